@@ -89,6 +89,7 @@ def run(settings: Settings, update: bool) -> None:
         check("install again, and nothing is lost", lambda: installed_again(kube, chart, before))
         check("install, rights in all namespaces", lambda: all_namespaces(kube, chart))
         check("install, and no right of the cluster", lambda: namespaced(kube, chart))
+        check("a release of another name takes over", lambda: taken_over(kube, chart))
     with apiserver.running(settings, folder) as kube:
         check("commands and manifests of the documents", lambda: docruns.check(settings, kube))
 
@@ -364,6 +365,20 @@ def namespaced(kube: Kube, chart: Path) -> str:
     # crds.keep=false: the definitions don't outlive the release.
     chartrender.definitions_removed(kube)
     return summary
+
+
+def taken_over(kube: Kube, chart: Path) -> str:
+    """The definitions that an uninstalled release leaves are still marked as its own."""
+    helm(kube, chart)
+    kube.run("helm", "uninstall", RELEASE, f"--namespace={SYSTEM}")
+    install = ("helm", "install", "other", str(chart), f"--namespace={SYSTEM}")
+    try:
+        kube.run(*install)
+    except LabError:
+        kube.run(*install, "--take-ownership", "--force-conflicts")
+        kube.run("helm", "uninstall", "other", f"--namespace={SYSTEM}")
+        return "only with --take-ownership"
+    raise LabError("helm takes the definitions over by itself: the README need not ask for --take-ownership")
 
 
 def rights(kube: Kube, cases: tuple[Access, ...]) -> str:

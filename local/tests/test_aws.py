@@ -193,6 +193,12 @@ class Policies(unittest.TestCase):
         # The last one is a condition.
         self.assertEqual(set(awscalls.ACTION.findall(code)) - {"kms:ViaService"}, role)
 
+    def test_pod_identity_is_let_through_where_the_operator_is_confined(self) -> None:
+        self.assertIs(parsed("values.yaml")[0]["networkPolicy"]["enabled"], True)
+        after = GUIDE.read_text().split("create-pod-identity-association")[1]
+        rule = text_as_yaml(after.split("```yaml\n")[1].split("```")[0])["networkPolicy"]["egress"]["extra"][0]
+        self.assertEqual((rule["to"][0]["ipBlock"]["cidr"], rule["ports"][0]["port"]), ("169.254.170.23/32", 80))
+
     def test_the_charts_readme_has_the_same_actions(self) -> None:
         text = README.read_text()
         for row, policy in ROWS.items():

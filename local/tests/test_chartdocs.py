@@ -1,6 +1,7 @@
 """The table of values, the schema against values.yaml, and the metrics that queries may ask for."""
 
 import json
+import re
 import tempfile
 import unittest
 from pathlib import Path
@@ -63,6 +64,29 @@ impl Metrics {
 #[cfg(test)]
 mod tests { struct Fake { a: Gauge, } }
 """
+
+
+# First cell of a row of the README's tables of rights -> its resource.
+RIGHTS = {"Pods' logs": "pods/log", "Finalizers of both kinds": "finalizers", "Access reviews of its own": "selfsubjectaccessreviews"}
+RULE = re.compile(r"^    resources: \[(.+)\]\n    verbs: \[(.+)\]$", re.MULTILINE)
+
+
+class Rights(unittest.TestCase):
+    def test_the_readme_has_every_right_of_the_controller(self) -> None:
+        granted: set[tuple[str, str]] = set()
+        for resources, verbs in RULE.findall((CHART / "templates" / "controller-rbac.yaml").read_text()):
+            for resource in resources.split(", "):
+                kind, _, part = resource.partition("/")
+                name = "finalizers" if part == "finalizers" else kind if part == "status" else resource
+                granted |= {(name, "write status" if part == "status" else verb) for verb in verbs.split(", ")}
+        shown: set[tuple[str, str]] = set()
+        text = (CHART / "README.md").read_text().split("## Rights in the cluster")[1].split("\n## ")[0]
+        for row in re.findall(r"^\| (.+?) \| (.+?) \|", text, re.MULTILINE):
+            resource = RIGHTS.get(row[0], row[0].split(",")[0].lower())
+            words = row[1].replace("read", "get, list, watch").replace("`", "")
+            shown |= {(resource, word.strip()) for word in re.split(r",|;| and | of ", words)}
+        self.assertGreater(len(granted), 30)
+        self.assertEqual(sorted(granted - shown), [])
 
 
 class Table(unittest.TestCase):

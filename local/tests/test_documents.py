@@ -38,6 +38,13 @@ class Links(unittest.TestCase):
         self.assertEqual([fault for page in pages for fault in doccheck.link_faults(page)], [])
 
 
+class Logs(unittest.TestCase):
+    def test_no_page_reads_the_log_of_one_of_two_controllers(self) -> None:
+        """kubectl takes one Pod of a Deployment, and only the leader's log has what a person looks for."""
+        reads = re.compile(r"logs deploy(ment)?/\S*-controller")
+        self.assertEqual([str(page) for page in doccheck.pages(REPOSITORY) if reads.search(page.read_text())], [])
+
+
 class Figures(unittest.TestCase):
     def test_the_readme_has_the_figures_of_their_pages(self) -> None:
         readme = (REPOSITORY / "README.md").read_text()

@@ -2,6 +2,7 @@
 //! stop signal, then runs the program's module.
 
 use std::future::Future;
+use std::num::NonZero;
 use std::process::ExitCode;
 
 use http::HeaderValue;
@@ -34,6 +35,8 @@ pub(super) const EXIT_CODES: &str = "Exit code 0: it was stopped. 1: an error, w
 /// What the exit code of a Pod's programs means.
 pub(super) const POD_EXIT_CODES: &str =
     "Exit code 0: its work is done. 1: an error, which is the last line of its log. 2: the arguments are refused.";
+/// Most threads that run tasks.
+const MAX_WORKERS: usize = 2;
 /// Environment variable with the log filter.
 const ENV_LOG: &str = "RUST_LOG";
 
@@ -91,7 +94,12 @@ where
     tracing::info!(program, version, revision, "starting");
     // It fails only where a provider is installed already, which serves as well.
     let _ = rustls::crypto::ring::default_provider().install_default();
-    let runtime = match tokio::runtime::Builder::new_multi_thread().enable_all().build() {
+    let cores = std::thread::available_parallelism().map_or(1, NonZero::get);
+    let runtime = tokio::runtime::Builder::new_multi_thread()
+        .worker_threads(workers(cores))
+        .enable_all()
+        .build();
+    let runtime = match runtime {
         Ok(runtime) => runtime,
         Err(error) => {
             eprintln!("leaderboard-operator: no threads can be started: {error}");
@@ -108,6 +116,12 @@ where
             ExitCode::FAILURE
         }
     }
+}
+
+/// Threads that run tasks on a machine of so many cores. A program never has work for more (docs/performance.md), and a
+/// node with GPUs has up to a hundred cores.
+fn workers(cores: usize) -> usize {
+    cores.clamp(1, MAX_WORKERS)
 }
 
 async fn lead(options: Controller) -> Result<(), String> {
@@ -203,5 +217,16 @@ impl Sending {
         if let Some(sending) = self.0 {
             sending.finish().await;
         }
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn a_large_node_gets_no_more_threads_than_a_small_one() {
+        let of = [0, 1, 2, 3, 96].map(workers);
+        assert_eq!(of, [1, 1, 2, 2, 2]);
     }
 }

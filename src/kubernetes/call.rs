@@ -70,14 +70,6 @@ impl CallError {
             Self::Silent { .. } => "timeout",
         }
     }
-
-    /// One word for metrics.
-    pub fn label(&self) -> &'static str {
-        match self {
-            Self::Refused { .. } => "kubernetes",
-            Self::Silent { .. } => "timeout",
-        }
-    }
 }
 
 /// Makes a call. `what` and `object` are for the message.
@@ -150,7 +142,7 @@ mod tests {
             ))
         };
         let error = call("the status", "one", refused(404)).await.unwrap_err();
-        assert!(error.is_gone() && !error.is_conflict() && error.label() == "kubernetes");
+        assert!(error.is_gone() && !error.is_conflict() && error.reason() == "not_found");
         assert_eq!(
             error.to_string(),
             "the status of one failed: the API server answered 404: No."
@@ -163,6 +155,6 @@ mod tests {
             error.to_string(),
             "the status of one: the API server did not answer within 20 s"
         );
-        assert_eq!((error.status().is_none(), error.label()), (true, "timeout"));
+        assert_eq!((error.status().is_none(), error.reason()), (true, "timeout"));
     }
 }

@@ -48,7 +48,13 @@ async fn hand_on<K: Watchable>(
                 metrics.event();
                 match item.object {
                     Ok(object) => take(object),
-                    Err(_) => metrics.malformed(),
+                    Err(malformed) => tracing::error!(
+                        watch = name,
+                        namespace = malformed.namespace,
+                        name = malformed.name,
+                        error = malformed.error,
+                        "skipped an object that can't be read"
+                    ),
                 }
             }
             // Without news a watch stays where it was, until the server has forgotten that.

@@ -226,12 +226,10 @@ impl<K: Watchable> Task<K> {
     fn apply(&mut self, item: Item<K>) {
         let object = match self.read(item) {
             Ok(object) => object,
-            Err(key) => {
-                self.unreadable.keys().insert(key);
-                return;
-            }
+            Err(key) => return self.note_unreadable(|keys| keys.extend([key])),
         };
-        self.unreadable.keys().remove(&key_of(&object));
+        let key = key_of(&object);
+        self.note_unreadable(|keys| _ = keys.remove(&key));
         let (after, before) = self.writer.put(object);
         match before {
             // The end of an object that was replaced by another one of its name between two reads.
@@ -248,7 +246,7 @@ impl<K: Watchable> Task<K> {
             Ok(object) => (key_of(&object), Some(self.trimmed(object))),
             Err(malformed) => (malformed.key(), None),
         };
-        self.unreadable.keys().remove(&key);
+        self.note_unreadable(|keys| _ = keys.remove(&key));
         let known = self.writer.remove(&key);
         // No event was sent for an object that never could be read.
         if let Some(last) = last.map(Arc::new).or(known) {
@@ -298,10 +296,10 @@ impl<K: Watchable> Task<K> {
         {
             gone.extend(self.writer.remove(&key));
         }
-        let mut unreadable = self.unreadable.keys();
-        unreadable.retain(|key| !from.has(key));
-        unreadable.extend(list.unreadable);
-        drop(unreadable);
+        self.note_unreadable(|keys| {
+            keys.retain(|key| !from.has(key));
+            keys.extend(list.unreadable);
+        });
         from.probe.listed();
         let (changed, left) = (list.changed.len(), gone.len());
         self.pending.extend(list.changed);
@@ -336,10 +334,15 @@ impl<K: Watchable> Task<K> {
         }
     }
 
+    fn note_unreadable(&self, change: impl FnOnce(&mut BTreeSet<Box<str>>)) {
+        let mut keys = self.unreadable.keys();
+        change(&mut keys);
+        self.metrics.unreadable(keys.len());
+    }
+
     /// The object, trimmed; if it can't be read, its key, and its name is logged.
     fn read(&mut self, item: Item<K>) -> Result<K, Box<str>> {
         item.object.map(|object| self.trimmed(object)).map_err(|malformed| {
-            self.metrics.malformed();
             tracing::error!(
                 kind = self.kind,
                 namespace = malformed.namespace,

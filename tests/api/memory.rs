@@ -141,3 +141,27 @@ async fn fifty_results_with_the_largest_texts_are_published_within_the_charts_li
     };
     assert!(all.iter().all(|(pk, _)| is_finished(*pk)));
 }
+
+#[tokio::test(flavor = "multi_thread", worker_threads = 2)]
+async fn a_row_that_its_participant_has_filled_takes_no_memory_and_holds_nobody_up() {
+    let world = World::new().await;
+    world.leaderboard("lb", 1, "Hosts").await;
+    let (filled, name) = world.submit("lb", 1).await;
+    world.evalai.with_state(|state| {
+        let row = state.submissions.get_mut(&filled).unwrap();
+        row.job_name = vec![String::new(); 2_000_000];
+    });
+    let (_, other) = world.submit("lb", 1).await;
+
+    let controller = Program::start("controller", "controller-0", &world.namespace).await;
+    let is_unread = |s: &SubmissionStatus| s.message.as_deref().is_some_and(|m| m.contains("more than is read"));
+    world.until(&name, "its row is not read", is_unread).await;
+    let is_accepted = |s: &SubmissionStatus| conditions::is_true(&s.conditions, conditions::ACCEPTED);
+    world.until(&other, "the other one is accepted", is_accepted).await;
+    let most = controller.most_memory();
+    assert!(
+        most < LIMIT_KIB,
+        "{most} KiB, more than the chart allows; {}",
+        controller.log()
+    );
+}

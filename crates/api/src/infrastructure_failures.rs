@@ -18,6 +18,9 @@ pub const CAN_BE_CAUSED: [&str; 3] = [
 /// Nodes that are remembered of a submission.
 pub const MAX_NODES: usize = 8;
 
+/// Ends of a submission whose times are remembered: as many as decide whether another Job follows.
+pub const MAX_RECENT_TIMES: usize = 3;
+
 /// Teams that a Leaderboard shows.
 pub const MAX_TEAMS: usize = 32;
 
@@ -41,11 +44,26 @@ pub struct InfrastructureFailures {
     pub first_time: Time,
     /// When the last of them ended.
     pub last_time: Time,
+    /// When each of the last ones ended, the oldest first.
+    #[serde(default, skip_serializing_if = "Vec::is_empty")]
+    #[x_kube(merge_strategy = ListMerge::Atomic)]
+    #[schemars(length(max = MAX_RECENT_TIMES))]
+    pub recent_times: Vec<Time>,
     /// Nodes of their last Pods.
     #[serde(default, skip_serializing_if = "Vec::is_empty")]
     #[x_kube(merge_strategy = ListMerge::Set)]
     #[schemars(length(max = MAX_NODES), inner(length(max = 253)))]
     pub nodes: Vec<String>,
+}
+
+impl InfrastructureFailures {
+    /// When the last ones ended, the oldest first, as far as that is known: an operator before `recentTimes` has noted the last one alone.
+    pub fn known_times(&self) -> &[Time] {
+        if self.recent_times.is_empty() && self.number > 0 {
+            return std::slice::from_ref(&self.last_time);
+        }
+        &self.recent_times
+    }
 }
 
 /// Attempts of a team that ended so, since one of the team's last finished.

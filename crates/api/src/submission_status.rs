@@ -81,8 +81,8 @@ pub struct SubmissionStatus {
     /// Times the Job of this attempt had to be created again after somebody deleted it.
     #[serde(default, skip_serializing_if = "is_zero")]
     pub recreated: i32,
-    /// Seconds that earlier Pods of the present Job have run. They count against `deadlines.runSeconds`; the wait of a Pod for its node
-    /// does not.
+    /// Seconds that earlier Pods of the present Job have run, each from its first agent. They count against `deadlines.runSeconds`; the
+    /// wait of a Pod for its node, and its preparation, do not.
     #[serde(default, skip_serializing_if = "is_none")]
     pub ran_seconds: i64,
     /// When the next Job of this attempt is made, after an infrastructure failure.
@@ -299,6 +299,7 @@ pub struct Rerun {
 
 /// When what happened; from the timestamps of messages, Pods and Jobs.
 #[derive(Serialize, Deserialize, JsonSchema, Clone, Debug, Default, PartialEq)]
+#[serde(rename_all = "camelCase")]
 pub struct Times {
     /// When the participant submitted it to EvalAI; of a local submission, when its object was made.
     #[serde(default, skip_serializing_if = "Option::is_none")]
@@ -312,6 +313,9 @@ pub struct Times {
     /// When the first agent of this attempt started.
     #[serde(default, skip_serializing_if = "Option::is_none")]
     pub started: Option<Time>,
+    /// When the first agent of the present Pod started. `deadlines.runSeconds` counts from here on.
+    #[serde(default, skip_serializing_if = "Option::is_none")]
+    pub agent_started: Option<Time>,
     /// When it was asked to stop.
     #[serde(default, skip_serializing_if = "Option::is_none")]
     pub stopping: Option<Time>,

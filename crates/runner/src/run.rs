@@ -183,6 +183,11 @@ impl Runner {
         let (Role::Agent { idle, .. }, Some(tee)) = (&self.job.role, &self.tee) else {
             return None;
         };
+        // What it prints waits in its pipe while the node takes nothing of standard output: that is no silence. Only the node reads
+        // there, so no command can bring this about.
+        if tee.wants_stdout() {
+            return Some(*idle);
+        }
         Some(idle.saturating_sub(tee.last_output().elapsed()))
     }
 

@@ -44,7 +44,7 @@ impl Tee {
         Ok((tee, writer))
     }
 
-    /// When the command last printed something (or started).
+    /// When the command last printed something (or started), or standard output had at last taken what was printed.
     pub(crate) const fn last_output(&self) -> Instant {
         self.last_output
     }
@@ -74,8 +74,9 @@ impl Tee {
         match input.read(&mut self.buffer) {
             Ok(0) => self.input = None,
             Ok(length) => {
-                self.last_output = Instant::now();
                 self.log.write(&self.buffer[..length]);
+                // After the log: a disk that hangs is not the command's silence.
+                self.last_output = Instant::now();
                 self.pending = if self.stdout_open { 0..length } else { 0..0 };
             }
             Err(error) if error.kind() == io::ErrorKind::Interrupted => {}
@@ -85,6 +86,9 @@ impl Tee {
 
     /// Hands stdout as much as it takes without blocking.
     pub(crate) fn write(&mut self) {
+        if self.pending.is_empty() {
+            return;
+        }
         let stdout = io::stdout();
         while !self.pending.is_empty() && is_writable(stdout.as_fd()) {
             let end = self.pending.end.min(self.pending.start + PIECE);
@@ -99,6 +103,10 @@ impl Tee {
                     self.pending = 0..0;
                 }
             }
+        }
+        if self.pending.is_empty() {
+            // Nobody has read the command's pipe meanwhile: what it has printed there is found from now on.
+            self.last_output = Instant::now();
         }
     }
 

@@ -9,7 +9,7 @@ use std::fs::{self, File};
 use std::io::{Read, Write};
 use std::os::unix::fs::{PermissionsExt, symlink};
 use std::process::{Command, Stdio};
-use std::time::Instant;
+use std::time::{Duration, Instant};
 
 use leaderboard_runner::protocol::{Mark, StatusFile};
 use leaderboard_runner::verdict::What;
@@ -118,6 +118,25 @@ fn an_agent_is_stopped_even_while_nobody_reads_its_output_and_none_of_it_is_lost
     assert_eq!(agent.code(), 0);
     assert!(bytes == fs::read(pod.log()).unwrap(), "stdout and log differ");
     assert!(bytes.len() > 65536, "{}", bytes.len());
+}
+
+#[test]
+fn an_agent_that_prints_is_not_idle_while_nobody_reads_its_output() {
+    let pod = pod();
+    let (mut output, stdout) = std::io::pipe().unwrap();
+    // More than its pipe, the runner's buffer and standard output hold together, and printed last of all.
+    let script = format!("echo '{COMPLETE}' > $CHECKPOINT; exec head -c 400000 /dev/zero");
+    let mut agent = pod.agent_printing(&["sh", "-c", &script], &["--idle-seconds=1"], stdout.into());
+    until("stdout is full", || {
+        fs::metadata(pod.log()).is_ok_and(|log| log.len() > 65536)
+    });
+    // No event shows that nothing happens. One second is the shortest limit there is; the other is for a busy machine.
+    assert!(agent.stays(Duration::from_secs(2)), "{}", agent.stderr());
+    let mut bytes = Vec::new();
+    output.read_to_end(&mut bytes).unwrap();
+    let end = (agent.code(), agent.verdict().what);
+    assert_eq!(end, (0, What::Exited), "{}", agent.stderr());
+    assert_eq!(bytes.len(), 400_000);
 }
 
 #[test]

@@ -36,7 +36,7 @@ use crate::services::token::secret_text;
 
 /// What the exit code means.
 pub(super) const EXIT_CODES: &str = "Exit code 0: the manifests are printed, or the Submissions are made. 2: entries or arguments are \
-    refused. 1: something can't be read or written.";
+    refused. 1: something can't be read or written, or the API server refuses a Submission, which keeps no other from being made.";
 
 /// Print manifests from the original pipeline's entries in Secrets Manager, or make Submissions from the rows of its table.
 #[derive(Args, Debug)]
@@ -89,7 +89,8 @@ pub(super) struct Import {
     /// Each Leaderboard has a cluster and an operator of its own: they share the queue and EvalAI's requests.
     #[arg(long)]
     two_operators: bool,
-    /// Make Submissions from the rows of this DynamoDB table, which the namespace's Leaderboards name.
+    /// Make Submissions from the rows of this DynamoDB table, which the namespace's Leaderboards name. One that the API server refuses
+    /// is reported, and the others are made.
     #[arg(long, value_name = "TABLE")]
     from_table: Option<String>,
     /// Print the Submissions of a table instead of making them.

@@ -224,24 +224,29 @@ fn progress(text: &str) -> Option<Progress> {
     (0..=total).contains(&done).then(|| Progress::new(done, total))
 }
 
+/// An agent may have forged its own: what is out of its range is no score, and may be longer than a status takes.
 fn score(row: &StoredRow) -> Option<Score> {
-    let number = |column: &str| row.text(column)?.parse().ok().filter(|number: &f64| number.is_finite());
-    let driving = number("driving_score").filter(|score| (0.0..=100.0).contains(score))?;
+    let number = |column: &str, most: f64| {
+        let number: Option<f64> = row.text(column)?.parse().ok();
+        number.filter(|number| (0.0..=most).contains(number))
+    };
     Some(Score::new(
-        driving,
-        number("route_completion"),
-        number("infraction_penalty"),
+        number("driving_score", 100.0)?,
+        number("route_completion", 100.0),
+        number("infraction_penalty", 1.0),
         true,
     ))
 }
 
-/// A time as both pipelines write it, `2026-11-20 10:00:00 UTC`, or as AWS does.
+/// A time as both pipelines write it, `2026-11-20 10:00:00 UTC`, or as AWS does. A forged one may be of a year that Kubernetes takes no
+/// time of.
 fn time(text: Option<&str>) -> Option<Time> {
     let text = text?;
     let theirs = DateTime::strptime("%Y-%m-%d %H:%M:%S UTC", text).ok();
     let theirs = theirs.and_then(|time| time.to_zoned(TimeZone::UTC).ok());
     let at = theirs.map(|time| time.timestamp());
-    at.or_else(|| text.parse::<Timestamp>().ok()).map(Time)
+    let at = at.or_else(|| text.parse::<Timestamp>().ok());
+    at.filter(|at| *at >= Timestamp::UNIX_EPOCH).map(Time)
 }
 
 fn is_image(text: &str) -> bool {

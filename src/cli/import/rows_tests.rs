@@ -182,12 +182,46 @@ fn nothing_that_a_stranger_wrote_is_taken_as_it_is() {
         ("progress", "30/20"),
         ("driving_score", "NaN"),
         ("end_time", "yesterday"),
+        ("submitted_time", "-000005-01-01T00:00:00Z"),
         ("start_time", "2026-11-20T10:05:00Z"),
     ];
     let (submission, end) = ended(&row("FINISHED", None, &strange));
     assert_eq!(submission.spec.team.unwrap().name.as_deref(), Some("a\u{fffd}[31mb"));
     assert_eq!(submission.spec.image, None);
     assert_eq!((end.results_url, end.progress, end.score), (None, None, None));
-    assert_eq!(end.times.finished, None);
+    assert_eq!((end.times.finished, end.times.submitted), (None, None));
     assert_eq!(end.times.started.unwrap().0.to_string(), "2026-11-20T10:05:00Z");
+}
+
+#[test]
+fn a_forged_score_is_no_score_and_no_text_of_it_is_longer_than_a_status_takes() {
+    for (column, forged) in [
+        ("infraction_penalty", "1e60"),
+        ("infraction_penalty", "1.001"),
+        ("infraction_penalty", "-0.5"),
+        ("infraction_penalty", "inf"),
+        ("route_completion", "1e60"),
+        ("route_completion", "-1e60"),
+        ("route_completion", "100.1"),
+        ("route_completion", "NaN"),
+    ] {
+        let score = ended(&row("FINISHED", None, &[("driving_score", "50"), (column, forged)])).1;
+        let score = score.score.unwrap();
+        let parts = [score.route_completion, score.infraction_penalty];
+        assert_eq!(parts, [None, None], "{column} {forged}");
+        assert_eq!((score.driving.as_str(), score.text.as_str()), ("50.00", "50.00"));
+    }
+    let longest = [
+        ("driving_score", "100"),
+        ("route_completion", "99.99999999999999999999999999999999999999"),
+        ("infraction_penalty", "0.00000000000000000000000000000000000001"),
+    ];
+    let score = ended(&row("FINISHED", None, &longest)).1.score.unwrap();
+    let texts = [
+        score.driving,
+        score.text,
+        score.route_completion.unwrap(),
+        score.infraction_penalty.unwrap(),
+    ];
+    assert!(texts.iter().all(|text| text.len() <= 32), "{texts:?}");
 }

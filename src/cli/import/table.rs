@@ -8,7 +8,7 @@ use k8s_openapi::apimachinery::pkg::apis::meta::v1::Time;
 use kube::api::{ListParams, PostParams};
 use kube::{Api, Client, ResourceExt};
 use leaderboard_api::client_errors;
-use leaderboard_api::text::one_line;
+use leaderboard_api::text::{LONGEST_MESSAGE, one_line};
 use leaderboard_api::{ImportedEnd, Leaderboard, Submission, SubmissionStatus};
 use serde_json::{Value, json};
 
@@ -17,7 +17,7 @@ use super::rows::{self, Outcome};
 use super::{Import, print, write_out};
 use crate::cli::serve;
 use crate::controller::writes::apply_status;
-use crate::kubernetes::CallError;
+use crate::kubernetes::{CallError, call};
 use crate::services::aws::Aws;
 use crate::services::table::{Table, TableError};
 
@@ -56,9 +56,10 @@ struct Counts {
     adopted: usize,
     there: usize,
     undecided: usize,
+    refused: usize,
 }
 
-/// Imports all rows of a table.
+/// Imports all rows of a table. The exit code is 0 if the API server has refused none of them.
 pub(super) async fn import(aws: &Aws, options: &Import, name: &str) -> Result<ExitCode, TableFailure> {
     let config = serve::cluster("import").await.map_err(TableFailure::Cluster)?;
     let client = Client::try_from(config)?;
@@ -81,7 +82,11 @@ pub(super) async fn import(aws: &Aws, options: &Import, name: &str) -> Result<Ex
         }
     }
     eprintln!("{}", counts.line(rows.len(), options.dry_run));
-    Ok(ExitCode::SUCCESS)
+    Ok(if counts.refused == 0 {
+        ExitCode::SUCCESS
+    } else {
+        ExitCode::FAILURE
+    })
 }
 
 impl Counts {
@@ -91,11 +96,16 @@ impl Counts {
             adopted,
             there,
             undecided,
+            refused,
         } = self;
         let make = if dry_run { "would make" } else { "made" };
         let go = if *adopted == 1 { "goes" } else { "go" };
+        let refused = match refused {
+            0 => String::new(),
+            number => format!("; {number} refused by the API server: correct what it names and repeat the command"),
+        };
         format!(
-            "{rows} rows: {make} {imported} that have ended, {adopted} that {go} on; {there} were there already; {undecided} undecided"
+            "{rows} rows: {make} {imported} that have ended, {adopted} that {go} on; {there} were there already; {undecided} undecided{refused}"
         )
     }
 }
@@ -158,29 +168,52 @@ fn status(submission: &Submission, end: ImportedEnd) -> SubmissionStatus {
     SubmissionStatus::of_imported(&submission.spec, end, generation, &Time(Timestamp::now()))
 }
 
-/// Makes a Submission, then its status. One that is there already is left as it is, unless only its status is missing.
+/// Makes a Submission with its status. One that the API server refuses is counted, and keeps no other waiting: a participant may have
+/// written the row.
 async fn make(
     client: &Client,
     submission: &Submission,
     end: Option<ImportedEnd>,
     counts: &mut Counts,
 ) -> Result<(), TableFailure> {
+    let name = submission.name_any();
+    match write(client, submission, end, counts).await {
+        Err(error) if is_of_one_object(&error) => {
+            counts.refused += 1;
+            eprintln!("refused: {name}: {}", one_line(&error.to_string(), LONGEST_MESSAGE));
+            Ok(())
+        }
+        written => written.map_err(|error| TableFailure::Object {
+            name,
+            why: error.to_string(),
+        }),
+    }
+}
+
+/// Whether the API server refuses this object: by its definition, a policy, a webhook or a quota. It may take the next one.
+fn is_of_one_object(error: &CallError) -> bool {
+    error
+        .status()
+        .is_some_and(|status| [400, 403, 422].contains(&status.code))
+}
+
+/// Makes a Submission, then its status. One that is there already is left as it is, unless only its status is missing.
+async fn write(
+    client: &Client,
+    submission: &Submission,
+    end: Option<ImportedEnd>,
+    counts: &mut Counts,
+) -> Result<(), CallError> {
     let (name, namespace) = (submission.name_any(), submission.namespace().unwrap_or_default());
     let api: Api<Submission> = Api::namespaced(client.clone(), &namespace);
-    let failed = |why: String| TableFailure::Object {
-        name: name.clone(),
-        why,
-    };
+    let described = format!("Submission {name}");
     let params = PostParams {
         field_manager: Some(MANAGER.to_owned()),
         ..PostParams::default()
     };
-    let made = match api.create(&params, submission).await {
-        Err(kube::Error::Api(status)) if status.code == 409 => {
-            let there = api
-                .get(&name)
-                .await
-                .map_err(|error| failed(client_errors::kube(&error)))?;
+    let made = match call("the creation", &described, api.create(&params, submission)).await {
+        Err(error) if error.is_conflict() => {
+            let there = call("the read", &described, api.get(&name)).await?;
             if !there.awaits_import() {
                 counts.there += 1;
                 eprintln!("{name}: is there already, and left as it is");
@@ -188,7 +221,7 @@ async fn make(
             }
             there
         }
-        other => other.map_err(|error| failed(client_errors::kube(&error)))?,
+        other => other?,
     };
     let Some(end) = end else {
         counts.adopted += 1;
@@ -199,11 +232,50 @@ async fn make(
         return Ok(());
     };
     let status = status(&made, end);
-    let written = apply_status(client, &made, &status).await;
-    written.map_err(|error: CallError| failed(error.to_string()))?;
+    apply_status(client, &made, &status).await?;
     counts.imported += 1;
     let score = status.score.as_ref().map(|score| format!(", score {}", score.text));
     let state = status.state_of_conditions().as_str();
     eprintln!("{name}: imported as {state}{}", score.unwrap_or_default());
     Ok(())
+}
+
+#[cfg(test)]
+mod tests {
+    use kube::core::Status;
+
+    use super::*;
+
+    #[tokio::test]
+    async fn only_a_refusal_of_one_object_lets_the_command_go_on() {
+        for (code, expected) in [
+            (400, true),
+            (403, true),
+            (422, true),
+            (401, false),
+            (404, false),
+            (409, false),
+            (429, false),
+            (500, false),
+            (503, false),
+        ] {
+            let status = Status::failure("No.", "Reason").with_code(code).boxed();
+            let refused = async { Err::<(), _>(kube::Error::Api(status)) };
+            let error = call("the status", "one", refused).await.unwrap_err();
+            assert_eq!(is_of_one_object(&error), expected, "{code}");
+        }
+    }
+
+    #[test]
+    fn the_last_line_counts_what_was_refused() {
+        let mut counts = Counts {
+            imported: 1,
+            ..Counts::default()
+        };
+        let line = "3 rows: made 1 that have ended, 0 that go on; 0 were there already; 0 undecided";
+        assert_eq!(counts.line(3, false), line);
+        counts.refused = 2;
+        let refused = "; 2 refused by the API server: correct what it names and repeat the command";
+        assert_eq!(counts.line(3, false), format!("{line}{refused}"));
+    }
 }

@@ -196,6 +196,13 @@ fn judge(arrival: &Arrival, readers: &[Arc<Leaderboard>], now_ms: i64, is_comple
             let why = format!("EvalAI has no submission {}", message.submission);
             return Verdict::Drop(DeadReason::Malformed(why));
         }
+        if arrival.origin == Origin::Foreign {
+            let why = format!(
+                "EvalAI does not show submission {} to a host of this challenge: its row has a phase of another challenge",
+                message.submission
+            );
+            return Verdict::Drop(DeadReason::Malformed(why));
+        }
     }
     let sent_ms = sent_ms(arrival, now_ms);
     let envelope = envelope(content, sent_ms.unwrap_or(now_ms));
@@ -219,7 +226,7 @@ fn judge(arrival: &Arrival, readers: &[Arc<Leaderboard>], now_ms: i64, is_comple
 fn sent_ms(arrival: &Arrival, now_ms: i64) -> Option<i64> {
     match arrival.origin {
         Origin::Wanted(time) => Some(time.as_millisecond().min(now_ms)),
-        Origin::Missing | Origin::Hidden => None,
+        Origin::Missing | Origin::Foreign | Origin::Hidden => None,
     }
 }
 

@@ -112,6 +112,7 @@ fn what_is_dropped_and_what_is_left() {
         (json!("text"), Origin::Hidden, Some("Malformed")),
         (fixed, wanted(1), Some("Malformed")),
         (message(1, 2), Origin::Missing, Some("Malformed")),
+        (message(1, 2), Origin::Foreign, Some("Malformed")),
         // Its Leaderboard may still be applied.
         (message(1, 3), wanted(800), None),
         (message(1, 3), wanted(1000), Some("UnknownPhase")),
@@ -120,6 +121,7 @@ fn what_is_dropped_and_what_is_left() {
         // Another challenge's are not ours, however old.
         (message(9, 2), wanted(1_000_000), None),
         (message(9, 2), Origin::Missing, None),
+        (message(9, 2), Origin::Foreign, None),
     ] {
         let verdict = judged(&body, origin);
         let found = match &verdict {

@@ -20,7 +20,7 @@ use crate::controller::leaderboards::{self, Reconciled, operator};
 use crate::controller::objects::{span_of, uid_of};
 use crate::controller::slots::SlotAllocator;
 use crate::controller::submissions::act::{ActError, act};
-use crate::controller::submissions::decide::{self, Plan, decide};
+use crate::controller::submissions::decide::{SlotUse, decide};
 use crate::controller::submissions::observe::observe;
 use crate::kubernetes::CallError;
 use crate::observability::metrics::Metrics;
@@ -82,7 +82,7 @@ impl ReconcileError {
     fn label(&self) -> &'static str {
         match self {
             Self::Act(error) => error.label(),
-            Self::Leaderboard(_) => "leaderboard",
+            Self::Leaderboard(error) => error.reason(),
             Self::TooLong => "timeout",
             Self::Panicked(_) => "panic",
         }
@@ -146,12 +146,11 @@ async fn reconcile_known(turn: Turn, submission: Arc<Submission>, shared: Arc<Sh
             policies.is_in_place(board)
         });
         let plan = decide(&view);
-        let creates_job = plan.actions.iter().any(|a| matches!(a, decide::Action::CreateJob(_)));
-        if !turn.may_continue(creates_job) {
+        if !turn.may_continue(plan.creates_job()) {
             return Ok(None);
         }
         let (requeue, class) = (plan.requeue, urgency::after(&submission, &plan));
-        settle(slots, &submission, &plan);
+        settle(slots, &submission, plan.slot());
         let held_back = act(shared.context.for_act(), &view, plan).await?;
         let requeue = [requeue, held_back].into_iter().flatten().min();
         Ok(Some((requeue, class)))
@@ -182,14 +181,12 @@ async fn limited<T>(work: impl Future<Output = Result<T, ReconcileError>>) -> Re
     }
 }
 
-/// Gives the slot back of a submission that does not start after all, or has come to its end: a later attempt stands in line
-/// like anyone. One that stays in line renews its place in `act`.
-fn settle(slots: &SlotAllocator, submission: &Submission, plan: &Plan) {
-    let is_over = plan.status.has_ended();
-    if plan.status.job_name.is_some() && !is_over {
-        slots.starts(submission);
-    } else if !plan.actions.iter().any(|a| matches!(a, decide::Action::JoinLine(_))) {
-        slots.leaves(submission);
+/// Tells the line what was decided. One that stays in line renews its place in `act`.
+fn settle(slots: &SlotAllocator, submission: &Submission, slot: SlotUse) {
+    match slot {
+        SlotUse::Holds => slots.starts(submission),
+        SlotUse::Waits => {}
+        SlotUse::Leaves => slots.leaves(submission),
     }
 }
 

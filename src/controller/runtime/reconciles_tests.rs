@@ -4,11 +4,13 @@ use futures::stream;
 use http::Method;
 use jiff::Timestamp;
 use k8s_openapi::apimachinery::pkg::apis::meta::v1::Time;
+use kube::core::Status;
 use tokio::sync::mpsc;
 
 use super::*;
 use crate::controller::fixtures::{Cluster, leaderboard, surroundings, with_job};
 use crate::controller::runtime::backoff::BackoffMap;
+use crate::kubernetes::call;
 use crate::observability::Observability;
 use crate::observability::shutdown::Stop;
 
@@ -85,4 +87,16 @@ async fn a_reconcile_that_panics_or_hangs_is_an_error_of_its_own() {
     );
     let hangs = limited(std::future::pending::<Result<(), _>>()).await.unwrap_err();
     assert_eq!(hangs.label(), "timeout");
+}
+
+#[tokio::test]
+async fn a_failed_call_is_counted_by_the_answer_of_the_api_server() {
+    let refused = async || {
+        let status = Status::failure("No.", "Forbidden").with_code(403).boxed();
+        let refused = async { Err::<(), _>(kube::Error::Api(status)) };
+        call("the status", "one", refused).await.unwrap_err()
+    };
+    let of_leaderboard = ReconcileError::from(refused().await);
+    let of_submission = ReconcileError::from(ActError::from(refused().await));
+    assert_eq!([of_leaderboard.label(), of_submission.label()], ["forbidden"; 2]);
 }

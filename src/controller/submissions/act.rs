@@ -68,7 +68,7 @@ impl ActError {
     /// One word for metrics.
     pub fn label(&self) -> &'static str {
         match self {
-            Self::Call(error) => error.label(),
+            Self::Call(error) => error.reason(),
             Self::NoPlan { .. } => "plan",
         }
     }

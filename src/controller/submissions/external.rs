@@ -95,6 +95,7 @@ impl ExternalSystems {
             .filter(|seen| Some(seen.attempt) == attempt);
         Some(seen.map_or_else(RecordView::default, |s| RecordView {
             end_written: s.end_written,
+            is_superseded: s.is_superseded,
             error: s.error,
         }))
     }

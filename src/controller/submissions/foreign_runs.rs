@@ -7,7 +7,7 @@ use std::time::Duration;
 
 use jiff::Timestamp;
 
-use super::questions::{self, Observed, Questions};
+use super::questions::{self, Observed, Questions, Service};
 use crate::controller::objects::Wake;
 use crate::controller::submissions::report_digest::StoredReport;
 use crate::lock::lock;
@@ -83,10 +83,18 @@ pub struct Looked {
 impl questions::Question for Question {
     type Answer = Looked;
     const AT_ONCE: usize = 8;
+    // Of a bucket or a table that hangs, each look takes all its time, and each submission is looked for again.
+    const AT_ONCE_OF_A_SERVICE: usize = 2;
     const GOOD_FOR: Duration = AGAIN;
 
     fn attempt(&self) -> Attempt {
         self.attempt
+    }
+
+    fn shares_a_service(&self, other: &Self) -> bool {
+        let tables = self.table.as_ref().zip(other.table.as_ref());
+        Service::of_bucket(&self.storage) == Service::of_bucket(&other.storage)
+            || tables.is_some_and(|(one, other)| Service::of_table(one) == Service::of_table(other))
     }
 }
 
@@ -261,9 +269,9 @@ impl Question {
 #[cfg(test)]
 mod tests {
     use kube::runtime::reflector::ObjectRef;
-    use serde_json::json;
+    use serde_json::{Value, json};
 
-    use super::super::questions::Shared;
+    use super::super::questions::{Question as _, Shared};
     use super::*;
     use crate::observability::about::LogSpan;
 
@@ -322,6 +330,55 @@ mod tests {
             "it is of the attempt before"
         );
         assert_eq!(shared.next(), Some(("u".into(), ask(2), "one".into())));
+    }
+
+    fn ask_of(run: usize, storage: Value, table: Value) -> Question {
+        Question {
+            run_id: run.to_string().parse().unwrap(),
+            storage: serde_json::from_value(storage).unwrap(),
+            table: Some(serde_json::from_value(table).unwrap()),
+            ..ask(1)
+        }
+    }
+
+    #[tokio::test(start_paused = true)]
+    async fn a_bucket_that_hangs_keeps_no_submission_of_another_waiting() {
+        let shared = Shared::default();
+        let of = |name: &str, run| ask_of(run, json!({"bucket": name}), json!({"name": name}));
+        for run in 1..=20 {
+            shared.want(format!("hangs-{run}"), by("a"), of("hangs", run), LogSpan::default());
+        }
+        tokio::time::advance(Duration::from_secs(1)).await;
+        shared.want("answers".into(), by("b"), of("answers", 21), LogSpan::default());
+        let begun: Vec<_> = (0..Question::AT_ONCE).filter_map(|_| shared.next()).collect();
+        let (others, of_hanging): (Vec<_>, Vec<_>) = begun.iter().partition(|(uid, ..)| uid == "answers");
+        assert_eq!((others.len(), of_hanging.len()), (1, Question::AT_ONCE_OF_A_SERVICE));
+        let (uid, question, _) = of_hanging[0];
+        assert_eq!(shared.done(uid, question, nothing()), Some(by("a")));
+        let (uid, ..) = shared.next().unwrap();
+        assert!(uid.starts_with("hangs"), "{uid}");
+        assert_eq!(shared.next(), None, "its share is under way again");
+    }
+
+    #[test]
+    fn what_hangs_together_has_one_share() {
+        let (bucket, table, others) = (
+            json!({"bucket": "results"}),
+            json!({"name": "rows"}),
+            json!({"name": "others"}),
+        );
+        let elsewhere = json!({"bucket": "results", "region": "eu-west-1"});
+        let of = |storage: &Value, table: &Value| ask_of(1, storage.clone(), table.clone());
+        let first = of(&bucket, &table);
+        assert!(first.shares_a_service(&of(&bucket, &others)), "the bucket");
+        assert!(first.shares_a_service(&of(&elsewhere, &table)), "the table");
+        assert!(!first.shares_a_service(&of(&elsewhere, &others)));
+        let at = |bucket: &str| Question {
+            storage: serde_json::from_value(json!({"bucket": bucket, "endpoint": "http://minio:9000"})).unwrap(),
+            ..ask(1)
+        };
+        assert!(at("one").shares_a_service(&at("two")), "the endpoint");
+        assert!(!first.shares_a_service(&at("results")));
     }
 
     #[test]

@@ -28,11 +28,17 @@ impl questions::Question for Question {
     type Answer = Result<Facts, Fault>;
     /// Each answer is at most a few MiB.
     const AT_ONCE: usize = 4;
+    /// A participant may choose a registry that takes all its time for each answer.
+    const AT_ONCE_OF_A_SERVICE: usize = 3;
     /// One answer serves the whole attempt.
     const GOOD_FOR: Duration = Duration::MAX;
 
     fn attempt(&self) -> Attempt {
         self.attempt
+    }
+
+    fn shares_a_service(&self, other: &Self) -> bool {
+        self.image.registry == other.image.registry
     }
 }
 
@@ -159,5 +165,19 @@ mod tests {
             matches!(shared.observe("b", Attempt(1)), ObservedImage::Asked(_)),
             "it still waits"
         );
+    }
+
+    #[tokio::test(start_paused = true)]
+    async fn a_registry_that_takes_its_time_leaves_a_place_to_the_others() {
+        let shared = Shared::default();
+        for uid in ["a", "b", "c", "d"] {
+            shared.want(uid.into(), by(uid), question(1, uid), LogSpan::default());
+        }
+        tokio::time::advance(Duration::from_secs(1)).await;
+        let mut other = question(1, "e");
+        other.image.registry = "other.example".into();
+        shared.want("e".into(), by("e"), other, LogSpan::default());
+        let begun: Vec<_> = std::iter::from_fn(|| shared.next()).map(|(uid, ..)| uid).collect();
+        assert_eq!((begun.len(), begun.last().map(String::as_str)), (4, Some("e")));
     }
 }

@@ -5,7 +5,7 @@ use std::time::Duration;
 
 use serde::Deserialize;
 
-use super::questions::{self, Observed, Questions};
+use super::questions::{self, Observed, Questions, Service};
 use crate::controller::objects::Wake;
 use crate::observability::tasks::Tasks;
 use crate::services::archive::Archive;
@@ -40,11 +40,16 @@ pub type Answer = Result<Routes, String>;
 impl questions::Question for Question {
     type Answer = Answer;
     const AT_ONCE: usize = 2;
+    const AT_ONCE_OF_A_SERVICE: usize = 1;
     // A run that has ended stays as it is.
     const GOOD_FOR: Duration = Duration::from_hours(1);
 
     fn attempt(&self) -> Attempt {
         self.attempt
+    }
+
+    fn shares_a_service(&self, other: &Self) -> bool {
+        Service::of_bucket(&self.storage) == Service::of_bucket(&other.storage)
     }
 }
 

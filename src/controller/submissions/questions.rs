@@ -16,7 +16,7 @@ use crate::controller::objects::{Wake, log_span_of, uid, uid_of};
 use crate::lock::lock;
 use crate::observability::about::LogSpan;
 use crate::observability::tasks::Tasks;
-use leaderboard_api::{Attempt, Submission};
+use leaderboard_api::{Attempt, Storage, Submission, Table};
 
 /// How long an answer is kept that nobody asks for again.
 pub(super) const KEPT: Duration = Duration::from_mins(10);
@@ -27,10 +27,39 @@ pub trait Question: Clone + PartialEq + Send + 'static {
     type Answer: Send + Sync + 'static;
     /// How many are asked at once.
     const AT_ONCE: usize;
+    /// How many of them are asked of one service: one that hangs leaves the rest to the others. By default there is no such share.
+    const AT_ONCE_OF_A_SERVICE: usize = Self::AT_ONCE;
     /// How long an answer is good: after that the same question is asked again.
     const GOOD_FOR: Duration;
     /// Another attempt asks anew.
     fn attempt(&self) -> Attempt;
+    /// Whether one service is asked both, so that it holds up both if it hangs.
+    fn shares_a_service(&self, _other: &Self) -> bool {
+        true
+    }
+}
+
+/// A bucket or a table as something that may hang: an endpoint of one's own hangs with all that it has, of AWS each alone.
+#[derive(PartialEq, Eq)]
+pub(super) enum Service<'a> {
+    Endpoint(&'a str),
+    OfAws { region: Option<&'a str>, name: &'a str },
+}
+
+impl<'a> Service<'a> {
+    /// Of a bucket.
+    pub(super) fn of_bucket(storage: &'a Storage) -> Self {
+        Self::of(storage.endpoint.as_deref(), storage.region.as_deref(), &storage.bucket)
+    }
+
+    /// Of a table.
+    pub(super) fn of_table(table: &'a Table) -> Self {
+        Self::of(table.endpoint.as_deref(), table.region.as_deref(), &table.name)
+    }
+
+    fn of(endpoint: Option<&'a str>, region: Option<&'a str>, name: &'a str) -> Self {
+        endpoint.map_or(Self::OfAws { region, name }, Self::Endpoint)
+    }
 }
 
 /// What is known for a submission's present attempt.
@@ -57,6 +86,8 @@ struct Entry<Q: Question> {
 pub(super) struct Shared<Q: Question> {
     /// By the UID of the submission.
     entries: Mutex<HashMap<String, Entry<Q>>>,
+    /// What is being asked, also for a submission that asks for something else by now, or is gone. Locked after the entries.
+    under_way: Mutex<Vec<Q>>,
     notify: Notify,
 }
 
@@ -102,6 +133,7 @@ impl<Q: Question> Default for Shared<Q> {
     fn default() -> Self {
         Self {
             entries: Mutex::default(),
+            under_way: Mutex::default(),
             notify: Notify::default(),
         }
     }
@@ -145,14 +177,23 @@ impl<Q: Question> Shared<Q> {
         }
     }
 
-    /// The question that has waited longest, with the UID and the namespace of its submission.
+    /// The question that has waited longest of those whose services have not their share yet, with the UID and the namespace of its
+    /// submission.
     pub(super) fn next(&self) -> Option<(String, Q, String)> {
         let mut entries = lock(&self.entries);
-        let due = entries
-            .iter_mut()
-            .filter(|(_, entry)| entry.is_due && !entry.is_under_way);
-        let (uid, entry) = due.min_by_key(|(_, entry)| entry.asked)?;
+        let mut under_way = lock(&self.under_way);
+        let mut oldest: Option<(&String, &mut Entry<Q>)> = None;
+        for (uid, entry) in &mut *entries {
+            let is_due = entry.is_due && !entry.is_under_way;
+            let is_older = oldest.as_ref().is_none_or(|(_, oldest)| entry.asked < oldest.asked);
+            // Thousands may be due: services are compared last, and only for one that would be begun.
+            if is_due && is_older && has_room(&under_way, &entry.question) {
+                oldest = Some((uid, entry));
+            }
+        }
+        let (uid, entry) = oldest?;
         (entry.is_due, entry.is_under_way) = (false, true);
+        under_way.push(entry.question.clone());
         let namespace = entry.by.namespace.clone().unwrap_or_default();
         Some((uid.clone(), entry.question.clone(), namespace))
     }
@@ -168,11 +209,21 @@ impl<Q: Question> Shared<Q> {
     /// Takes an answer in. Returns whom it is for.
     pub(super) fn done(&self, uid: &str, question: &Q, answer: Q::Answer) -> Option<ObjectRef<Submission>> {
         let mut entries = lock(&self.entries);
+        let mut under_way = lock(&self.under_way);
+        if let Some(index) = under_way.iter().position(|asked| asked == question) {
+            under_way.swap_remove(index);
+        }
         let entry = entries.get_mut(uid).filter(|entry| entry.question == *question)?;
         entry.is_under_way = false;
         entry.answer = Some(Arc::new(answer));
         Some(entry.by.clone())
     }
+}
+
+/// Whether the services of a question have not their share of what is under way.
+fn has_room<Q: Question>(under_way: &[Q], question: &Q) -> bool {
+    let same = under_way.iter().filter(|other| question.shares_a_service(other));
+    same.count() < Q::AT_ONCE_OF_A_SERVICE
 }
 
 async fn ask_all<Q: Question, F>(ask: impl Fn(Q, String) -> F, shared: Arc<Shared<Q>>, wake: Wake<Submission>)

@@ -27,6 +27,8 @@ const A_DAY: SignedDuration = SignedDuration::from_hours(24);
 pub struct TeamHistory {
     /// Within a day.
     pub within_a_day: usize,
+    /// Whether there may have been more of them within a day than their Submissions remember.
+    pub may_be_more: bool,
     /// Since a run of the team last finished.
     pub in_a_row: usize,
     /// Nodes of those in a row.
@@ -223,11 +225,14 @@ impl Board {
         let Some(team) = self.teams.get(name) else {
             return TeamHistory::default();
         };
-        let is_recent = |one: &&InfrastructureFailures| now.duration_since(one.last_time.0) < A_DAY;
         let all = team.failures.values().map(|failures| &failures.of);
+        let (within_a_day, may_be_more) = all
+            .map(|one| within_a_day(one, now))
+            .fold((0, false), |(sum, any), (recent, more)| (sum + recent, any || more));
         let since = team.in_a_row().map(|one| one.first_time.0).min();
         TeamHistory {
-            within_a_day: all.filter(is_recent).map(number).sum(),
+            within_a_day,
+            may_be_more,
             in_a_row: team.in_a_row().map(number).sum(),
             nodes: team.in_a_row().flat_map(|one| one.nodes.iter().cloned()).collect(),
             others: since.map_or_else(Others::default, |since| self.others(submission, name, since)),
@@ -318,6 +323,13 @@ fn failures(submission: &Submission) -> Option<&InfrastructureFailures> {
 
 fn number(failures: &InfrastructureFailures) -> usize {
     usize::try_from(failures.number).unwrap_or(0)
+}
+
+/// How many of them ended within a day, as far as the Submission remembers, and whether there may be more.
+fn within_a_day(failures: &InfrastructureFailures, now: Timestamp) -> (usize, bool) {
+    let known = failures.known_times();
+    let recent = known.iter().filter(|time| now.duration_since(time.0) < A_DAY).count();
+    (recent, recent == known.len() && recent < number(failures))
 }
 
 /// When it ended with results that count.

@@ -1,6 +1,8 @@
 //! The table of repeated failures: a row for each case.
 
+use k8s_openapi::apimachinery::pkg::apis::meta::v1::Time;
 use leaderboard_api::Use;
+use leaderboard_api::infrastructure_failures::MAX_RECENT_TIMES;
 use serde_json::{Value, json};
 
 use super::*;
@@ -44,7 +46,10 @@ fn submission(number: usize, run: &Run) -> Submission {
     });
     let time = at(run.hour).to_string();
     let condition = |status: &str, reason: &str| json!([{"type": "Finished", "status": status, "reason": reason, "message": "", "lastTransitionTime": time}]);
-    let failures = |number: i32| json!({"number": number, "firstTime": time, "lastTime": time, "nodes": [run.node]});
+    let failures = |number: i32| {
+        let recent = vec![&time; usize::try_from(number).unwrap().min(MAX_RECENT_TIMES)];
+        json!({"number": number, "firstTime": time, "lastTime": time, "recentTimes": recent, "nodes": [run.node]})
+    };
     let mut status: Value = match run.end {
         Finished => json!({"conditions": condition("True", "Finished"), "times": {"finished": time}}),
         Failed(number) => json!({
@@ -217,6 +222,30 @@ fn within_a_day_every_attempt_of_the_team_counts_also_those_that_were_resumed() 
     let mut nobodys = submission(9, &runs[0]);
     nobodys.spec.team = None;
     assert_eq!(teams.history(&nobodys, at(20)), TeamHistory::default());
+}
+
+#[test]
+fn within_a_day_an_older_failure_of_the_same_submission_does_not_count() {
+    const WEEK: i64 = 7 * 24;
+    // Four failures each, and the hours of those that are remembered; it is hour 20.
+    for (what, hours, expected) in [
+        ("one a week", vec![19 - 2 * WEEK, 19 - WEEK, 19], (1, false)),
+        ("two today", vec![19 - WEEK, 18, 19], (2, false)),
+        ("as many today as are remembered, or more", vec![17, 18, 19], (3, true)),
+        ("an older operator's, today", vec![], (1, true)),
+    ] {
+        let mut one = submission(0, &run("a", Failed(4), 19, "n1"));
+        let failures = one.status.as_mut().unwrap().infrastructure_failures.as_mut().unwrap();
+        failures.recent_times = hours.into_iter().map(|hour| Time(at(hour))).collect();
+        let found = shown([&one]).history(&one, at(20));
+        assert_eq!((found.within_a_day, found.may_be_more), expected, "{what}");
+        assert_eq!(found.in_a_row, 4, "{what}");
+    }
+    let mut old = submission(0, &run("a", Failed(4), 20 - 24, "n1"));
+    let failures = old.status.as_mut().unwrap().infrastructure_failures.as_mut().unwrap();
+    failures.recent_times = Vec::new();
+    let found = shown([&old]).history(&old, at(20));
+    assert_eq!((found.within_a_day, found.may_be_more, found.in_a_row), (0, false, 4));
 }
 
 #[test]

@@ -444,6 +444,8 @@ pub enum EvalaiEnd {
 pub struct RecordView {
     /// The end of this attempt is written.
     pub end_written: bool,
+    /// The table keeps a later attempt, or another end, in place of this end.
+    pub is_superseded: bool,
     /// Why the last write failed.
     pub error: Option<String>,
 }

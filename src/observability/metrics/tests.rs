@@ -83,7 +83,7 @@ fn every_metric_has_its_name_and_its_labels() {
         "leaderboard_reconcile_wait_duration_seconds_bucket{le=\"0.025\",kind=\"Submission\",class=\"new\"} 1",
         "leaderboard_reconcile_wait_duration_seconds_count{kind=\"Submission\",class=\"urgent\"} 0",
         "leaderboard_watch_errors_total{kind=\"Job\"} 1",
-        "leaderboard_watch_malformed_objects_total{kind=\"Job\"} 0",
+        "leaderboard_watch_unreadable_objects{kind=\"Job\"} 0",
         "leaderboard_is_leader 1",
         "leaderboard_leader_term 7",
         "leaderboard_lease_errors_total{reason=\"timeout\"} 1",
@@ -188,7 +188,7 @@ fn a_bridge_exports_what_it_counts_and_nothing_of_a_controller() {
     let expected = [
         "leaderboard_build",
         "leaderboard_watch_errors",
-        "leaderboard_watch_malformed_objects",
+        "leaderboard_watch_unreadable_objects",
         "leaderboard_watch_last_event_timestamp_seconds",
         "leaderboard_cloud_calls",
         "leaderboard_cloud_call_duration_seconds",

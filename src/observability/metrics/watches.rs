@@ -2,15 +2,16 @@
 
 use prometheus_client::metrics::counter::Counter;
 use prometheus_client::metrics::family::Family;
+use prometheus_client::metrics::gauge::Gauge;
 use prometheus_client::registry::Registry;
 
 use super::labels::Kind;
-use super::{FloatGauge, Metrics, unix_time, zero};
+use super::{FloatGauge, Metrics, unix_time, whole, zero};
 
 #[derive(Debug)]
 pub(super) struct Watches {
     errors: Family<Kind, Counter>,
-    malformed: Family<Kind, Counter>,
+    unreadable: Family<Kind, Gauge>,
     last_event: Family<Kind, FloatGauge>,
 }
 
@@ -18,7 +19,7 @@ impl Watches {
     pub(super) fn new(r: &mut Registry) -> Self {
         Self {
             errors: zero(r, "watch_errors", "Errors of a kind's watch"),
-            malformed: zero(r, "watch_malformed_objects", "Objects that could not be read"),
+            unreadable: zero(r, "watch_unreadable_objects", "Objects that cannot be read now"),
             last_event: zero(
                 r,
                 "watch_last_event_timestamp_seconds",
@@ -29,12 +30,12 @@ impl Watches {
 }
 
 impl Metrics {
-    /// The counters of one kind's watch; they appear at once, at zero.
+    /// What is counted of one kind's watch; it appears at once, at zero.
     pub fn watch(&self, kind: &str) -> WatchMetrics {
         let label = Kind { kind: kind.to_owned() };
         WatchMetrics {
             errors: self.watches.errors.get_or_create_owned(&label),
-            malformed: self.watches.malformed.get_or_create_owned(&label),
+            unreadable: self.watches.unreadable.get_or_create_owned(&label),
             last_event: self.watches.last_event.get_or_create_owned(&label),
         }
     }
@@ -44,7 +45,7 @@ impl Metrics {
 #[derive(Clone, Debug)]
 pub struct WatchMetrics {
     errors: Counter,
-    malformed: Counter,
+    unreadable: Gauge,
     last_event: FloatGauge,
 }
 
@@ -54,9 +55,9 @@ impl WatchMetrics {
         self.errors.inc();
     }
 
-    /// An object could not be read.
-    pub fn malformed(&self) {
-        self.malformed.inc();
+    /// So many objects cannot be read now.
+    pub fn unreadable(&self, objects: usize) {
+        self.unreadable.set(whole(objects));
     }
 
     /// The watch brought something.

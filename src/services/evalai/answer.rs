@@ -42,6 +42,13 @@ pub struct Refusal {
     pub message: String,
 }
 
+impl Refusal {
+    /// Of one submission, to a host of the challenge whose queue named it: EvalAI says that only of another challenge's.
+    pub(super) fn is_of_another_challenge(&self) -> bool {
+        self.about == About::Request && self.status == 401 && self.message.contains(NOT_AUTHORIZED)
+    }
+}
+
 /// What a refusal is about.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 pub enum About {

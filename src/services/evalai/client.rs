@@ -15,13 +15,17 @@ use super::answer::Answer;
 use super::files::Files;
 use super::http::{ClientError, Need, Timeouts, answer, builder, made};
 use super::request::{Reply, Request, SubmissionRef};
+use super::row::Row;
 use super::types::Payload;
 use crate::services::meter::Meter;
 use crate::services::public::Reach;
 use crate::services::token::Token;
 
-/// Largest answer that is read, a list of many thousand rows, in bytes.
-const LARGEST: usize = 64 << 20;
+/// Largest answer that is read about one submission, in bytes: a row has some 2 kB, and its participant can write into it.
+const LARGEST_ROW: usize = 1 << 20;
+/// Largest other answer that is read, in bytes: a list takes 8 ms for each row and has 30 s, so it has less than 4,000.
+const LARGEST: usize = 8 << 20;
+
 /// A server of EvalAI.
 #[derive(Clone, Debug)]
 pub struct Client {
@@ -83,7 +87,7 @@ impl Client {
 
     async fn exchange(&self, token: &Token, request: &Request) -> Reply {
         match request {
-            Request::Get(s) => Reply::Row(self.get(token, &format!("jobs/submission/{}", s.pk)).await),
+            Request::Get(s) => Reply::Row(self.row(token, s.pk).await),
             Request::Image(_, url) => Reply::Image(self.files.image(url).await),
             Request::List {
                 challenge,
@@ -109,7 +113,7 @@ impl Client {
                 let path = format!("jobs/challenge/queues/{queue}/");
                 Reply::Message(self.get(token, &path).await.of_hosts())
             }
-            Request::MessageRow(_, pk) => Reply::Row(self.get(token, &format!("jobs/submission/{pk}")).await),
+            Request::MessageRow(_, pk) => Reply::Row(self.row(token, *pk).await),
             Request::DeleteMessage(queue, receipt) => {
                 let body = BTreeMap::from([("receipt_handle", receipt)]);
                 let path = format!("jobs/queues/{queue}/");
@@ -140,9 +144,18 @@ impl Client {
         self.write(token, Method::PUT, &path, &body).await
     }
 
+    async fn row(&self, token: &Token, pk: i64) -> Answer<Row> {
+        let path = format!("jobs/submission/{pk}");
+        self.get_within(LARGEST_ROW, token, &path).await
+    }
+
     async fn get<T: DeserializeOwned>(&self, token: &Token, path: &str) -> Answer<T> {
+        self.get_within(LARGEST, token, path).await
+    }
+
+    async fn get_within<T: DeserializeOwned>(&self, largest: usize, token: &Token, path: &str) -> Answer<T> {
         let request = self.api.get(format!("{}{path}", self.base)).timeout(self.timeouts.read);
-        let answer = answer(request.header(AUTHORIZATION, token.header()), LARGEST, Need::Body).await;
+        let answer = answer(request.header(AUTHORIZATION, token.header()), largest, Need::Body).await;
         answer.and_then(|(status, body)| match serde_json::from_slice(&body) {
             Ok(content) => Answer::Done(content),
             Err(_) => Answer::unusable(status, "something that is not EvalAI's"),
@@ -161,7 +174,7 @@ impl Client {
             .header(AUTHORIZATION, token.header())
             .header(CONTENT_TYPE, "application/json")
             .body(body);
-        answer(request, LARGEST, Need::Status)
+        answer(request, LARGEST_ROW, Need::Status)
             .await
             .and_then(|_| Answer::Done(()))
     }

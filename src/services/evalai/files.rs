@@ -107,6 +107,10 @@ async fn content(response: Response) -> Answer<ImageAnswer> {
             Answer::Done(ImageAnswer::NotAnImage(why))
         }
         other => other.and_then(|(_, body)| {
+            // No JSON begins so: a login page, or the start page of a web application, stands in the file's place.
+            if body.trim_ascii_start().starts_with(b"<") {
+                return refused("the address of the uploaded file answers with a page and not with the file");
+            }
             let named = image(&body).map(ImageAnswer::Named);
             Answer::Done(named.unwrap_or_else(ImageAnswer::NotAnImage))
         }),

@@ -130,3 +130,16 @@ async fn redirects_end() {
         "{said}"
     );
 }
+
+#[tokio::test]
+async fn a_page_in_the_place_of_the_file_is_nobodys_image() {
+    let page = "\n<!DOCTYPE html><html><title>Log in</title></html>";
+    let head = format!(
+        "HTTP/1.1 200 OK\r\nconnection: close\r\ncontent-length: {}\r\n\r\n",
+        page.len()
+    );
+    let login = Server::start("127.0.0.2", head + page).await;
+    let evalai = Server::leading_to("127.0.0.1", &login.url).await;
+    let message = refusal(read_as(&evalai.url, &format!("{}/media/1.json", evalai.url)).await);
+    assert!(message.contains("a page") && message.contains("MEDIA_URL"), "{message}");
+}

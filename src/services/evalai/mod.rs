@@ -12,6 +12,7 @@ mod files;
 pub mod guard;
 mod http;
 pub mod hub;
+mod job_names;
 pub mod labels;
 mod payload;
 pub mod queue;

@@ -7,6 +7,8 @@ use jiff::Timestamp;
 use serde::{Deserialize, Deserializer};
 use serde_json::Value;
 
+use super::job_names::JobNames;
+
 use super::status::Status;
 use leaderboard_api::ImageReference;
 use leaderboard_api::text::{LONGEST_NAME, one_line};
@@ -32,7 +34,7 @@ pub struct Row {
     pub completed_at: Option<Timestamp>,
     /// Where the uploaded file is.
     pub input_file: Option<String>,
-    /// Every `job_name` ever sent, in lower case.
+    /// The last of all `job_name` ever sent, in lower case.
     pub jobs: Vec<String>,
 }
 
@@ -88,13 +90,12 @@ impl<'de> Deserialize<'de> for Row {
             #[serde(default)]
             input_file: Value,
             #[serde(default)]
-            job_name: Value,
+            job_name: JobNames,
         }
         let raw = Raw::deserialize(deserializer)?;
         let text = |value: &Value| value.as_str().map(str::to_owned);
         let time = |value: &Value| value.as_str().and_then(|text| text.parse().ok());
         let ignored = raw.ignore_submission.as_bool() == Some(true);
-        let jobs = raw.job_name.as_array().into_iter().flatten();
         Ok(Self {
             id: raw.id,
             status: match Status::parse(&raw.status) {
@@ -109,7 +110,7 @@ impl<'de> Deserialize<'de> for Row {
             resumed_at: time(&raw.rerun_resumed_at),
             completed_at: time(&raw.completed_at),
             input_file: text(&raw.input_file),
-            jobs: jobs.filter_map(Value::as_str).map(str::to_lowercase).collect(),
+            jobs: raw.job_name.into(),
         })
     }
 }

@@ -273,7 +273,9 @@ pub enum Origin {
     Wanted(Timestamp),
     /// It does not exist.
     Missing,
-    /// Nothing that helps: the message names none, or one that this token may not read.
+    /// This token may not read it, though its user reads the queue as a host of the challenge: its row is another challenge's by now.
+    Foreign,
+    /// Nothing that helps: the message names none, or EvalAI refuses to show it for another reason.
     Hidden,
 }
 

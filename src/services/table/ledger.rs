@@ -43,6 +43,8 @@ pub struct RowState {
     pub attempt: i64,
     /// True if the end of that attempt is in the table.
     pub end_written: bool,
+    /// True if the table keeps a later attempt, or another end, in place of that end.
+    pub is_superseded: bool,
     /// Why the newest row is not in the table.
     pub error: Option<String>,
 }
@@ -64,6 +66,7 @@ struct Entry {
     newest: RowUpdate,
     is_pending: bool,
     is_written: bool,
+    is_superseded: bool,
     refused_until: Option<Instant>,
     error: Option<String>,
 }
@@ -88,12 +91,13 @@ impl Ledger {
             if is_older || is_known {
                 return false;
             }
-            if update.row.attempt != old.row.attempt {
+            if update.row.attempt != old.row.attempt || entry.is_superseded {
                 entry.error = None;
             }
             entry.turn = if entry.is_pending { entry.turn } else { turn };
             entry.newest = update;
             (entry.is_pending, entry.is_written, entry.refused_until) = (true, false, None);
+            entry.is_superseded = false;
             return true;
         }
         let entry = Entry {
@@ -102,6 +106,7 @@ impl Ledger {
             newest: update,
             is_pending: true,
             is_written: false,
+            is_superseded: false,
             refused_until: None,
             error: None,
         };
@@ -146,6 +151,7 @@ impl Ledger {
             }
             Err(error) if is_newest => {
                 (entry.is_pending, entry.refused_until) = (false, Some(now + REFUSED));
+                entry.is_superseded = matches!(error, TableError::Stale { .. });
                 entry.error = Some(error.to_string());
             }
             // A newer row waits already; what became of the older one means nothing.
@@ -159,6 +165,7 @@ impl Ledger {
         self.entries.get(key).map(|entry| RowState {
             attempt: entry.newest.row.attempt,
             end_written: entry.newest.end && entry.is_written,
+            is_superseded: entry.is_superseded,
             error: entry.error.clone(),
         })
     }
@@ -228,6 +235,7 @@ mod tests {
         RowState {
             attempt,
             end_written,
+            is_superseded: false,
             error: error.map(str::to_owned),
         }
     }
@@ -378,6 +386,26 @@ mod tests {
         ledger.record(table("t"), &a, update(1, "9/9", true), now);
         ledger.report(&table("t"), &a, &update(1, "9/9", true), Ok(Written::Stale), now);
         let error = "table t already holds a later attempt or another end of submission 7; the row is left as it is";
-        assert_eq!(ledger.view(&a), Some(view(1, false, Some(error))));
+        let superseded = RowState {
+            is_superseded: true,
+            ..view(1, false, Some(error))
+        };
+        assert_eq!(ledger.view(&a), Some(superseded));
+        assert_eq!(ledger.next(&table("t")), None, "it would be refused again");
+    }
+
+    #[test]
+    fn an_end_is_superseded_until_there_is_another_row() {
+        for next in [update(1, "cancelled", true), update(2, "1/9", false)] {
+            let (mut ledger, now, a) = (Ledger::default(), Instant::now(), key("a"));
+            ledger.record(table("t"), &a, update(1, "9/9", true), now);
+            assert!(ledger.report(&table("t"), &a, &update(1, "9/9", true), Ok(Written::Stale), now));
+            let attempt = next.row.attempt;
+            let is_end = next.end;
+            assert!(ledger.record(table("t"), &a, next.clone(), now));
+            assert_eq!(ledger.view(&a), Some(view(attempt, false, None)));
+            ledger.report(&table("t"), &a, &next, Ok(Written::Stored), now);
+            assert_eq!(ledger.view(&a), Some(view(attempt, is_end, None)));
+        }
     }
 }

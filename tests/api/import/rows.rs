@@ -1,15 +1,17 @@
 //! Rows of the original pipeline's table become Submissions.
 
 use std::collections::BTreeMap;
+use std::time::Duration;
 
 use aws_sdk_dynamodb::types::AttributeValue;
+use k8s_openapi::api::admissionregistration::v1::{ValidatingAdmissionPolicy, ValidatingAdmissionPolicyBinding};
 use k8s_openapi::api::batch::v1::Job;
-use kube::api::{ListParams, Patch, PatchParams};
+use kube::api::{ListParams, Patch, PatchParams, PostParams};
 use kube::runtime::wait::await_condition;
 use kube::{Api, ResourceExt};
 use leaderboard_api::{Leaderboard, State, Submission, names};
 use serde_json::{Value, json};
-use tokio::time::timeout;
+use tokio::time::{sleep, timeout};
 
 use super::{import, texts};
 use crate::api::bridge::LIMIT;
@@ -78,6 +80,13 @@ impl Table {
     }
 
     async fn import(&self, more: &[&str]) -> String {
+        let (code, notes) = self.import_to_its_end(more).await;
+        assert_eq!(code, Some(0), "{notes}");
+        notes
+    }
+
+    /// The exit code, and all that it prints.
+    async fn import_to_its_end(&self, more: &[&str]) -> (Option<i32>, String) {
         let namespace = &self.world.namespace;
         let always = [
             "--from-table",
@@ -89,8 +98,7 @@ impl Table {
         ];
         let output = import(&[always.as_slice(), more].concat()).await;
         let (out, err) = texts(&output);
-        assert!(output.status.success(), "{err}");
-        format!("{out}{err}")
+        (output.status.code(), format!("{out}{err}"))
     }
 
     async fn submissions(&self) -> BTreeMap<String, Submission> {
@@ -120,6 +128,57 @@ impl Table {
         self.world
             .evalai
             .with_state(|state| evalai_stand_in::submissions::create(state, new, stored, now))
+    }
+
+    /// The API server refuses to make one Submission, and to take the status of another.
+    async fn refuse(&self, made: &str, status: &str) {
+        let (client, namespace) = (&self.world.client, self.world.namespace.as_str());
+        let policy = json!({
+            "metadata": {"name": namespace},
+            "spec": {
+                "matchConstraints": {
+                    "namespaceSelector": {"matchLabels": {"kubernetes.io/metadata.name": namespace}},
+                    "resourceRules": [{
+                        "apiGroups": ["leaderboard.carla.org"],
+                        "apiVersions": ["*"],
+                        "operations": ["CREATE", "UPDATE"],
+                        "resources": ["submissions", "submissions/status"],
+                    }],
+                },
+                "validations": [{
+                    "expression": format!("object.metadata.name != (has(object.status) ? '{status}' : '{made}')"),
+                    "message": "a rule of this cluster",
+                }],
+            },
+        });
+        let binding = json!({
+            "metadata": {"name": namespace},
+            "spec": {"policyName": namespace, "validationActions": ["Deny"]},
+        });
+        let policies: Api<ValidatingAdmissionPolicy> = Api::all(client.clone());
+        let policy = serde_json::from_value(policy).unwrap();
+        policies.create(&PostParams::default(), &policy).await.unwrap();
+        let bindings: Api<ValidatingAdmissionPolicyBinding> = Api::all(client.clone());
+        let binding = serde_json::from_value(binding).unwrap();
+        bindings.create(&PostParams::default(), &binding).await.unwrap();
+        self.await_refusal(made).await;
+    }
+
+    /// The API server takes a new policy in only after a moment.
+    async fn await_refusal(&self, name: &str) {
+        let dry_run = PostParams {
+            dry_run: true,
+            ..PostParams::default()
+        };
+        let spec = json!({"leaderboardName": "lb", "evalai": {"challenge": 1, "phase": 1, "submission": 1}});
+        let trial = Submission::new(name, serde_json::from_value(spec).unwrap());
+        let api = self.world.api::<Submission>();
+        let refused = async {
+            while api.create(&dry_run, &trial).await.is_ok() {
+                sleep(Duration::from_millis(100)).await;
+            }
+        };
+        timeout(LIMIT, refused).await.expect("the policy has no effect");
     }
 
     fn updates(&self) -> Vec<String> {
@@ -287,7 +346,7 @@ async fn one_whose_status_was_not_written_is_completed_by_the_next_import() {
     half.annotations_mut()
         .insert(names::ANNOTATION_IMPORTED.into(), table.name.clone());
     let api = world.api::<Submission>();
-    api.create(&kube::api::PostParams::default(), &half).await.unwrap();
+    api.create(&PostParams::default(), &half).await.unwrap();
     let _controller = world.controller();
     // One that is no import shows that the controller has had its turn.
     let (_, other) = world.submit("lb", 1).await;
@@ -302,4 +361,36 @@ async fn one_whose_status_was_not_written_is_completed_by_the_next_import() {
     world
         .until(&name, "it has ended", |status| status.state == Some(State::Finished))
         .await;
+}
+
+#[tokio::test]
+async fn one_that_the_api_server_refuses_keeps_no_other_from_being_imported() {
+    let table = Table::new(World::new().await).await;
+    let world = &table.world;
+    let spec = json!({"table": {"name": table.name, "endpoint": world.aws.endpoint}});
+    world.leaderboard_with("lb", 1, "Hosts", &spec).await;
+    // The rows are imported in the order of their ids, which have as many digits.
+    let ids = [101, 102, 103];
+    for id in ids {
+        table.put(id, "FINISHED", None, &[("driving_score", "1.5")]).await;
+    }
+    let names = ids.map(|id| format!("submission-{id}"));
+    table.refuse(&names[0], &names[1]).await;
+    let (code, notes) = table.import_to_its_end(&[]).await;
+    assert_eq!(code, Some(1), "{notes}");
+    let refused: Vec<&str> = notes.lines().filter(|line| line.starts_with("refused: ")).collect();
+    for (name, what) in [(&names[0], "creation"), (&names[1], "status")] {
+        let begin = format!("refused: {name}: the {what} of Submission {name} failed: the API server answered ");
+        let is_named = |line: &&str| line.starts_with(&begin) && line.contains("a rule of this cluster");
+        assert!(refused.iter().any(is_named), "{begin}: {notes}");
+    }
+    assert_eq!(refused.len(), 2, "{notes}");
+    let imported = format!("{}: imported as Finished, score 1.50\n", names[2]);
+    assert!(notes.contains(&imported), "{notes}");
+    let last = "3 rows: made 1 that have ended, 0 that go on; 0 were there already; 0 undecided; \
+        2 refused by the API server: correct what it names and repeat the command\n";
+    assert!(notes.ends_with(last), "{notes}");
+    let found = table.submissions().await;
+    assert_eq!(found.keys().collect::<Vec<_>>(), [&names[1], &names[2]]);
+    assert!(found[&names[1]].status.is_none() && found[&names[1]].awaits_import());
 }

@@ -35,7 +35,8 @@ reasons! {
             "Another program, such as the old pipeline, runs the submission, or whether one does cannot be read: the table's row is \
              `SUBMITTED` or `RUNNING` and has no `attempt`; or, where there is no row, objects below its prefix are younger than \
              `deadlines.runSeconds` (without a limit: than a day) and have no `logcopy/owner`. No Job is created, and nothing is \
-             written to EvalAI, table and bucket.",
+             written to EvalAI, table and bucket. Where EvalAI shows an end and the Submission has no status of a run, as after a restore \
+             from a backup: whether the end is that of a run of this operator cannot be read.",
             "Wait for the end of the other run; the submission is looked for every 30 s. If nothing runs it any more, set the row's \
              `submission_status` to `FAILED`, or annotate the Submission with `leaderboard.carla.org/adopt=true`: it then continues \
              from what is stored. If the message has an error, do what it asks.";
@@ -292,8 +293,9 @@ reasons! {
             "EvalAI: check that the phase's leaderboard schema has all metric labels. DynamoDB: check the table and the operator's \
              rights.";
         NOT_REQUIRED = "NotRequired",
-            "There is nothing to publish: no EvalAI, no table, no team, or EvalAI ended the submission itself.",
-            "Nothing.";
+            "There is nothing to publish: no EvalAI, no table, no team, or EvalAI ended the submission itself; or the table keeps a later \
+             attempt or another end of the run, as the message then says.",
+            "Nothing, unless the message asks for it.";
         CONCURRENT_UPDATE = "ConcurrentUpdate",
             "An update of EvalAI and one of the operator happened at the same time, or the submission was deleted before its end: \
              EvalAI may show the wrong end. The operator reads EvalAI again and writes `cancelled` if needed.",

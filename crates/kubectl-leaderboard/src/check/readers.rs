@@ -112,7 +112,7 @@ async fn try_ask(queue: &Queue) -> Result<Vec<Reader>, String> {
     let arn = attributes.pointer("/Attributes/QueueArn").and_then(Value::as_str);
     let arn = arn.ok_or("aws sqs named no ARN of the queue")?.to_owned();
     let mut found = pipes(&run(&pipes_command(queue, &arn)).await?, &arn);
-    found.extend(mappings(&run(&mappings_command(queue, &arn)).await?));
+    found.extend(mappings(&run(&mappings_command(queue, &arn)).await?, &arn));
     Ok(found)
 }
 
@@ -149,13 +149,13 @@ fn pipes(answer: &Value, arn: &str) -> Vec<Reader> {
     names
         .map(|name| Reader {
             what: format!("EventBridge Pipe {name}"),
-            stop: format!("aws pipes stop-pipe --name {name}"),
+            stop: format!("aws pipes stop-pipe --name {name}{}", region(arn)),
         })
         .collect()
 }
 
 /// The functions that read the queue, in the answer of `aws lambda list-event-source-mappings`.
-fn mappings(answer: &Value) -> Vec<Reader> {
+fn mappings(answer: &Value, arn: &str) -> Vec<Reader> {
     let all = answer["EventSourceMappings"]
         .as_array()
         .map(Vec::as_slice)
@@ -171,11 +171,18 @@ fn mappings(answer: &Value) -> Vec<Reader> {
         .map(|mapping| Reader {
             what: format!("Lambda function {}", text(mapping, "FunctionArn")),
             stop: format!(
-                "aws lambda update-event-source-mapping --no-enabled --uuid {}",
-                text(mapping, "UUID")
+                "aws lambda update-event-source-mapping --no-enabled --uuid {}{}",
+                text(mapping, "UUID"),
+                region(arn)
             ),
         })
         .collect()
+}
+
+/// The flag with the region of a queue, as its ARN names it: a Pipe and a mapping are where their queue is.
+fn region(arn: &str) -> String {
+    let region = arn.split(':').nth(3).filter(|region| !region.is_empty());
+    region.map_or_else(String::new, |region| format!(" --region {}", clean(region)))
 }
 
 /// The same commands, for a person. The ARN is the answer of the first one.
@@ -255,18 +262,20 @@ mod tests {
             pipes(&answer, arn),
             [Reader {
                 what: "EventBridge Pipe old-pipeline".into(),
-                stop: "aws pipes stop-pipe --name old-pipeline".into()
+                stop: "aws pipes stop-pipe --name old-pipeline --region eu-west-1".into()
             }]
         );
         assert_eq!(pipes(&json!({}), arn), []);
         let mapping = |state: &str| json!({"UUID": state, "FunctionArn": "arn:f", "State": state});
         let answer = json!({"EventSourceMappings": [mapping("Enabled"), mapping("Disabled"), mapping("Creating")]});
-        let found: Vec<String> = mappings(&answer).into_iter().map(|reader| reader.stop).collect();
+        let found: Vec<String> = mappings(&answer, arn).into_iter().map(|reader| reader.stop).collect();
         assert_eq!(
             found,
-            ["Enabled", "Creating"]
-                .map(|id| format!("aws lambda update-event-source-mapping --no-enabled --uuid {id}"))
+            ["Enabled", "Creating"].map(|id| format!(
+                "aws lambda update-event-source-mapping --no-enabled --uuid {id} --region eu-west-1"
+            ))
         );
+        assert_eq!(region("?"), "", "a stand-in may name no ARN");
     }
 
     #[test]

@@ -7,8 +7,8 @@ use tokio::time::Instant;
 use super::request::{Answer, KINDS, Sent, Target};
 use crate::controller::submissions::failure_log::{LogDemand, Tail};
 use crate::controller::submissions::report_digest::{ReportDigest, ReportId};
-use crate::controller::submissions::view::{ObservedLog, ObservedTexts, ReportDemand, Stage, Texts};
-use leaderboard_api::JobNumber;
+use crate::controller::submissions::view::{ObservedLog, ObservedReport, ObservedTexts, ReportDemand, Stage, Texts};
+use leaderboard_api::{Attempt, JobNumber};
 
 pub(super) struct Run {
     pub target: Arc<Target>,
@@ -90,6 +90,19 @@ impl ReportRun {
         Sent {
             demand: self.wanted.clone(),
             memory: self.memory,
+        }
+    }
+
+    /// The report as that of an attempt. `is_former`: what is read is of the time before the object was restored from a backup, and may be
+    /// of a later attempt than the object knows of. Its own Pods store reports of its attempt alone.
+    pub fn shown(&self, wanted: Attempt, is_former: bool) -> ObservedReport {
+        let is_of = |attempt: Attempt| attempt == wanted || (is_former && attempt > wanted);
+        match (&self.error, &self.content) {
+            (Some(why), _) => ObservedReport::Unreadable(why.clone()),
+            (None, None) => ObservedReport::NotRead,
+            (None, Some(Content::Absent)) => ObservedReport::Absent,
+            (None, Some(Content::Report(report))) if is_of(report.attempt) => ObservedReport::Ours(Arc::clone(report)),
+            (None, Some(Content::Foreign | Content::Report(_))) => ObservedReport::Foreign,
         }
     }
 

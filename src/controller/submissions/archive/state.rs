@@ -10,7 +10,7 @@ use std::time::Duration;
 use tokio::time::Instant;
 
 use super::request::{Done, KINDS, Kind, LIMITS, Target, Uid, What, Work};
-use super::run::{Content, FenceRun, LogRun, ReportRun, Run, TextsRun, answers};
+use super::run::{FenceRun, LogRun, ReportRun, Run, TextsRun, answers};
 use crate::controller::submissions::failure_log::{LogAnswer, LogDemand, Tail};
 use crate::controller::submissions::report_digest::ReportId;
 use crate::controller::submissions::view::{
@@ -96,8 +96,8 @@ impl State {
 
     /// What is known of a report, seen from a run that is at this Job with this Pod.
     pub fn report(&self, uid: &str, job: JobNumber, pod: Option<&str>, now: Instant) -> SeenReport {
-        let known = self.runs.get(uid).and_then(|run| run.report.as_ref());
-        let Some(known) = known else {
+        let run = self.runs.get(uid);
+        let Some((run, known)) = run.and_then(|run| Some((run, run.report.as_ref()?))) else {
             return SeenReport {
                 report: ObservedReport::NotRead,
                 stage: None,
@@ -108,17 +108,8 @@ impl State {
             let is_of_pod = sent.pod.as_deref() == pod || sent.stage == Stage::JobEnded;
             sent.job == job && is_of_pod
         };
-        let report = match (&known.error, &known.content) {
-            (Some(why), _) => ObservedReport::Unreadable(why.clone()),
-            (None, None) => ObservedReport::NotRead,
-            (None, Some(Content::Absent)) => ObservedReport::Absent,
-            (None, Some(Content::Report(report))) if report.attempt == job.attempt => {
-                ObservedReport::Ours(Arc::clone(report))
-            }
-            (None, Some(Content::Foreign | Content::Report(_))) => ObservedReport::Foreign,
-        };
         SeenReport {
-            report,
+            report: known.shown(job.attempt, *run.target.submission_uid != *uid),
             stage: known.of.as_ref().filter(is_of).map(|sent| sent.stage),
             waited: now.saturating_duration_since(known.since),
         }

@@ -140,6 +140,26 @@ async fn what_is_no_report_is_unreadable_and_another_objects_is_foreign() {
 }
 
 #[tokio::test]
+async fn a_report_of_before_a_restore_may_be_of_a_later_attempt() {
+    let mut bench = bench().await;
+    let later = report("").replace(r#""attempt":1"#, r#""attempt":2"#);
+    let former = |text: &str| text.replace("uid-of-sub", "uid-before");
+    bench.stores("logcopy/report.json", later.as_str());
+    bench.demand(Stage::JobEnded);
+    let seen = bench.answer().await.report;
+    assert_eq!(seen.report, ObservedReport::Foreign, "its own Pods are of its attempt");
+    let status = bench.submission.status.as_mut().unwrap();
+    status.plan.as_mut().unwrap().submission_uid = Some("uid-before".into());
+    for (stored, attempt) in [(former(&later), 2), (former(&report("")), 1)] {
+        bench.workers().forget("uid-of-sub");
+        bench.stores("logcopy/report.json", stored);
+        bench.demand(Stage::JobEnded);
+        let seen = bench.answer().await.report;
+        assert_eq!(seen.report.ours().unwrap().attempt, Attempt(attempt));
+    }
+}
+
+#[tokio::test]
 async fn texts_count_only_with_the_digest_that_the_report_names() {
     let mut bench = bench().await;
     bench.stores("logcopy/report.json", report("all is well"));

@@ -110,7 +110,20 @@ pub(super) fn had_ended(draft: &mut PlanBuilder<'_>) -> bool {
         track,
         info,
     };
-    foreign::look(draft, terms).is_none() || restored::ends(draft, terms)
+    let Some(looked) = foreign::look(draft, terms) else {
+        return true;
+    };
+    if let Err(unread) = &looked.found {
+        foreign::looks_again(draft, terms, unread);
+        return true;
+    }
+    restored::ends(draft, terms)
+}
+
+/// Whether EvalAI's own end may be ours, of an object that has lost its status.
+pub(super) fn may_have_ended(draft: &PlanBuilder<'_>) -> bool {
+    let info = draft.evalai_info();
+    info.is_some_and(|info| stored::may_have_ended(draft, info))
 }
 
 /// The image, if one is named that the Leaderboard allows. Otherwise the draft shows why not.

@@ -26,6 +26,9 @@ const RERUN_SECONDS: i64 = 60;
 const CANCELLED: &str = "cancelled";
 /// What a check finds of the table.
 const TRIED: &str = "The table would take a row; a check writes none.";
+/// Shown of an end that is settled without a row: another try would be refused again.
+const SUPERSEDED: &str = "The table has a later attempt or another end of this run, and its row was left as it was. Correct the row by \
+                          hand if this end is the one that counts.";
 const SENT_AGAIN: &str = "EvalAI may have lost its own end of this submission: one of our requests may have overwritten it, or \
                            the submission was deleted before its end. EvalAI is read again, and `cancelled` is written if \
                            needed.";
@@ -131,10 +134,15 @@ fn farewell(draft: &PlanBuilder<'_>) -> Option<Timestamp> {
 }
 
 fn is_not_wanted(draft: &PlanBuilder<'_>, type_: &str) -> bool {
-    draft
-        .status
-        .condition(type_)
-        .is_some_and(|c| c.reason == reasons::NOT_REQUIRED)
+    let known = draft.status.condition(type_);
+    known.is_some_and(|c| c.reason == reasons::NOT_REQUIRED)
+}
+
+/// Whether the table keeps another row than that of this end: the recorder says so until it has forgotten the end, then the status.
+fn is_superseded(draft: &PlanBuilder<'_>) -> bool {
+    let shown = draft.status.condition(conditions::RECORDED);
+    let is_shown = shown.is_some_and(|c| c.reason == reasons::NOT_REQUIRED && c.message == SUPERSEDED);
+    is_shown || draft.view.record.as_ref().is_some_and(|row| row.is_superseded)
 }
 
 /// A Leaderboard that is gone can't show what is wanted: what was decided before stands, and what never ran needs nothing.
@@ -364,9 +372,9 @@ fn amend(draft: &mut PlanBuilder<'_>, status: &str) -> Delivery {
     let message = format!("EvalAI shows {status}, so the result is not published.");
     draft.condition(conditions::FINISHED, Truth::True, reasons::ENDED_IN_EVALAI, &message);
     draft.show(reasons::ENDED_IN_EVALAI, message);
-    // While EvalAI refused the result, its row was written with the outcome that no longer holds; the status may not show it yet.
+    // While EvalAI refused the result, the table was handed the outcome that no longer holds; the status may not show that yet.
     let is_written = draft.view.record.as_ref().is_some_and(|row| row.end_written);
-    if !is_written && !draft.status.is_true(conditions::RECORDED) {
+    if !is_written && !draft.status.is_true(conditions::RECORDED) && !is_superseded(draft) {
         return Delivery::Done;
     }
     draft.condition(conditions::RECORDED, Truth::False, reasons::WAITING, "");
@@ -381,21 +389,11 @@ fn record(draft: &mut PlanBuilder<'_>) -> Delivery {
     if draft.leaderboard().is_none() {
         return without_leaderboard(draft, conditions::RECORDED);
     }
-    let Some(view) = draft.view.record.clone() else {
-        draft.condition(conditions::RECORDED, Truth::False, reasons::NOT_REQUIRED, "");
-        return Delivery::Done;
-    };
-    if draft.status.plan.is_none() {
-        let message = "The submission was never accepted, so the table has no row for it.";
+    if let Some(message) = why_without_row(draft) {
         draft.condition(conditions::RECORDED, Truth::False, reasons::NOT_REQUIRED, message);
         return Delivery::Done;
     }
-    let has_team = draft.status.team.as_ref().is_some_and(|team| team.id.is_some());
-    if !has_team && !draft.spec().check {
-        let message = "The row needs a team; give spec.team.id to a submission that is not EvalAI's.";
-        draft.condition(conditions::RECORDED, Truth::False, reasons::NOT_REQUIRED, message);
-        return Delivery::Done;
-    }
+    let view = draft.view.record.clone().unwrap_or_default();
     if view.end_written {
         let message = if draft.spec().check { TRIED } else { "" };
         draft.condition(conditions::RECORDED, Truth::True, reasons::RECORDED, message);
@@ -418,6 +416,20 @@ fn record(draft: &mut PlanBuilder<'_>) -> Delivery {
     };
     draft.condition(conditions::RECORDED, Truth::False, reason, &message);
     Delivery::Waiting
+}
+
+/// Why the end has no row of its own; none if it has one, or will.
+fn why_without_row(draft: &PlanBuilder<'_>) -> Option<&'static str> {
+    let has_team = draft.status.team.as_ref().is_some_and(|team| team.id.is_some());
+    if draft.view.record.is_none() {
+        Some("")
+    } else if draft.status.plan.is_none() {
+        Some("The submission was never accepted, so the table has no row for it.")
+    } else if !has_team && !draft.spec().check {
+        Some("The row needs a team; give spec.team.id to a submission that is not EvalAI's.")
+    } else {
+        is_superseded(draft).then_some(SUPERSEDED)
+    }
 }
 
 /// A check only learns whether the table would take its row.

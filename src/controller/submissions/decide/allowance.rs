@@ -9,11 +9,11 @@ use k8s_openapi::apimachinery::pkg::apis::meta::v1::Time;
 use super::failure;
 use super::next_steps::Steps;
 use super::plan_builder::PlanBuilder;
-use leaderboard_api::infrastructure_failures::{CAN_BE_CAUSED, MAX_NODES};
+use leaderboard_api::infrastructure_failures::{CAN_BE_CAUSED, MAX_NODES, MAX_RECENT_TIMES};
 use leaderboard_api::{Failure, FailureClass, InfrastructureFailures, OnRepeatedInfrastructure, reasons};
 
-/// Attempts of a team that may end so in a Leaderboard within a day, each with all its Jobs.
-const FREE_ATTEMPTS: usize = 3;
+/// Attempts of a team that may end so in a Leaderboard within a day, each with all its Jobs. A Submission remembers as many.
+const FREE_ATTEMPTS: usize = MAX_RECENT_TIMES;
 
 /// Whether no further Job follows a failure, because of what the team had before.
 pub(super) fn is_used_up(draft: &PlanBuilder<'_>, found: &Failure) -> bool {
@@ -41,8 +41,10 @@ pub(super) fn counted(draft: &mut PlanBuilder<'_>, found: Failure) -> Failure {
         0 => "1 Job".to_owned(),
         retry => format!("{} Jobs", retry + 1),
     };
-    let attempts = match draft.view.team.within_a_day {
+    let history = &draft.view.team;
+    let attempts = match history.within_a_day {
         0 => "1 attempt".to_owned(),
+        before if history.may_be_more => format!("at least {} attempts", before + 1),
         before => format!("{} attempts", before + 1),
     };
     Failure {
@@ -74,12 +76,17 @@ fn note(draft: &mut PlanBuilder<'_>) {
         number: 0,
         first_time: now.clone(),
         last_time: now.clone(),
+        recent_times: Vec::new(),
         nodes: Vec::new(),
     };
     let known = draft
         .status
         .infrastructure_failures
         .get_or_insert_with(|| Box::new(none()));
+    let mut times = known.known_times().to_vec();
+    times.push(now.clone());
+    times.drain(..times.len().saturating_sub(MAX_RECENT_TIMES));
+    known.recent_times = times;
     known.number = known.number.saturating_add(1);
     known.last_time = now;
     let is_new = |node: &String| !known.nodes.contains(node);

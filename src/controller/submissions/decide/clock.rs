@@ -1,4 +1,5 @@
-//! How long a run has gone on, and what its Jobs have used. A Pod that waits for a node takes neither time nor GPUs.
+//! How long a run has gone on, and what its Jobs have used. A Pod that waits for a node takes neither time nor GPUs; one that is prepared
+//! has its GPUs, and takes no time before its first agent.
 //!
 //! Called by the stages of a live submission and of its end. Pure. The Pods of one Job share one time: an agent wins nothing by
 //! having its Pod evicted. A Job that replaces one which the infrastructure took away has the whole time again.
@@ -21,21 +22,42 @@ pub(super) fn take_node(draft: &mut PlanBuilder<'_>, pod: &PodView) {
         let lost = lost_at(draft, before);
         draft.status.ran_seconds += began_at(draft).map_or(0, |began| seconds(began, lost));
         count_use(draft, lost);
+        draft.status.times.agent_started = None;
     }
     draft.status.times.scheduled = Some(Time(scheduled));
+}
+
+/// Notes when the first agent of the attempt started, and that of its present Pod. What a Pod shows of it moves when its containers are
+/// started again.
+pub(super) fn take_agents(draft: &mut PlanBuilder<'_>, pod: &PodView) {
+    let Some(first) = pod.agent_started.map(Time) else {
+        return;
+    };
+    let is_known = began_at(draft).is_some();
+    let times = &mut draft.status.times;
+    if !is_known && times.agent_started.is_none() {
+        times.agent_started = Some(first.clone());
+    }
+    if times.started.is_none() {
+        times.started = Some(first);
+    }
 }
 
 /// The present Job is gone, and another one begins anew.
 pub(super) fn restart(draft: &mut PlanBuilder<'_>) {
     draft.status.times.scheduled = None;
+    draft.status.times.agent_started = None;
     draft.status.ran_seconds = 0;
 }
 
-/// How long the run has gone on; None before its first agent, and before a Job that is not the first has a node.
+/// How long the present Job has run; None before its first agent.
 pub(super) fn run_seconds(draft: &PlanBuilder<'_>) -> Option<i64> {
-    let began = began_at(draft)?;
+    let before = draft.status.ran_seconds;
+    let Some(began) = began_at(draft) else {
+        return (before > 0).then_some(before);
+    };
     let until = until(draft, draft.now());
-    Some(draft.status.ran_seconds.saturating_add(seconds(began, until)))
+    Some(before.saturating_add(seconds(began, until)))
 }
 
 /// Counts what the present Pod of the Job has used, from its scheduling until its end.
@@ -46,8 +68,12 @@ pub(super) fn count_use(draft: &mut PlanBuilder<'_>, end: Timestamp) {
     }
 }
 
-/// Whether the Pod that is there has a node: else nothing runs.
-pub(super) fn has_node(draft: &PlanBuilder<'_>) -> bool {
+/// Whether the run takes time at present: the Pod that is there has a node, and an agent of it has started.
+pub(super) fn goes_on(draft: &PlanBuilder<'_>) -> bool {
+    has_node(draft) && began_at(draft).is_some()
+}
+
+fn has_node(draft: &PlanBuilder<'_>) -> bool {
     draft.view.pod.as_ref().is_some_and(|pod| pod.scheduled.is_some())
 }
 
@@ -55,13 +81,17 @@ fn scheduled_at(draft: &PlanBuilder<'_>) -> Option<Timestamp> {
     draft.status.times.scheduled.as_ref().map(|time| time.0)
 }
 
-/// From when on the Pod that had a node last takes time: the first agent of the run, or its own scheduling.
+/// From when on the Pod that had a node last takes time: its first agent. Its clock may be behind that of its scheduling.
 fn began_at(draft: &PlanBuilder<'_>) -> Option<Timestamp> {
-    let started = draft.status.times.started.as_ref()?.0;
-    match scheduled_at(draft) {
-        Some(scheduled) => Some(started.max(scheduled)),
-        None => draft.is_first_job().then_some(started),
-    }
+    let times = &draft.status.times;
+    let started = times.started.as_ref()?.0;
+    let Some(scheduled) = scheduled_at(draft) else {
+        return draft.is_first_job().then_some(started);
+    };
+    // An operator before this field has left it out: the attempt's first agent is that of this Pod if the Pod had its node before.
+    let older = (started >= scheduled).then_some(started);
+    let agent = times.agent_started.as_ref().map(|time| time.0).or(older)?;
+    Some(agent.max(scheduled))
 }
 
 /// The end of what runs: it has ended with the Pod that had a node, if none has one.

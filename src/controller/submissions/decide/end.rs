@@ -248,6 +248,8 @@ pub(super) fn note_without_gpu(nodes: &mut Vec<NodeWithoutGpu>, node_name: Strin
 }
 
 fn finished(draft: &mut PlanBuilder<'_>, report: &ReportDigest) {
+    // Without its Job nobody has taken it in yet.
+    reported::take(draft, report);
     draft.status.failure = None;
     draft.status.infrastructure_failures = None;
     let score = draft.status.score.as_ref().map_or("", |score| score.text.as_str());
@@ -264,6 +266,7 @@ pub(super) fn failed(draft: &mut PlanBuilder<'_>, found: Failure) {
 }
 
 fn close(draft: &mut PlanBuilder<'_>, reason: &str, message: &str) {
+    reported::count_attempts(draft);
     let ended = draft.view.ended_at().unwrap_or(draft.now());
     let ended = ended.min(draft.now());
     if !draft.is_finished() {

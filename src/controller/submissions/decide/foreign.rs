@@ -46,7 +46,12 @@ pub(super) fn waits(draft: &mut PlanBuilder<'_>, terms: Terms<'_>) -> bool {
     let why = match (&answer.found, terms.info) {
         // A person's word stands above what was found of another program.
         _ if draft.is_adopted() => return false,
-        (Err(unread), _) => not_known(draft, unread),
+        (Err(unread), _) => not_known(
+            draft,
+            unread,
+            "Whether another program runs the submission",
+            &format!("to start it all the same, {}", adoption()),
+        ),
         (Ok(_), None) => return false,
         (Ok(traces), Some(info)) => {
             let window = match effective::deadlines(terms.leaderboard, Some(terms.track)).run_seconds {
@@ -60,11 +65,27 @@ pub(super) fn waits(draft: &mut PlanBuilder<'_>, terms: Terms<'_>) -> bool {
             found.message(&question.prefix())
         }
     };
+    waits_for_look(draft, question, why);
+    true
+}
+
+/// An end that EvalAI shows may be one of ours, and an end that is shown here stands: while that is not known none is shown.
+pub(super) fn looks_again(draft: &mut PlanBuilder<'_>, terms: Terms<'_>, unread: &Unread) {
+    let shown = terms.info.map_or("an end", |info| info.status.as_str());
+    let what = format!("EvalAI shows {shown}, and whether a run of this operator has ended so");
+    let way_out = "to end the Submission without that, set its spec.cancel: it is then Cancelled, and EvalAI and table keep what \
+                   they have.";
+    let why = not_known(draft, unread, &what, way_out);
+    let question = ask(draft, terms);
+    waits_for_look(draft, question, why);
+}
+
+/// Looks again when the present answer is no longer good.
+fn waits_for_look(draft: &mut PlanBuilder<'_>, question: Question, why: String) {
     draft.act(Action::LookForForeignRun(Box::new(question)));
     draft.requeue_in(AGAIN + Duration::from_secs(1));
     draft.condition(conditions::ACCEPTED, Truth::False, reasons::FOREIGN, &why);
     draft.show(reasons::FOREIGN, why);
-    true
 }
 
 /// Whether a submission that was held back waits for EvalAI's own word on how the other run has ended: what is known of it may be
@@ -123,17 +144,21 @@ fn looks(draft: &mut PlanBuilder<'_>, question: Question, waited: Duration) {
     draft.show(reasons::LOOKING_FOR_FOREIGN_RUN, message);
 }
 
-/// While that cannot be known nothing starts: a second run would write over the first one's results.
-fn not_known(draft: &mut PlanBuilder<'_>, unread: &Unread) -> String {
+/// While that cannot be known nothing starts, since a second run would write over the first one's results, and nothing ends. `what` is
+/// not known; `way_out` is what a person can do without it.
+fn not_known(draft: &mut PlanBuilder<'_>, unread: &Unread, what: &str, way_out: &str) -> String {
     let why = sentence(&unread.why);
-    let message = format!(
-        "Whether another program runs the submission is not known: {why} It is looked for again; to start it all the same, {}",
-        adoption()
-    );
-    if unread.is_refused {
+    let message = format!("{what} is not known: {why} It is looked for again; {way_out}");
+    if !unread.is_refused {
+        draft.moves();
+        return message;
+    }
+    let shown = draft.status.condition(conditions::STALLED);
+    if shown.is_some_and(|c| c.message.starts_with(what)) {
         return draft.stall(reasons::FOREIGN, &message);
     }
-    draft.moves();
+    // What is not known may be another thing than before, with another way out.
+    draft.stall_with(reasons::FOREIGN, &message);
     message
 }
 

@@ -3,13 +3,11 @@
 use std::sync::Arc;
 use std::time::Duration;
 
-use k8s_openapi::apimachinery::pkg::apis::meta::v1::Time;
-
 use super::plan::{Action, EvalaiUpdate, TableUpdate};
 use super::plan_builder::{PlanBuilder, after};
 use super::{
-    accept, addresses, clock, crashes, end, failure, interruption, isolation, line, reading, reported, requeue, start,
-    stop,
+    accept, addresses, clock, crashes, end, failure, interruption, isolation, line, reading, reported, requeue,
+    restored, start, stop,
 };
 use crate::controller::submissions::job_spec;
 use crate::controller::submissions::report_digest::ReportDigest;
@@ -74,9 +72,13 @@ fn name_taken(draft: &mut PlanBuilder<'_>) {
 
 fn in_line(draft: &mut PlanBuilder<'_>) {
     if draft.is_cancelled() {
-        let reason = end::cancel_reason(draft);
+        let mut reason = end::cancel_reason(draft);
         if reason == reasons::ENDED_IN_EVALAI && accept::had_ended(draft) {
             return;
+        }
+        if accept::may_have_ended(draft) {
+            // Who ends the wait for that ends nothing in EvalAI: `cancelled` would be written over `finished`.
+            reason = reasons::ENDED_IN_EVALAI;
         }
         let what = if reason == reasons::ENDED_IN_EVALAI {
             "EvalAI ended the submission"
@@ -180,7 +182,7 @@ fn without_its_job(draft: &mut PlanBuilder<'_>) {
     // A report from before this Job was seen is its predecessor's.
     let says = |report: &Arc<ReportDigest>| report.is_verdict() && reported::is_of_present_job(draft, report);
     let is_verdict = is_read && draft.view.report.ours().is_some_and(says);
-    if draft.is_to_stop() || (is_verdict && draft.was_job_seen()) {
+    if draft.is_to_stop() || (is_verdict && draft.was_job_seen()) || restored::awaits_report(draft) {
         return end::decide(draft, None);
     }
     if draft.was_job_seen() && has_expired(draft) {
@@ -295,8 +297,7 @@ fn take_pod(draft: &mut PlanBuilder<'_>, pod: &PodView) {
     let known = draft.status.node_name.take();
     draft.status.node_name = pod.node.clone().or(known);
     clock::take_node(draft, pod);
-    let started = &mut draft.status.times.started;
-    *started = started.take().or(pod.agent_started.map(Time));
+    clock::take_agents(draft, pod);
     let now = draft.now();
     crashes::note(&mut draft.status, pod, now);
 }
@@ -317,7 +318,7 @@ fn watch_run(draft: &mut PlanBuilder<'_>) {
     }
     if ran >= limit {
         draft.fail(failure::time_limit(limit));
-    } else if clock::has_node(draft) {
+    } else if clock::goes_on(draft) {
         draft.requeue_at(after(draft.now(), limit - ran));
     }
 }

@@ -46,7 +46,7 @@ use std::time::Duration;
 use super::view::View;
 pub use after::previous_controller;
 pub(super) use image::pinned;
-pub use plan::{Action, EvalaiUpdate, Event, Plan, StatusWrite, TableUpdate, job_name};
+pub use plan::{Action, EvalaiUpdate, Event, Plan, SlotUse, StatusWrite, TableUpdate, job_name};
 use plan_builder::PlanBuilder;
 pub use reading::awaits_publication;
 

@@ -24,6 +24,35 @@ pub struct Plan {
     pub requeue: Option<Duration>,
 }
 
+/// What becomes of a submission's slot and of its place in line.
+#[derive(Clone, Copy, Debug, PartialEq, Eq)]
+pub enum SlotUse {
+    /// The Job is about to be created, or exists.
+    Holds,
+    /// It stands in line for one, and for nothing else.
+    Waits,
+    /// It waits for something else, or has come to its end: a later attempt stands in line like anyone.
+    Leaves,
+}
+
+impl Plan {
+    /// What becomes of the slot.
+    pub fn slot(&self) -> SlotUse {
+        if self.status.job_name.is_some() && !self.status.has_ended() {
+            SlotUse::Holds
+        } else if self.actions.iter().any(|action| matches!(action, Action::JoinLine(_))) {
+            SlotUse::Waits
+        } else {
+            SlotUse::Leaves
+        }
+    }
+
+    /// True if it creates a Job.
+    pub fn creates_job(&self) -> bool {
+        self.actions.iter().any(|action| matches!(action, Action::CreateJob(_)))
+    }
+}
+
 /// When the status is written.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 pub enum StatusWrite {

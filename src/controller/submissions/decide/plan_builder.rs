@@ -10,7 +10,7 @@ use super::significance::{self, Change};
 use crate::controller::submissions::view::{EvalaiInfo, ReportDemand, View};
 use leaderboard_api::conditions::{self, Truth};
 use leaderboard_api::{
-    Attempt, BlockedSince, Deadlines, Failure, Ingested, LeaderboardSpec, Retries, Score, State, Submission,
+    Attempt, BlockedSince, Deadlines, Failure, Ingested, LeaderboardSpec, Retries, RunPlan, Score, State, Submission,
     SubmissionSpec, SubmissionStatus, Track, effective, names, reasons,
 };
 
@@ -206,12 +206,19 @@ impl<'a> PlanBuilder<'a> {
     /// The status of a new attempt, with what was pinned and what earlier attempts reached.
     fn start_status(&mut self, wanted: Attempt) {
         let old = std::mem::take(&mut self.status);
+        // What Pods of before a restore have stored is of earlier attempts.
+        let submission_uid = self.submission().metadata.uid.clone();
+        let next = |plan: RunPlan| RunPlan {
+            resume: true,
+            submission_uid,
+            ..plan
+        };
         self.status = SubmissionStatus {
             observed_generation: self.submission().metadata.generation,
             attempt: Some(wanted),
             team: old.team,
             track: old.track,
-            plan: old.plan.map(|plan| leaderboard_api::RunPlan { resume: true, ..plan }),
+            plan: old.plan.map(next),
             image: old.image,
             progress: old.progress,
             score: old.score.map(Score::so_far),

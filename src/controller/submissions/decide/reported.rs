@@ -35,6 +35,16 @@ pub(super) fn take(draft: &mut PlanBuilder<'_>, report: &ReportDigest) {
     note_logs(draft, report);
 }
 
+/// A report of before a restore may be of a later attempt than the object knows of. The table's row counts on from it.
+pub(super) fn count_attempts(draft: &mut PlanBuilder<'_>) {
+    let present = draft.status.attempt.unwrap_or_default();
+    let (Some(report), Some(plan)) = (draft.view.report.ours(), draft.status.plan.as_mut()) else {
+        return;
+    };
+    let ahead = report.attempt.0.saturating_sub(present.0);
+    plan.earlier_attempts = plan.earlier_attempts.max(ahead);
+}
+
 /// Whether a report can be of the present Job, rather than of one before it whose end is settled: it stays where it is until the present
 /// Job's first round. The Pod decides. Without one, what was stopped is the present Job's only if that is being ended too.
 pub(super) fn is_of_present_job(draft: &PlanBuilder<'_>, report: &ReportDigest) -> bool {

@@ -5,8 +5,9 @@ use std::time::Duration;
 
 use super::plan_builder::{PlanBuilder, Terms};
 use super::stored::{Found, found, may_be, note, stop, traces};
-use super::{failure, pin, reported};
+use super::{failure, pin, reading, reported};
 use crate::controller::submissions::report_digest::{ReportDigest, StoredReport};
+use crate::controller::submissions::view::{ObservedReport, Stage};
 use crate::pod::run::Stop;
 use leaderboard_api::conditions::{self, Truth};
 use leaderboard_api::{ImportedEnd, ImportedState, SubmissionStatus, Times, effective, reasons};
@@ -55,6 +56,18 @@ fn take_end(draft: &mut PlanBuilder<'_>, report: &StoredReport) {
         Some(Stop::Interruption) | None => {}
     }
     draft.requeue_in(Duration::ZERO);
+}
+
+/// Whether an end that was taken over waits for the bucket: that it cannot be read at the moment is no reason to make a Job for it.
+pub(super) fn awaits_report(draft: &PlanBuilder<'_>) -> bool {
+    let report = &draft.view.report;
+    let is_unread = matches!(report, ObservedReport::NotRead | ObservedReport::Unreadable(_));
+    let is_open = is_unread || !reading::is_of(draft, Stage::JobEnded);
+    let of_former = draft.status.plan.as_ref().and_then(|plan| plan.submission_uid.as_ref());
+    let is_former = of_former.is_some() && of_former != draft.submission().metadata.uid.as_ref();
+    let accepted = draft.status.condition(conditions::ACCEPTED);
+    let is_restored = accepted.is_some_and(|c| c.reason == reasons::RESTORED);
+    is_open && is_former && is_restored && draft.is_first_job() && draft.status.times.scheduled.is_none()
 }
 
 /// Shows an end that every system has: nothing is run, published or recorded again.

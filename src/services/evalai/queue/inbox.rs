@@ -243,6 +243,8 @@ impl Inboxes {
         let origin = match answer {
             Answer::Done(row) => row.wanted_at().map_or(Origin::Hidden, Origin::Wanted),
             Answer::Refused(refusal) if refusal.about == About::Missing => Origin::Missing,
+            // A participant can give the row a phase of another challenge.
+            Answer::Refused(refusal) if refusal.is_of_another_challenge() => Origin::Foreign,
             Answer::Refused(_) => Origin::Hidden,
             other => {
                 let inbox = self.by_name.get_mut(name);

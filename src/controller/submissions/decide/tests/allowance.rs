@@ -1,10 +1,12 @@
 //! What infrastructure failures that an agent can cause cost a team.
 
+use k8s_openapi::apimachinery::pkg::apis::meta::v1::Time;
+
 use super::builders::*;
 use crate::controller::submissions::team_history::{Others, TeamHistory};
 use leaderboard_api::FailureClass::{Infrastructure, Participant};
 use leaderboard_api::State::{Failed, Finished, Pending, Running};
-use leaderboard_api::{Attempt, OnRepeatedInfrastructure, reasons};
+use leaderboard_api::{Attempt, InfrastructureFailures, OnRepeatedInfrastructure, reasons};
 
 /// Two attempts of the team in a row, on two nodes, while others finish.
 fn repeated() -> TeamHistory {
@@ -16,6 +18,7 @@ fn repeated() -> TeamHistory {
             finished: 5,
             ..Others::default()
         },
+        ..TeamHistory::default()
     }
 }
 
@@ -107,4 +110,51 @@ fn results_that_an_agent_keeps_from_being_stored_are_counted_as_well() {
     let status = world.pass_to(Failed, reasons::RESULTS_NOT_STORED).status;
     assert_eq!(status.failure.unwrap().class, Infrastructure);
     assert_eq!(status.infrastructure_failures.unwrap().number, 1);
+}
+
+#[test]
+fn the_times_of_the_last_three_are_remembered() {
+    let known = |number: i32, recent: &[i64]| InfrastructureFailures {
+        number,
+        first_time: Time(at(-9000)),
+        last_time: Time(at(-1000)),
+        recent_times: recent.iter().map(|second| Time(at(*second))).collect(),
+        nodes: Vec::new(),
+    };
+    for (what, before, expected) in [
+        ("the first one", None, vec![10]),
+        ("after two", Some(known(2, &[-9000, -1000])), vec![-9000, -1000, 10]),
+        (
+            "after four",
+            Some(known(4, &[-4000, -3000, -1000])),
+            vec![-3000, -1000, 10],
+        ),
+        ("after those of an older operator", Some(known(2, &[])), vec![-1000, 10]),
+    ] {
+        let mut world = World::local().running();
+        world.leaderboard().retries.infrastructure = 0;
+        let number = before.as_ref().map_or(1, |before| before.number + 1);
+        world.submission().status.as_mut().unwrap().infrastructure_failures = before.map(Box::new);
+        world.complete();
+        let status = world.pass_to(Failed, reasons::RESULTS_NOT_STORED).status;
+        let found = status.infrastructure_failures.unwrap();
+        let expected: Vec<_> = expected.into_iter().map(|second| Time(at(second))).collect();
+        assert_eq!((found.number, found.recent_times), (number, expected), "{what}");
+    }
+}
+
+#[test]
+fn a_number_that_may_be_larger_is_shown_as_the_least() {
+    let history = TeamHistory {
+        within_a_day: 3,
+        may_be_more: true,
+        ..TeamHistory::default()
+    };
+    let mut world = simulator_failed(history, OnRepeatedInfrastructure::Forgive);
+    let status = world.pass_to(Failed, reasons::SIMULATION_CRASHED).status;
+    let message = status.failure.unwrap().message;
+    assert!(
+        message.contains("Within a day at least 4 attempts of team t1 ended like this in this Leaderboard;"),
+        "{message}"
+    );
 }

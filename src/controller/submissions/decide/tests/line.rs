@@ -2,7 +2,7 @@
 
 use super::builders::*;
 use crate::controller::slots::turns::{InLine, Turn};
-use crate::controller::submissions::decide::{Action, EvalaiUpdate};
+use crate::controller::submissions::decide::{Action, EvalaiUpdate, SlotUse};
 use crate::controller::submissions::view::ObservedJob;
 use leaderboard_api::State::{Cancelled, Pending};
 use leaderboard_api::{Eta, SubmissionStatus, Waiting, reasons};
@@ -90,6 +90,28 @@ fn joining_the_line_shows_nothing_and_starts_nothing() {
         world.view.turn = Turn::Go;
         assert!(creates(&world.pass_to(Pending, reasons::PREPARING)));
     }
+}
+
+#[test]
+fn a_slot_is_held_from_the_job_to_the_end_and_by_nobody_who_waits_for_something_else() {
+    let mut world = World::local();
+    world.view.turn = Turn::NotInLine;
+    assert_eq!(world.pass().slot(), SlotUse::Waits);
+    world.view.turn = Turn::Wait { position: 1, eta: None };
+    assert_eq!(world.pass().slot(), SlotUse::Waits);
+    world.view.is_policy_in_place = false;
+    assert_eq!(world.pass().slot(), SlotUse::Leaves, "its policy is missing");
+    world.view.is_policy_in_place = true;
+    world.view.turn = Turn::Go;
+    assert_eq!(world.pass().slot(), SlotUse::Holds, "its Job is created");
+
+    let mut world = World::local().running();
+    assert_eq!(world.pass().slot(), SlotUse::Holds);
+    world.submission().spec.cancel = true;
+    assert_eq!(world.pass().slot(), SlotUse::Holds, "its Pod stops");
+    world.job_gone();
+    world.pass_to(Cancelled, reasons::CANCELLED);
+    assert_eq!(world.pass().slot(), SlotUse::Leaves, "it has ended");
 }
 
 #[test]

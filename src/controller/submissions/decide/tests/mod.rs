@@ -24,6 +24,7 @@ mod observe;
 mod phases;
 mod properties;
 mod reading;
+mod record;
 mod requeue;
 mod restored;
 mod resume;

@@ -1,19 +1,21 @@
 //! Objects that have lost their status: what EvalAI, the table and the bucket hold shows whether they have ended.
 
 use std::sync::Arc;
+use std::time::Duration;
 
 use super::builders::*;
 use crate::controller::submissions::decide::stored::{Found, found};
 use crate::controller::submissions::decide::{Action, EvalaiUpdate};
-use crate::controller::submissions::foreign_runs::{StoredRun, Traces};
+use crate::controller::submissions::foreign_runs::{StoredRun, Traces, Unread};
 use crate::controller::submissions::report_digest::{ReportDigest, StoredReport};
-use crate::controller::submissions::view::{EvalaiInfo, ObservedReport, ObservedTraces, Standing};
+use crate::controller::submissions::result_texts::attempt_of_run;
+use crate::controller::submissions::view::{EvalaiInfo, ObservedReport, ObservedTraces, Stage, Standing};
 use crate::pod::report::Report;
 use crate::pod::run::Stop;
 use crate::services::table::ObservedRow;
 use leaderboard_api::ImportedState::{Cancelled as WasCancelled, Failed as HasFailed, Finished as HasFinished};
 use leaderboard_api::State::{Cancelled, Failed, Finished, Pending};
-use leaderboard_api::conditions::{ACCEPTED, PUBLISHED, RECORDED};
+use leaderboard_api::conditions::{ACCEPTED, PUBLISHED, RECORDED, STALLED};
 use leaderboard_api::{Attempt, names, reasons};
 
 /// UID of the object before it was restored.
@@ -276,4 +278,141 @@ fn a_marked_one_waits_until_table_and_bucket_have_answered() {
     let plan = world.pass_to(Pending, reasons::PREPARING);
     assert!(creates(&plan));
     assert!(!plan.status.plan.unwrap().resume);
+}
+
+/// Table and bucket cannot be read.
+fn unreadable(world: &mut World, is_refused: bool) {
+    let why = "table rows: GetItem is not allowed".to_owned();
+    let unread = Unread { is_refused, why };
+    world.view.traces = ObservedTraces::Answered(Arc::new(looked(at(0), Err(unread))));
+}
+
+#[test]
+fn an_end_in_evalai_that_may_be_ours_waits_until_table_and_bucket_can_be_read() {
+    for (is_refused, stalled) in [(true, "True"), (false, "False")] {
+        let known = traces(Some(row("FINISHED", 1)), Some(final_report()));
+        let mut world = in_evalai(Standing::Ended, "finished", known.clone());
+        unreadable(&mut world, is_refused);
+        let plan = world.pass_to(Pending, reasons::FOREIGN);
+        assert!(!creates(&plan) && evalai_updates(&plan).is_empty());
+        let looks = |action: &Action| matches!(action, Action::LookForForeignRun(_));
+        assert!(has(&plan, looks), "it is looked for again");
+        assert_eq!(condition(&plan, ACCEPTED), ("False".into(), reasons::FOREIGN.into()));
+        assert_eq!(condition(&plan, STALLED).0, stalled);
+        let message = plan.status.message.unwrap();
+        for part in [
+            "EvalAI shows finished",
+            "is not known: table rows: GetItem is not allowed. It is looked for again",
+            "spec.cancel",
+        ] {
+            assert!(message.contains(part), "{message}");
+        }
+        world.view.traces = ObservedTraces::Answered(Arc::new(looked(at(60), Ok(known))));
+        let plan = world.pass_to(Finished, reasons::FINISHED);
+        assert!(!creates(&plan) && evalai_updates(&plan).is_empty());
+        assert_eq!(plan.status.score.unwrap().text, "43.13");
+    }
+}
+
+#[test]
+fn who_ends_the_wait_for_that_ends_nothing_in_evalai() {
+    for is_deleted in [false, true] {
+        let mut world = in_evalai(Standing::Ended, "finished", Traces::default());
+        unreadable(&mut world, true);
+        world.pass_to(Pending, reasons::FOREIGN);
+        if is_deleted {
+            world.delete();
+        } else {
+            world.submission().spec.cancel = true;
+        }
+        let plan = world.pass_to(Cancelled, reasons::ENDED_IN_EVALAI);
+        assert_eq!(
+            evalai_updates(&plan),
+            [],
+            "`cancelled` would be written over `finished`"
+        );
+        assert!(!has(&plan, |a| matches!(a, Action::Record(_))));
+        assert_eq!(has(&plan, |a| *a == Action::ReleaseFinalizer), is_deleted);
+    }
+}
+
+#[test]
+fn what_is_not_known_is_shown_anew_when_evalai_ends_what_waits() {
+    let mut world = in_evalai(Standing::Wanted, "submitted", Traces::default());
+    unreadable(&mut world, true);
+    let plan = world.pass_to(Pending, reasons::FOREIGN);
+    assert!(plan.status.message.unwrap().contains(names::ANNOTATION_ADOPT));
+    world.in_evalai().info = Some(evalai(Standing::Ended, "cancelled"));
+    world.in_evalai().cancelled = true;
+    let plan = world.pass_to(Pending, reasons::FOREIGN);
+    let message = plan.status.message.unwrap();
+    assert!(message.starts_with("EvalAI shows cancelled"), "{message}");
+}
+
+#[test]
+fn an_end_that_is_an_attempt_ahead_of_the_object_is_taken_over_too() {
+    for (standing, status) in [(Standing::Wanted, "running"), (Standing::Ended, "finished")] {
+        let later = || Report {
+            attempt: Attempt(2),
+            ..final_report()
+        };
+        let mut world = in_evalai(standing, status, traces(Some(row("RUNNING", 2)), Some(later())));
+        assert!(!creates(&world.pass()));
+        world.report(later());
+        let plan = world.pass_to(Finished, reasons::FINISHED);
+        assert!(!creates(&plan));
+        assert_eq!(attempt_of_run(&plan.status), 2, "as the row counts them");
+    }
+}
+
+#[test]
+fn a_kept_status_that_is_older_than_the_last_report_ends_with_that_and_counts_on() {
+    let mut world = World::local().running();
+    world.report(report(2));
+    world.pass();
+    let status = world.submission().status.as_mut().unwrap();
+    status.plan.as_mut().unwrap().submission_uid = Some(OLD.into());
+    world.job_gone();
+    world.report(Report {
+        attempt: Attempt(2),
+        ..final_report()
+    });
+    let plan = world.pass_to(Finished, reasons::FINISHED);
+    assert_eq!(attempt_of_run(&plan.status), 2);
+    let shown = (plan.status.progress.unwrap().text, plan.status.score.unwrap().text);
+    assert_eq!(shown, ("4/4".into(), "43.13".into()));
+}
+
+#[test]
+fn a_resume_takes_no_report_of_before_the_restore_for_its_own() {
+    let later = Report {
+        attempt: Attempt(2),
+        ..refused()
+    };
+    let found = traces(Some(row("RUNNING", 2)), Some(later));
+    let mut world = in_evalai(Standing::Wanted, "running", found);
+    assert!(!creates(&world.pass()));
+    world.pass_to(Failed, reasons::INVALID_RESULTS);
+    world.view.report = ObservedReport::Foreign;
+    world.submission().spec.attempt = Attempt(2);
+    let plan = world.pass_to(Pending, reasons::PREPARING);
+    assert_eq!(attempt_of_run(&plan.status), 3, "the row has two already");
+    let pinned = plan.status.plan.unwrap();
+    assert_eq!(pinned.submission_uid.as_deref(), Some(UID));
+}
+
+#[test]
+fn an_end_that_was_taken_over_waits_for_its_report_and_makes_no_job() {
+    let unread = ObservedReport::Unreadable("slow down".into());
+    for (stage, report) in [(Some(Stage::JobEnded), unread), (None, ObservedReport::NotRead)] {
+        let found = traces(Some(row("RUNNING", 1)), Some(final_report()));
+        let mut world = in_evalai(Standing::Wanted, "running", found);
+        world.pass();
+        (world.view.report_stage, world.view.report) = (stage, report);
+        world.view.report_waited = Duration::from_mins(1);
+        assert!(!creates(&world.pass_to(Pending, reasons::NOT_STORED)));
+        world.view.report_stage = Some(Stage::JobEnded);
+        world.report(final_report());
+        assert!(!creates(&world.pass_to(Finished, reasons::FINISHED)));
+    }
 }

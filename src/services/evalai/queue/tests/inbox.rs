@@ -144,11 +144,18 @@ fn what_evalai_shows_of_a_message_goes_with_it() {
         resumed_at: Some(wall(-5)),
         ..row(7, Status::Resuming)
     };
+    let of_another = Refusal {
+        message: "EvalAI answered 401: Sorry, you are not authorized to access this submission.".into(),
+        ..refusal(About::Request, 401)
+    };
     for (answer, origin) in [
         (Answer::Done(resumed), Origin::Wanted(wall(-5))),
         (Answer::Done(Row::missing(7)), Origin::Hidden),
         (Answer::Refused(refused(About::Missing)), Origin::Missing),
         (Answer::Refused(refused(About::Request)), Origin::Hidden),
+        // A page of a proxy shows nothing of the submission.
+        (Answer::Refused(refusal(About::Request, 401)), Origin::Hidden),
+        (Answer::Refused(of_another), Origin::Foreign),
     ] {
         let mut bench = Bench::reading();
         bench.receive(message(7));
