@@ -2,7 +2,6 @@
 //! stop signal, then runs the program's module.
 
 use std::future::Future;
-use std::num::NonZero;
 use std::process::ExitCode;
 
 use http::HeaderValue;
@@ -35,8 +34,11 @@ pub(super) const EXIT_CODES: &str = "Exit code 0: it was stopped. 1: an error, w
 /// What the exit code of a Pod's programs means.
 pub(super) const POD_EXIT_CODES: &str =
     "Exit code 0: its work is done. 1: an error, which is the last line of its log. 2: the arguments are refused.";
-/// Most threads that run tasks.
-const MAX_WORKERS: usize = 2;
+/// Threads that run the tasks of controller and bridge. All that a burst needs is a part of one core, and each thread more is woken by
+/// events that another one serves (docs/performance.md).
+const THREADS: usize = 1;
+/// Threads that run the tasks of a Pod's programs: while one waits for a disk, the other goes on.
+const THREADS_IN_POD: usize = 2;
 /// Environment variable with the log filter.
 const ENV_LOG: &str = "RUST_LOG";
 
@@ -50,7 +52,7 @@ pub(super) fn bridge(options: Server) -> ExitCode {
 
 pub(super) fn workspace(options: &InPod) -> ExitCode {
     ownlog::start(&Places::below(&options.root).logs, ownlog::WORKSPACE_LOG);
-    start_logged("workspace", || async {
+    start_logged("workspace", THREADS_IN_POD, || async {
         let setting = setting(options)?;
         workspace_program::main(setting).await.map_err(|e| e.to_string())
     })
@@ -59,7 +61,7 @@ pub(super) fn workspace(options: &InPod) -> ExitCode {
 pub(super) fn logcopy(options: &InPod) -> ExitCode {
     // Its log is one of the results as well.
     ownlog::start(&Places::below(&options.root).logs, ownlog::OWN_LOG);
-    start_logged("logcopy", || async {
+    start_logged("logcopy", THREADS_IN_POD, || async {
         let setting = setting(options)?;
         let stop = on_signals().map_err(|e| e.to_string())?;
         Box::pin(logcopy_program::main(setting, async move { stop.wait().await }))
@@ -82,10 +84,10 @@ where
         eprintln!("leaderboard-operator: {error}");
         return ExitCode::from(2);
     }
-    start_logged(program, work)
+    start_logged(program, THREADS, work)
 }
 
-fn start_logged<W>(program: &'static str, work: impl FnOnce() -> W) -> ExitCode
+fn start_logged<W>(program: &'static str, threads: usize, work: impl FnOnce() -> W) -> ExitCode
 where
     W: Future<Output = Result<(), String>>,
 {
@@ -94,9 +96,8 @@ where
     tracing::info!(program, version, revision, "starting");
     // It fails only where a provider is installed already, which serves as well.
     let _ = rustls::crypto::ring::default_provider().install_default();
-    let cores = std::thread::available_parallelism().map_or(1, NonZero::get);
     let runtime = tokio::runtime::Builder::new_multi_thread()
-        .worker_threads(workers(cores))
+        .worker_threads(threads)
         .enable_all()
         .build();
     let runtime = match runtime {
@@ -116,12 +117,6 @@ where
             ExitCode::FAILURE
         }
     }
-}
-
-/// Threads that run tasks on a machine of so many cores. A program never has work for more (docs/performance.md), and a
-/// node with GPUs has up to a hundred cores.
-fn workers(cores: usize) -> usize {
-    cores.clamp(1, MAX_WORKERS)
 }
 
 async fn lead(options: Controller) -> Result<(), String> {
@@ -217,16 +212,5 @@ impl Sending {
         if let Some(sending) = self.0 {
             sending.finish().await;
         }
-    }
-}
-
-#[cfg(test)]
-mod tests {
-    use super::*;
-
-    #[test]
-    fn a_large_node_gets_no_more_threads_than_a_small_one() {
-        let of = [0, 1, 2, 3, 96].map(workers);
-        assert_eq!(of, [1, 1, 2, 2, 2]);
     }
 }
