@@ -67,7 +67,11 @@ mod tests { struct Fake { a: Gauge, } }
 
 
 # First cell of a row of the README's tables of rights -> its resource.
-RIGHTS = {"Pods' logs": "pods/log", "Finalizers of both kinds": "finalizers", "Access reviews of its own": "selfsubjectaccessreviews"}
+RIGHTS = {
+    "Pods' logs": "pods/log",
+    "Finalizers of both kinds": "finalizers",
+    "Access reviews of its own": "selfsubjectaccessreviews",
+}
 RULE = re.compile(r"^    resources: \[(.+)\]\n    verbs: \[(.+)\]$", re.MULTILINE)
 
 
