@@ -99,6 +99,11 @@ pub fn child_of(leaderboard: &Leaderboard, name: String) -> ObjectMeta {
     }
 }
 
+/// A Leaderboard as metrics show it.
+pub fn board_name(namespace: Option<String>, name: &str) -> String {
+    format!("{}/{name}", namespace.unwrap_or_default())
+}
+
 /// The label selector of everything the operator makes for submissions.
 pub fn children_selector() -> String {
     format!("{}={}", names::LABEL_MANAGED_BY, names::OPERATOR)

@@ -11,6 +11,7 @@ use kube::ResourceExt;
 
 use super::gpu_holders::{Holder, Holders};
 use crate::controller::leaderboards::operator;
+use crate::controller::objects::board_name;
 use crate::controller::submissions::decide::awaits_publication;
 use crate::kubernetes::Store;
 use crate::lock::lock;
@@ -308,10 +309,6 @@ fn boards(
         .collect();
     census.show_waits(&mut boards, now);
     boards
-}
-
-pub(super) fn board_name(namespace: Option<String>, name: &str) -> String {
-    format!("{}/{name}", namespace.unwrap_or_default())
 }
 
 /// Teams that have had this often in a row what an agent can cause, by the statuses of the Leaderboards.

@@ -7,7 +7,7 @@ use std::collections::BTreeMap;
 use jiff::Timestamp;
 use kube::ResourceExt;
 
-use super::counts::board_name;
+use crate::controller::objects::board_name;
 use crate::observability::metrics::{OTHERS, OfSubmission};
 use leaderboard_api::{Submission, Use, conditions};
 
