@@ -25,6 +25,8 @@ NOT_OURS = {
     "kind: NodePool": "Karpenter's own definitions are not here",
     "timeSlicing:": "a file of NVIDIA's device plugin",
 }
+# First lines of values of the chart that stand in other pages than its own.
+VALUES = ("networkPolicy:\n",)
 # What the rest of the example cannot stand next to, by page.
 INSTEAD: dict[str, dict[str, Any]] = {
     "docs/evalai.md": {"queue": None, "evalai": {"token": {"secretsManager": None}}},
@@ -115,7 +117,7 @@ def manifests(repository: Path, kube: Kube, found: Sequence[Block]) -> tuple[int
     for block in found:
         if block.language != "yaml" or any(mark in block.text for mark in NOT_OURS):
             continue
-        is_values = block.page == docpages.CHART
+        is_values = block.page == docpages.CHART or block.text.startswith(VALUES)
         for kind, text in [("values", block.text)] if is_values else docpages.manifests(block, known):
             fault = applied(repository, kube, block.page, kind, text)
             count += not fault
