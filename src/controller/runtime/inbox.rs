@@ -192,15 +192,15 @@ fn judge(arrival: &Arrival, readers: &[Arc<Leaderboard>], now_ms: i64, is_comple
         {
             return Verdict::Foreign;
         }
-        if arrival.origin == Origin::Missing {
-            let why = format!("EvalAI has no submission {}", message.submission);
-            return Verdict::Drop(DeadReason::Malformed(why));
-        }
-        if arrival.origin == Origin::Foreign {
-            let why = format!(
-                "EvalAI does not show submission {} to a host of this challenge: its row has a phase of another challenge",
-                message.submission
-            );
+        let submission = message.submission;
+        let unusable = match arrival.origin {
+            Origin::Missing => Some(format!("EvalAI has no submission {submission}")),
+            Origin::Foreign => Some(format!(
+                "EvalAI does not show submission {submission} to a host of this challenge: its row has a phase of another challenge"
+            )),
+            Origin::Wanted(_) | Origin::Hidden => None,
+        };
+        if let Some(why) = unusable {
             return Verdict::Drop(DeadReason::Malformed(why));
         }
     }

@@ -181,7 +181,7 @@ async fn limited<T>(work: impl Future<Output = Result<T, ReconcileError>>) -> Re
     }
 }
 
-/// Tells the line what was decided. One that stays in line renews its place in `act`.
+/// Does with the slot what was decided. One that stays in line renews its place in `act`.
 fn settle(slots: &SlotAllocator, submission: &Submission, slot: SlotUse) {
     match slot {
         SlotUse::Holds => slots.starts(submission),

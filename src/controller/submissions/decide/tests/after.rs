@@ -6,19 +6,12 @@ use jiff::SignedDuration;
 use k8s_openapi::apimachinery::pkg::apis::meta::v1::Time;
 
 use super::builders::*;
+use super::record::{finished, refused};
 use crate::controller::submissions::decide::{Action, EvalaiUpdate, Plan, TableUpdate};
 use crate::controller::submissions::view::{EvalaiEnd, EvalaiInfo, ObservedReport, Standing};
 use leaderboard_api::State::{Cancelled, Failed, Finished};
 use leaderboard_api::conditions::{self, PUBLISHED, RECORDED};
 use leaderboard_api::{Rerun, reasons};
-
-fn finished() -> World {
-    let mut world = World::evalai().running();
-    world.complete();
-    world.report(final_report());
-    world.pass_to(Finished, reasons::FINISHED);
-    world
-}
 
 fn failed() -> World {
     let mut world = World::evalai().running();
@@ -235,11 +228,7 @@ fn a_refused_result_is_shown_once_and_does_not_hold_up_the_row() {
 #[test]
 fn a_cancel_in_evalai_after_a_refusal_reaches_the_row_too() {
     for is_shown in [true, false] {
-        let mut world = finished();
-        world.in_evalai().end = Some(EvalaiEnd::Refused {
-            message: "it belongs to another phase".into(),
-            is_due: false,
-        });
+        let mut world = refused();
         world.pass();
         world.recorded();
         if is_shown {

@@ -21,7 +21,7 @@ use crate::pod::report::{Report, ReportPair};
 use crate::pod::run::Stop;
 use leaderboard_api::conditions;
 use leaderboard_api::{
-    Attempt, Leaderboard, LeaderboardSpec, PairState, Requeue, State, Submission, SubmissionStatus, names,
+    Attempt, Leaderboard, LeaderboardSpec, PairState, Requeue, State, Submission, SubmissionStatus, names, reasons,
 };
 use leaderboard_runner::verdict::{Verdict, What};
 
@@ -318,6 +318,17 @@ impl World {
         }
     }
 
+    /// The Job fails because of the infrastructure and is gone, and the next one is there.
+    #[track_caller]
+    pub fn gets_another_job(&mut self) {
+        self.complete();
+        self.pass_to(State::Pending, reasons::REPLACING);
+        self.job_gone();
+        self.wait(10);
+        self.pass_to(State::Pending, reasons::PREPARING);
+        self.see_job();
+    }
+
     /// One reconcile: decides, checks the rules, and keeps the status.
     pub fn pass(&mut self) -> Plan {
         let plan = decide(&self.view);
@@ -465,7 +476,7 @@ pub fn has(plan: &Plan, matches: impl Fn(&Action) -> bool) -> bool {
 }
 
 pub fn creates(plan: &Plan) -> bool {
-    has(plan, |a| matches!(a, Action::CreateJob(_)))
+    plan.creates_job()
 }
 
 /// Status and reason of a condition.

@@ -193,12 +193,7 @@ fn the_preparation_of_an_earlier_pod_is_no_time_that_it_has_run() {
 fn another_job_has_the_whole_time_from_its_own_first_agent() {
     let mut world = limited();
     world.go_to(GONE);
-    world.complete();
-    world.pass_to(Pending, reasons::REPLACING);
-    world.job_gone();
-    world.wait(10);
-    world.pass_to(Pending, reasons::PREPARING);
-    world.see_job();
+    world.gets_another_job();
     let scheduled = GONE + 20;
     world.view.pod = Some(pulling_pod(scheduled));
     for second in [scheduled, scheduled + LIMIT, scheduled + PULLS] {

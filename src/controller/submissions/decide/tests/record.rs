@@ -7,11 +7,22 @@ use leaderboard_api::State::{Cancelled, Finished};
 use leaderboard_api::conditions::{self, RECORDED};
 use leaderboard_api::reasons;
 
-fn finished() -> World {
+/// A run of EvalAI's that has finished, and of which no system has the end.
+pub(super) fn finished() -> World {
     let mut world = World::evalai().running();
     world.complete();
     world.report(final_report());
     world.pass_to(Finished, reasons::FINISHED);
+    world
+}
+
+/// The same after EvalAI has refused its result.
+pub(super) fn refused() -> World {
+    let mut world = finished();
+    world.in_evalai().end = Some(EvalaiEnd::Refused {
+        message: "it belongs to another phase".into(),
+        is_due: false,
+    });
     world
 }
 
@@ -57,11 +68,7 @@ fn an_end_that_the_table_does_not_take_is_settled_and_not_written_again() {
 #[test]
 fn a_cancel_in_evalai_after_a_refusal_is_written_over_the_end_that_the_table_kept() {
     for is_restarted in [false, true] {
-        let mut world = finished();
-        world.in_evalai().end = Some(EvalaiEnd::Refused {
-            message: "it belongs to another phase".into(),
-            is_due: false,
-        });
+        let mut world = refused();
         assert!(records(&world.pass()));
         supersede(&mut world);
         let plan = world.pass();

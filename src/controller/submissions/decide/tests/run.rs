@@ -193,12 +193,7 @@ fn a_run_that_outlives_its_leaderboard_meets_no_deadline_of_ours() {
 fn time_lost_to_the_infrastructure_is_given_back() {
     let mut world = World::local().running();
     world.go_to(86_000);
-    world.complete();
-    world.pass_to(Pending, reasons::REPLACING);
-    world.job_gone();
-    world.wait(10);
-    world.pass_to(Pending, reasons::PREPARING);
-    world.see_job();
+    world.gets_another_job();
     world.go_to(200_000);
     world.pass_to(Pending, reasons::PREPARING);
     world.view.pod = Some(pod(200_000));
@@ -262,12 +257,7 @@ fn crashes_of_an_earlier_pod_are_not_counted_twice() {
         world.see(ended(&format!("simulator-{n}"), 3, "exited", 1, 100));
     }
     world.pass_to(Running, reasons::STOPPING);
-    world.complete();
-    world.pass_to(Pending, reasons::REPLACING);
-    world.job_gone();
-    world.wait(10);
-    world.pass_to(Pending, reasons::PREPARING);
-    world.see_job();
+    world.gets_another_job();
     world.view.pod = Some(PodView {
         uid: "pod-2".into(),
         ..pod(200)
