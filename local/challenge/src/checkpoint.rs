@@ -8,10 +8,13 @@ use std::{
     path::Path,
 };
 
-use serde::{Deserialize, Serialize, Serializer, ser::SerializeMap};
+use serde::{Deserialize, Deserializer, Serialize, Serializer, de::Error as _, ser::SerializeMap};
 use serde_json::{Number, Value, ser::PrettyFormatter};
 
 use crate::flags::Format;
+
+/// The entry status after a crash of the simulation.
+pub const CRASHED: &str = "Crashed";
 
 /// The infractions, in the order of V2's file. V1 has the nine that are not marked.
 const INFRACTIONS: [&str; 12] = [
@@ -61,6 +64,9 @@ pub struct Meta {
 /// One route's record.
 #[derive(Clone, Debug, Serialize, Deserialize)]
 pub struct Record {
+    /// Read from a file, not made by this process.
+    #[serde(skip, default = "from_file")]
+    pub from_file: bool,
     pub index: usize,
     pub route_id: String,
     pub status: String,
@@ -73,14 +79,14 @@ pub struct Record {
 }
 
 /// A mean, or a deviation, of each score.
-#[derive(Clone, Debug, Serialize)]
+#[derive(Clone, Debug, Serialize, Deserialize)]
 pub struct ScoreTriple<T> {
     pub score_composed: T,
     pub score_route: T,
     pub score_penalty: T,
 }
 
-#[derive(Clone, Debug, Serialize)]
+#[derive(Clone, Debug, Serialize, Deserialize)]
 pub struct GlobalMeta {
     pub total_length: f64,
     pub duration_game: f64,
@@ -90,7 +96,7 @@ pub struct GlobalMeta {
     pub exceptions: Option<Vec<(String, usize, String)>>,
 }
 
-#[derive(Clone, Debug, Serialize)]
+#[derive(Clone, Debug, Serialize, Deserialize)]
 pub struct GlobalRecord {
     pub index: i8,
     pub route_id: i8,
@@ -107,16 +113,17 @@ pub struct GlobalRecord {
     pub meta: GlobalMeta,
 }
 
-#[derive(Clone, Debug, Serialize)]
+#[derive(Clone, Debug, Serialize, Deserialize)]
 pub struct Routes {
-    #[serde(serialize_with = "object")]
+    #[serde(serialize_with = "object", deserialize_with = "filled")]
     pub global_record: Option<GlobalRecord>,
-    pub progress: [usize; 2],
+    /// Routes done and all routes; empty in a file of V1 that an evaluator made of nothing when it was to resume.
+    pub progress: Vec<usize>,
     pub records: Vec<Record>,
 }
 
 /// The whole file.
-#[derive(Clone, Debug, Serialize)]
+#[derive(Clone, Debug, Serialize, Deserialize)]
 pub struct Checkpoint {
     #[serde(rename = "_checkpoint")]
     pub routes: Routes,
@@ -126,22 +133,6 @@ pub struct Checkpoint {
     pub sensors: Vec<String>,
     pub values: Vec<String>,
     pub labels: Vec<String>,
-}
-
-/// What a resumed run reads of its earlier file.
-#[derive(Debug, Deserialize)]
-pub struct Saved {
-    #[serde(rename = "_checkpoint")]
-    pub routes: SavedRoutes,
-    pub entry_status: String,
-    #[serde(default)]
-    pub sensors: Vec<String>,
-}
-
-#[derive(Debug, Deserialize)]
-pub struct SavedRoutes {
-    pub progress: Vec<usize>,
-    pub records: Vec<Record>,
 }
 
 impl Checkpoint {
@@ -154,7 +145,7 @@ impl Checkpoint {
         Self {
             routes: Routes {
                 global_record: None,
-                progress: [0, total],
+                progress: vec![0, total],
                 records: Vec::new(),
             },
             entry_status: entry_status.to_owned(),
@@ -195,8 +186,21 @@ pub fn write_in_pieces(path: &Path, text: &str, mut between: impl FnMut()) -> io
 }
 
 /// What an earlier run left, or none if there is no file or it is not a checkpoint.
-pub fn saved(path: &Path) -> Option<Saved> {
+pub fn saved(path: &Path) -> Option<Checkpoint> {
     serde_json::from_slice(&fs::read(path).ok()?).ok()
+}
+
+fn from_file() -> bool {
+    true
+}
+
+/// An object with nothing in it is no global record.
+fn filled<'de, D: Deserializer<'de>>(deserializer: D) -> Result<Option<GlobalRecord>, D::Error> {
+    let value = Value::deserialize(deserializer)?;
+    if value.as_object().is_some_and(serde_json::Map::is_empty) {
+        return Ok(None);
+    }
+    serde_json::from_value(value).map(Some).map_err(D::Error::custom)
 }
 
 fn in_file_order<T: Serialize, S: Serializer>(map: &BTreeMap<String, T>, serializer: S) -> Result<S::Ok, S::Error> {

@@ -1,5 +1,6 @@
-//! The Leaderboard's evaluator: runs a worker's routes against a simulator, keeps the checkpoint, resumes from it. Called
-//! by `challenge-agent`. What happens on a route comes from `scenario`, what goes wrong on purpose from `faults`.
+//! The Leaderboard's evaluator: runs a worker's routes against a simulator, keeps the checkpoint, resumes from it, and writes it
+//! at the moments of the original. Called by `challenge-agent`. What happens on a route comes from `scenario`, what goes wrong on
+//! purpose from `faults`.
 
 use std::{
     fs,
@@ -10,19 +11,21 @@ use std::{
 };
 
 use crate::{
-    checkpoint::{self, Checkpoint, Saved},
+    checkpoint::{self, CRASHED, Checkpoint, Record},
     faults::Faults,
     flags::{Format, Invocation},
     knobs::Knobs,
     link::{Link, NoSimulator},
+    resume,
     routes::{self, SubsetError},
-    scenario::{self, Leg, Outcome, Scenario},
+    scenario::{Leg, NOT_LOADED, Outcome, Scenario},
     statistics,
 };
 
 /// Packages the Leaderboard imports, each from another of the shared folders.
 const MODULES: [&str; 3] = ["leaderboard", "srunner", "agents"];
 
+const STARTED: &str = "Started";
 /// A copy that does not come is not waited for any longer.
 const COPY_PATIENCE: Duration = Duration::from_secs(10);
 
@@ -72,8 +75,17 @@ pub enum EvaluatorError {
     UnknownRoute { path: PathBuf, route: String },
     #[error("RuntimeError: {0}")]
     NoSimulator(#[from] NoSimulator),
+    #[error("AttributeError: 'NoneType' object has no attribute 'get_actors'")]
+    NoWorld,
     #[error("{path} can't be written: {source}")]
     Write { path: PathBuf, source: io::Error },
+}
+
+impl EvaluatorError {
+    /// It comes once the evaluator is set up.
+    pub fn is_of_the_run(&self) -> bool {
+        !matches!(self, Self::NoModule(_) | Self::NoAgent(_) | Self::NoSimulator(_))
+    }
 }
 
 /// Runs the evaluation.
@@ -81,20 +93,28 @@ pub fn run(invocation: &Invocation, environment: Environment) -> Result<Ending, 
     let faults = Faults::new(environment.knobs, invocation.format, &invocation.checkpoint);
     faults.at_start();
     check_imports(invocation, &environment.python_path)?;
-    let Plan { sensors, legs } = plan(invocation)?;
     let link = Link::connect(invocation.port)?;
-    let file = Checkpoint::new(invocation.format, legs.len());
+    let Plan { sensors, legs } = plan(invocation)?;
     let mut worker = Worker {
         invocation,
         route_time: environment.route_time,
         route_copy: environment.route_copy,
+        file: Checkpoint::new(invocation.format, legs.len()),
         faults,
         sensors,
         legs,
         link,
-        file,
+        resumes: invocation.resume,
+        is_set_up: false,
+        has_world: false,
     };
-    let ending = worker.evaluate()?;
+    let ending = match worker.replayed()? {
+        Some(ending) => ending,
+        None => worker.evaluate()?,
+    };
+    if ending == Ending::Finished && worker.faults.starts_once_more() {
+        worker.start_once_more()?;
+    }
     worker.faults.at_end();
     Ok(ending)
 }
@@ -173,28 +193,55 @@ struct Worker<'a> {
     legs: Vec<(Leg, Outcome)>,
     link: Link,
     file: Checkpoint,
+    resumes: bool,
+    /// The sensors of this process are known.
+    is_set_up: bool,
+    /// This process has loaded a world.
+    has_world: bool,
+}
+
+/// What came of a route.
+struct Driven {
+    record: Record,
+    /// The entry status: all but `Started` stop the evaluation.
+    entry: &'static str,
+}
+
+impl Driven {
+    fn stopped(entry: &'static str, record: Record) -> Self {
+        Self { record, entry }
+    }
+
+    fn went_on(record: Record) -> Self {
+        Self { record, entry: STARTED }
+    }
 }
 
 impl Worker<'_> {
     fn evaluate(&mut self) -> Result<Ending, EvaluatorError> {
-        let start = self.resume()?;
-        self.file.routes.progress[0] = start;
-        self.write(start)?;
-        for (leg, outcome) in self.legs.split_off(start) {
+        let start = match self.format() {
+            Format::V1 => self.begin_v1()?,
+            Format::V2 => self.begin_v2()?,
+        };
+        for (leg, outcome) in self.legs.get(start..).unwrap_or_default().to_vec() {
+            let number = leg.index + 1;
             say(&format!(
                 "\n========= Preparing {} (repetition {}) =========",
                 leg.id(self.format()),
                 leg.repetition
             ));
-            let stop = self.route(&leg, &outcome)?;
-            if stop.is_none() || self.format() == Format::V2 {
-                self.file.routes.progress[0] = leg.index + 1;
+            let driven = self.route(&leg, &outcome)?;
+            let stops = driven.entry != STARTED;
+            self.register(&leg, driven)?;
+            if !stops || self.format() == Format::V2 {
+                self.file.routes.progress = vec![number, self.legs.len()];
+                self.write(number)?;
             }
-            self.write(leg.index + 1)?;
-            if stop.is_some() {
+            if stops {
                 return Ok(Ending::Stopped);
             }
-            if self.faults.ends_early(leg.index + 1) {
+            self.faults.after_route(number);
+            if self.faults.ends_early(number) {
                 break;
             }
         }
@@ -204,113 +251,211 @@ impl Worker<'_> {
         Ok(Ending::Finished)
     }
 
-    /// Takes up an earlier file, or clears it; the index of the first route to run.
-    fn resume(&mut self) -> Result<usize, EvaluatorError> {
-        let earlier = if self.invocation.resume {
+    /// V1 takes up an earlier file without a look at its routes, and edits it from then on; it writes nothing before its first
+    /// set-up. The index of the first route to run.
+    fn begin_v1(&mut self) -> Result<usize, EvaluatorError> {
+        if !self.resumes {
+            self.clear()?;
+            self.write(0)?;
+            return Ok(0);
+        }
+        if let Some(saved) = checkpoint::saved(&self.invocation.checkpoint) {
+            self.file = saved;
+        } else {
+            self.file.routes.progress.clear();
+        }
+        let done = self.file.routes.progress.first().copied().unwrap_or(0);
+        let start = if done <= self.legs.len() { done } else { 0 };
+        self.say_resuming(start);
+        Ok(start)
+    }
+
+    /// V2 takes of an earlier file its records and nothing else, and writes that at once.
+    fn begin_v2(&mut self) -> Result<usize, EvaluatorError> {
+        self.file = Checkpoint::new(Format::V2, self.legs.len());
+        let earlier = if self.resumes {
             checkpoint::saved(&self.invocation.checkpoint)
         } else {
             None
         };
-        let Some((start, saved)) = earlier.and_then(|saved| Some((self.first_route(&saved)?, saved))) else {
-            let cleared = fs::OpenOptions::new()
-                .write(true)
-                .truncate(true)
-                .open(&self.invocation.checkpoint);
-            return match cleared {
-                Err(error) if error.kind() != io::ErrorKind::NotFound => Err(self.unwritable(error)),
-                _ => Ok(0),
-            };
+        let start = match earlier.and_then(|saved| Some((resume::first_route(&saved, &self.ids())?, saved))) {
+            Some((start, saved)) => {
+                self.say_resuming(start);
+                self.file.routes.records = saved.routes.records;
+                start
+            }
+            None => {
+                self.clear()?;
+                0
+            }
         };
-        say(&format!("> Resuming at route {} of {}", start + 1, self.legs.len()));
-        self.file.routes.records = saved.routes.records;
-        self.file.routes.records.truncate(start);
-        self.file.sensors = saved.sensors;
-        if start > 0 {
-            self.started();
-        }
+        self.file.routes.progress = vec![start, self.legs.len()];
+        self.write(start)?;
         Ok(start)
     }
 
-    /// V2 repeats the route in which it crashed and compares the ids of those before; V1 trusts its progress.
-    fn first_route(&self, saved: &Saved) -> Option<usize> {
-        let &[done, total] = saved.routes.progress.as_slice() else {
-            return None;
-        };
-        let records = &saved.routes.records;
-        let repeat = usize::from(self.format() == Format::V2 && saved.entry_status == "Crashed");
-        let start = done.saturating_sub(repeat).min(records.len());
-        let same = records
-            .iter()
-            .zip(&self.legs)
-            .all(|(record, (leg, _))| record.route_id == leg.id(self.format()));
-        (total == self.legs.len() && (same || self.format() == Format::V1)).then_some(start)
+    fn ids(&self) -> Vec<String> {
+        self.legs.iter().map(|(leg, _)| leg.id(self.format())).collect()
     }
 
-    /// Runs one route up to its record. Returns with which entry status the evaluation stops, if it does.
-    fn route(&mut self, leg: &Leg, outcome: &Outcome) -> Result<Option<&'static str>, EvaluatorError> {
-        let (format, number) = (self.format(), leg.index + 1);
-        self.started();
+    fn say_resuming(&self, start: usize) {
+        say(&format!("> Resuming at route {} of {}", start + 1, self.legs.len()));
+    }
+
+    fn clear(&self) -> Result<(), EvaluatorError> {
+        let cleared = fs::OpenOptions::new()
+            .write(true)
+            .truncate(true)
+            .open(&self.invocation.checkpoint);
+        match cleared {
+            Err(error) if error.kind() != io::ErrorKind::NotFound => Err(self.unwritable(error)),
+            _ => Ok(()),
+        }
+    }
+
+    /// Runs one route up to its record.
+    fn route(&mut self, leg: &Leg, outcome: &Outcome) -> Result<Driven, EvaluatorError> {
+        let format = self.format();
+        if format == Format::V2 && leg.index < self.file.routes.records.len() {
+            // A route under way is not in the file, and what an earlier process has of it is no longer.
+            self.file.routes.records.remove(leg.index);
+        }
         if let Some(path) = &self.invocation.debug_checkpoint {
             fs::write(path, format!("Route id: {}\n", leg.id(format))).map_err(|source| EvaluatorError::Write {
                 path: path.clone(),
                 source,
             })?;
         }
-        say("> Setting up the agent");
-        self.file.sensors.clone_from(&self.sensors);
-        let (record, stop) = if self.faults.rejects(number) {
-            say("The sensor's configuration used is invalid");
-            (scenario::rejected(format, leg), Some("Rejected"))
-        } else if drive(&mut self.link, &self.faults, self.invocation, self.route_time, leg) {
+        let not_loaded = || Driven::stopped(CRASHED, outcome.not_begun(format, leg, NOT_LOADED));
+        if format == Format::V2 && !self.load_world(leg)? {
+            return Ok(not_loaded());
+        }
+        if let Some(failed) = self.set_up(leg, outcome)? {
+            return Ok(failed);
+        }
+        if format == Format::V1 && !self.load_world(leg)? {
+            return Ok(not_loaded());
+        }
+        let driven = if drive(&mut self.link, &self.faults, self.invocation, self.route_time, leg) {
             let mut record = outcome.record(format, leg);
-            self.faults.falsify(number, &mut record);
-            (record, None)
+            self.faults.falsify(leg.index + 1, &mut record);
+            Driven::went_on(record)
         } else {
             say("> The simulation crashed");
-            (outcome.broken_off(format, leg), Some("Crashed"))
+            Driven::stopped(CRASHED, outcome.broken_off(format, leg))
         };
         self.await_copy();
+        Ok(driven)
+    }
+
+    /// Without a world of its own V2 falls over its own clearing up, before it has written anything.
+    fn load_world(&mut self, leg: &Leg) -> Result<bool, EvaluatorError> {
+        say("> Loading the world");
+        let is_loaded = !self.faults.keeps_from_loading(leg.index + 1) && self.link.load(&leg.route).is_ok();
+        if !is_loaded {
+            say("The scenario could not be loaded");
+            if self.format() == Format::V2 && !self.has_world {
+                return Err(EvaluatorError::NoWorld);
+            }
+        }
+        self.has_world |= is_loaded;
+        Ok(is_loaded)
+    }
+
+    /// Sets up the agent. The first set-up of a process stores the sensors, V1's only if the file has none.
+    fn set_up(&mut self, leg: &Leg, outcome: &Outcome) -> Result<Option<Driven>, EvaluatorError> {
+        let (format, number) = (self.format(), leg.index + 1);
+        say("> Setting up the agent");
+        if self.faults.rejects(number) {
+            say("The sensor's configuration used is invalid");
+            let record = outcome.not_begun(format, leg, "Agent's sensors were invalid");
+            return Ok(Some(Driven::stopped("Rejected", record)));
+        }
+        if self.faults.keeps_from_setting_up(number) {
+            say("Could not set up the required agent");
+            let record = outcome.not_begun(format, leg, "Agent couldn't be set up");
+            return Ok(Some(Driven::went_on(record)));
+        }
+        let is_first = !std::mem::replace(&mut self.is_set_up, true);
+        if is_first && (format == Format::V2 || self.file.sensors.is_empty()) {
+            self.file.sensors.clone_from(&self.sensors);
+            self.write(leg.index)?;
+        }
+        Ok(None)
+    }
+
+    /// V1 writes after each step, V2 once at the end of the route.
+    fn register(&mut self, leg: &Leg, driven: Driven) -> Result<(), EvaluatorError> {
         say("> Registering the route statistics");
-        self.file.routes.records.truncate(leg.index);
-        self.file.routes.records.push(record);
-        if let Some(status) = stop {
-            status.clone_into(&mut self.file.entry_status);
-        } else if format == Format::V1 {
-            // V1 saves the record first and the progress after it.
+        let (records, number) = (&mut self.file.routes.records, leg.index + 1);
+        if self.invocation.format == Format::V2 {
+            records.insert(leg.index.min(records.len()), driven.record);
+        } else {
+            match records.get_mut(leg.index) {
+                Some(record) => *record = driven.record,
+                None => records.push(driven.record),
+            }
             self.write(number)?;
         }
-        Ok(stop)
+        driven.entry.clone_into(&mut self.file.entry_status);
+        self.file.eligible = false.into();
+        match self.format() {
+            Format::V1 => self.write(number),
+            Format::V2 => Ok(()),
+        }
     }
 
     fn finish(&mut self) {
         let records = &self.file.routes.records;
         let global = statistics::global(self.format(), records);
-        let agent_errors = self.format() == Format::V1 && records.iter().any(|record| record.status.contains("Agent"));
-        let status = if agent_errors {
-            "Finished with agent errors"
-        } else {
-            "Finished"
-        };
+        let status = statistics::entry_status(self.format(), records);
         status.clone_into(&mut self.file.entry_status);
-        self.file.eligible = true.into();
+        self.file.eligible = status.starts_with("Finished").into();
         self.file.values = statistics::values(self.format(), &global);
         self.file.labels = statistics::labels(self.format());
         self.file.routes.global_record = Some(global);
     }
 
+    /// With the knob `replay` a file of a real evaluator takes the place of an evaluation that begins.
+    fn replayed(&self) -> Result<Option<Ending>, EvaluatorError> {
+        let path = &self.invocation.checkpoint;
+        let Some(file) = self.faults.replays() else {
+            return Ok(None);
+        };
+        if self.resumes && checkpoint::saved(path).is_some() {
+            return Ok(None);
+        }
+        let text = read("the file to replay", &self.invocation.routes.with_file_name(file))?;
+        let written = self.faults.write_text(&text, 0);
+        written.map_err(|source| self.unwritable(source))?;
+        say(&format!("> Replaying {file}"));
+        match checkpoint::saved(path) {
+            Some(saved) if saved.routes.global_record.is_some() => Ok(Some(Ending::Finished)),
+            Some(saved) if saved.entry_status != STARTED => Ok(Some(Ending::Stopped)),
+            _ => Err(EvaluatorError::NoWorld),
+        }
+    }
+
+    /// Does what another process would do to the complete file.
+    fn start_once_more(&mut self) -> Result<Ending, EvaluatorError> {
+        (self.resumes, self.is_set_up, self.has_world) = (true, false, false);
+        self.evaluate()
+    }
+
     /// Routes of real challenges take minutes, those of tests must take at least as long as a copy of the checkpoint.
     fn await_copy(&self) {
-        let Some(copy) = &self.route_copy else { return };
+        let Some(copy) = self
+            .route_copy
+            .as_ref()
+            .filter(|_| !self.file.routes.progress.is_empty())
+        else {
+            return;
+        };
         let begin = Instant::now();
         let differ = || fs::read(copy).ok() != fs::read(&self.invocation.checkpoint).ok();
         while differ() && begin.elapsed() < COPY_PATIENCE {
             thread::sleep(Duration::from_millis(1));
         }
-    }
-
-    fn started(&mut self) {
-        "Started".clone_into(&mut self.file.entry_status);
-        self.file.eligible = false.into();
     }
 
     fn write(&self, number: usize) -> Result<(), EvaluatorError> {

@@ -29,6 +29,11 @@ pub const KNOBS: &[Known] = &[
     ("hang", Shape::At),
     ("oom", Shape::At),
     ("reject", Shape::At),
+    ("no-setup", Shape::At),
+    ("no-world", Shape::At),
+    ("dies-after", Shape::At),
+    ("once-more", Shape::Plain),
+    ("replay", Shape::Value),
     ("print-routes", Shape::PlainOrAt),
     ("nonsense", Shape::At),
     ("deep", Shape::At),
@@ -131,6 +136,33 @@ impl Faults {
         self.knobs.fires("reject", number, &self.markers)
     }
 
+    /// Does the agent's set-up fail at this route?
+    pub fn keeps_from_setting_up(&self, number: usize) -> bool {
+        self.knobs.fires("no-setup", number, &self.markers)
+    }
+
+    /// Can the world of this route not be loaded?
+    pub fn keeps_from_loading(&self, number: usize) -> bool {
+        self.knobs.fires("no-world", number, &self.markers)
+    }
+
+    /// After the last write of a route.
+    pub fn after_route(&self, number: usize) {
+        if self.knobs.fires("dies-after", number, &self.markers) {
+            abort("Segmentation fault (core dumped)");
+        }
+    }
+
+    /// Is the evaluator started once more when it has done everything?
+    pub fn starts_once_more(&self) -> bool {
+        self.knobs.has("once-more")
+    }
+
+    /// The file that stands for a whole evaluation, beside the routes file.
+    pub fn replays(&self) -> Option<&str> {
+        self.knobs.value("replay")
+    }
+
     /// Does the agent leave out what comes after this route?
     pub fn ends_early(&self, number: usize) -> bool {
         self.knobs.fires("early", number, &self.markers)
@@ -150,6 +182,11 @@ impl Faults {
 
     /// Writes the checkpoint after the `number`-th route.
     pub fn write(&self, checkpoint: &Checkpoint, number: usize) -> io::Result<()> {
+        self.write_text(&checkpoint.text(self.format)?, number)
+    }
+
+    /// Writes this text as the checkpoint.
+    pub fn write_text(&self, checkpoint: &str, number: usize) -> io::Result<()> {
         if self.knobs.has("fifo") {
             return self.make_fifo();
         }
@@ -160,7 +197,7 @@ impl Faults {
             }
             () if holds("deep") => "[".repeat(DEPTH),
             () if holds("huge") => " ".repeat(HUGE),
-            () => checkpoint.text(self.format)?,
+            () => checkpoint.to_owned(),
         };
         let Some(target) = self.knobs.value("symlink") else {
             write_in_pieces(&self.path, &text, || thread::sleep(BETWEEN_PIECES))?;

@@ -9,6 +9,7 @@ pub mod faults;
 pub mod flags;
 pub mod knobs;
 pub mod link;
+pub mod resume;
 pub mod routes;
 pub mod scenario;
 pub mod simulator;

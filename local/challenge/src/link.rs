@@ -1,5 +1,5 @@
 //! The agent's connection to its simulator. Called by `evaluator`; `simulator` speaks the other side: a greeting line
-//! for each connection, then `ok <id>` for each `route <id>`.
+//! for each connection, then `ok <id>` for each `load <id>` and each `route <id>`.
 
 use std::{
     io::{self, BufRead, BufReader, ErrorKind, Read, Write},
@@ -49,13 +49,19 @@ impl Link {
         }
     }
 
+    /// Loads the world of a route; returns when the simulator has it, however long that takes.
+    pub fn load(&mut self, route: &str) -> Result<(), Gone> {
+        self.ask(&format!("load {route}\n"))
+    }
+
     /// Begins a route; returns when the simulator has taken it up, however long that takes.
     pub fn begin(&mut self, route: &str) -> Result<(), Gone> {
+        self.ask(&format!("route {route}\n"))
+    }
+
+    fn ask(&mut self, line: &str) -> Result<(), Gone> {
         self.stream.get_ref().set_read_timeout(None).map_err(|_| Gone)?;
-        self.stream
-            .get_mut()
-            .write_all(format!("route {route}\n").as_bytes())
-            .map_err(|_| Gone)?;
+        self.stream.get_mut().write_all(line.as_bytes()).map_err(|_| Gone)?;
         let mut answer = String::new();
         match self.stream.read_line(&mut answer) {
             Ok(length) if length > 0 => Ok(()),

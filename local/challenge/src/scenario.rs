@@ -11,6 +11,9 @@ use crate::{
     flags::Format,
 };
 
+/// Why a route has not begun: its world can't be loaded.
+pub const NOT_LOADED: &str = "Simulation crashed";
+
 /// The table.
 #[derive(Debug, Deserialize)]
 pub struct Scenario {
@@ -77,6 +80,17 @@ impl Outcome {
         }
     }
 
+    /// The record of a route that never began. Its length is known unless V2 could not load its world.
+    pub fn not_begun(&self, format: Format, leg: &Leg, why: &str) -> Record {
+        let none = infractions(format).map(|name| (name.to_owned(), Vec::new())).collect();
+        let mut record = empty(format, leg, &format!("Failed - {why}"), none);
+        record.scores.score_penalty = 1.0;
+        if format == Format::V1 || why != NOT_LOADED {
+            record.meta.route_length = self.route_length;
+        }
+        record
+    }
+
     /// The record of a route in whose middle the simulator died.
     pub fn broken_off(&self, format: Format, leg: &Leg) -> Record {
         let score = rounded(format, self.score_route.as_f64().unwrap_or_default() / 2.0, 6);
@@ -97,14 +111,9 @@ impl Outcome {
     }
 }
 
-/// The record of a route that never began, because the agent asked for sensors it may not have.
-pub fn rejected(format: Format, leg: &Leg) -> Record {
-    let none = infractions(format).map(|name| (name.to_owned(), Vec::new())).collect();
-    empty(format, leg, "Failed - Agent's sensors were invalid", none)
-}
-
 fn empty(format: Format, leg: &Leg, status: &str, found: BTreeMap<String, Vec<String>>) -> Record {
     Record {
+        from_file: false,
         index: leg.index,
         route_id: leg.id(format),
         status: status.to_owned(),

@@ -23,6 +23,7 @@ const SAVED: &str = "/home/carla/CarlaUE4/Saved";
 
 const KNOBS: &[Known] = &[
     ("crash", Shape::At),
+    ("crash-loading", Shape::At),
     ("hang", Shape::PlainOrAt),
     ("never-ready", Shape::Plain),
     ("ignore-term", Shape::Plain),
@@ -45,7 +46,9 @@ pub enum SimulatorError {
 struct World {
     knobs: Knobs,
     saved: PathBuf,
-    /// Routes begun since this process started, over all connections.
+    /// Worlds loaded since this process started, over all connections.
+    worlds: Mutex<usize>,
+    /// Routes begun since then.
     routes: Mutex<usize>,
     /// The main loop hangs: nobody is answered any more, on no connection.
     hangs: AtomicBool,
@@ -65,6 +68,7 @@ pub fn run(arguments: &[String]) -> Result<(), SimulatorError> {
     let world = Arc::new(World {
         knobs,
         saved,
+        worlds: Mutex::new(0),
         routes: Mutex::new(0),
         hangs: AtomicBool::new(false),
         log,
@@ -104,7 +108,11 @@ impl World {
         }
         writeln!(stream, "carla {VERSION}")?;
         for line in BufReader::new(stream).lines() {
-            if let Some(route) = line?.strip_prefix("route ") {
+            let line = line?;
+            if let Some(route) = line.strip_prefix("load ") {
+                self.load();
+                writeln!(stream, "ok {route}")?;
+            } else if let Some(route) = line.strip_prefix("route ") {
                 self.begin(route);
                 writeln!(stream, "ok {route}")?;
             }
@@ -112,21 +120,28 @@ impl World {
         Ok(())
     }
 
+    fn load(&self) {
+        let number = one_more(&self.worlds);
+        if self.knobs.fires("crash-loading", number, &self.saved) {
+            self.crash();
+        }
+    }
+
     fn begin(&self, route: &str) {
-        let number = {
-            let mut routes = self.routes.lock().unwrap_or_else(PoisonError::into_inner);
-            *routes += 1;
-            *routes
-        };
+        let number = one_more(&self.routes);
         self.say(&format!("route {route} begins, number {number} of this server"));
         if self.knobs.fires("crash", number, &self.saved) {
-            self.say("Signal 11 caught. Malloc Size=65538 LargeMemoryPoolOffset=65554");
-            std::process::exit(1);
+            self.crash();
         }
         if self.knobs.fires("hang", number, &self.saved) {
             self.hangs.store(true, Ordering::Relaxed);
             forever();
         }
+    }
+
+    fn crash(&self) -> ! {
+        self.say("Signal 11 caught. Malloc Size=65538 LargeMemoryPoolOffset=65554");
+        std::process::exit(1);
     }
 
     /// To standard output and, when there is one, to the log file; neither may end the simulator.
@@ -136,6 +151,12 @@ impl World {
             let _ = writeln!(file, "{line}");
         }
     }
+}
+
+fn one_more(counter: &Mutex<usize>) -> usize {
+    let mut count = counter.lock().unwrap_or_else(PoisonError::into_inner);
+    *count += 1;
+    *count
 }
 
 /// All pairs' simulators share one folder, so the file carries the port.

@@ -37,6 +37,22 @@ fn undisturbed(subset: &str, v1: bool) -> String {
     folder.read("agent_results.json")
 }
 
+/// To the byte; 1.0 counts each route of an earlier process as failed in its global record.
+fn assert_same(found: &str, undisturbed: &str, v1: bool) {
+    if !v1 {
+        assert_eq!(found, undisturbed);
+        return;
+    }
+    let but_that = |text: &str| {
+        let mut file: Value = serde_json::from_str(text).unwrap();
+        let global = file["_checkpoint"]["global_record"].as_object_mut().unwrap();
+        global.remove("status");
+        global["meta"].as_object_mut().unwrap().remove("exceptions");
+        file
+    };
+    assert_eq!(but_that(found), but_that(undisturbed));
+}
+
 fn state(checkpoint: &Value) -> (&Value, &Value, usize, bool) {
     let routes = &checkpoint["_checkpoint"];
     let global = routes["global_record"].as_object().unwrap();
@@ -129,7 +145,7 @@ fn a_killed_run_resumes_to_the_same_file() {
         .start();
         second.until("> Resuming at route 3 of");
         assert!(second.end().1.success());
-        assert_eq!(folder.read("agent_results.json"), undisturbed("0-4", v1), "V1: {v1}");
+        assert_same(&folder.read("agent_results.json"), &undisturbed("0-4", v1), v1);
     }
 }
 
@@ -223,7 +239,7 @@ fn a_crash_of_the_simulator_is_recorded_and_repeated() {
             .run()
             .success()
         );
-        assert_eq!(folder.read("agent_results.json"), undisturbed("0-4", v1), "V1: {v1}");
+        assert_same(&folder.read("agent_results.json"), &undisturbed("0-4", v1), v1);
     }
 }
 

@@ -4,6 +4,8 @@
 #[cfg(test)]
 mod agent;
 #[cfg(test)]
+mod resume;
+#[cfg(test)]
 mod simulator;
 #[cfg(test)]
 mod support;
