@@ -16,7 +16,7 @@ pub(super) struct TrackPods {
 
 /// One sentence or two for each thing.
 pub(super) fn notes(tracks: &[TrackPods]) -> Vec<String> {
-    [weak(tracks), secrets(tracks), unbounded(tracks)]
+    [weak(tracks), secrets(tracks), unbounded(tracks), ros(tracks)]
         .into_iter()
         .flatten()
         .collect()
@@ -95,6 +95,37 @@ fn unbounded(tracks: &[TrackPods]) -> Option<String> {
          else runs there; set agent.resources.limits.memory.",
         listed(names)
     ))
+}
+
+/// Several ROS agents in one Pod meet on its network.
+fn ros(tracks: &[TrackPods]) -> Option<String> {
+    let found: Vec<String> = tracks
+        .iter()
+        .filter(|pods| agents(&pods.template["spec"]).nth(1).is_some() && names_ros(pods))
+        .map(|pods| pods.track.clone())
+        .collect();
+    let tracks = match found.len() {
+        0 => return None,
+        1 => "track",
+        _ => "tracks",
+    };
+    Some(format!(
+        "ROS: all pairs of a Pod share its network, so the agents of the {tracks} {} meet on one ROS1 master (11311), one rosbridge \
+         (9090) and ROS2's default domain; set pairs: 1 for each track of ROS agents.",
+        listed(found)
+    ))
+}
+
+/// A track's name or a variable of its agents, the codename among them, has the word.
+fn names_ros(pods: &TrackPods) -> bool {
+    let variables = agents(&pods.template["spec"]).flat_map(|agent| list(agent, "env"));
+    let texts = variables.flat_map(|variable| [&variable["name"], &variable["value"]].map(Value::as_str));
+    texts.flatten().chain([pods.track.as_str()]).any(has_ros)
+}
+
+fn has_ros(text: &str) -> bool {
+    let mut words = text.split(|letter: char| !letter.is_ascii_alphanumeric());
+    words.any(|word| ["ros", "ros1", "ros2"].contains(&word.to_ascii_lowercase().as_str()))
 }
 
 fn agents(pod: &Value) -> impl Iterator<Item = &Value> {
@@ -183,6 +214,38 @@ mod tests {
         // One that nobody mounts, and one that is no Secret.
         let volumes = json!([{"name": "w", "secret": {"secretName": "key"}}, {"name": "v", "emptyDir": {}}]);
         assert!(notes(&[pods("a", with("volumeMounts", mount()), &volumes)]).is_empty());
+    }
+
+    /// A track whose Pod has two agents with this variable.
+    fn two_pairs(track: &str, name: &str, value: &str) -> TrackPods {
+        let agent = |pair| {
+            let mut agent = with("env", json!([{"name": name, "value": value}]));
+            agent["name"] = format!("agent-{pair}").into();
+            agent
+        };
+        let template = json!({"spec": {"containers": [agent(1), agent(2)]}});
+        let track = track.to_owned();
+        TrackPods { track, template }
+    }
+
+    #[test]
+    fn tracks_of_several_pairs_that_say_ros_are_named() {
+        for (track, name, value, has_note) in [
+            ("sensors", "ROS_DOMAIN_ID", "3", true),
+            ("sensors", "SETUP", "/opt/ros/humble/setup.bash", true),
+            ("sensors", "CHALLENGE_TRACK_CODENAME", "SENSORS_ROS2", true),
+            ("map-ros", "CHALLENGE_TRACK_CODENAME", "MAP", true),
+            ("sensors", "PROSE", "across", false),
+            ("sensors", "CHALLENGE_TRACK_CODENAME", "MICROSERVICE", false),
+        ] {
+            let found = notes(&[two_pairs(track, name, value)]);
+            assert_eq!(found.len(), usize::from(has_note), "{track} {name}={value}: {found:?}");
+            let expected = format!("the agents of the track {track} meet on one ROS1 master (11311)");
+            assert!(found.iter().all(|note| note.contains(&expected)), "{found:?}");
+        }
+        // Alone in its Pod an agent meets nobody.
+        let alone = with("env", json!([{"name": "ROS_DISTRO", "value": "humble"}]));
+        assert!(notes(&[pods("sensors", alone, &json!([]))]).is_empty());
     }
 
     #[test]
