@@ -56,6 +56,7 @@ mod cluster {
     mod probe_endings;
     mod probes;
     mod publish;
+    mod real_files;
     mod requeues;
     mod restarts;
     mod runs;

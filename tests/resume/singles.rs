@@ -103,7 +103,7 @@ async fn all_crash(kubelet: &mut Kubelet<'_>) {
 
 /// Awaits logcopy's rounds, each of which asks the bucket whose the prefix is, until one has come so late that complete results would
 /// have been final in it.
-async fn rounds_past(proxy: &Proxy, settled: Instant) {
+pub(super) async fn rounds_past(proxy: &Proxy, settled: Instant) {
     while Instant::now() < settled {
         let known = proxy.counts().requests;
         proxy.until(|counts| counts.requests > known).await;
@@ -111,7 +111,7 @@ async fn rounds_past(proxy: &Proxy, settled: Instant) {
 }
 
 /// S3 reports no changes, so it is asked.
-async fn until_reported(submission: &Submission, done: u32) {
+pub(super) async fn until_reported(submission: &Submission, done: u32) {
     while report(&submission.archive)
         .await
         .is_none_or(|report| report.done < done)
