@@ -18,13 +18,13 @@ mod files;
 mod ministack;
 
 mod resume {
-    mod again;
     mod kills;
     mod kubelet;
     mod largest;
     mod late;
     mod measure;
     mod process;
+    mod restarted;
     mod results;
     mod singles;
     mod submission;

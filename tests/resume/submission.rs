@@ -57,7 +57,7 @@ pub struct Submission {
     pub route_waits_for_copy: bool,
     /// Knobs of the simulators.
     pub simulator_knobs: String,
-    /// Knobs of the agents.
+    /// Knobs of the agents; `{pair}` is the number of each.
     pub agent_knobs: String,
     ports: Vec<u16>,
 }
@@ -167,7 +167,10 @@ impl Submission {
             .arg("--resume=$(RESUME)")
             .arg(format!("--checkpoint={}", checkpoint.display()))
             .env("ROUTE_MS", self.route_ms.to_string())
-            .env("AGENT_KNOBS", &self.agent_knobs);
+            .env(
+                "AGENT_KNOBS",
+                self.agent_knobs.replace("{pair}", &member.pair.to_string()),
+            );
         if self.route_waits_for_copy {
             let copy = places.status().join(member.to_string()).join(KEPT_CHECKPOINT);
             command.env("ROUTE_COPY", copy);

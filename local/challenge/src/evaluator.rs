@@ -207,16 +207,6 @@ struct Driven {
     entry: &'static str,
 }
 
-impl Driven {
-    fn stopped(entry: &'static str, record: Record) -> Self {
-        Self { record, entry }
-    }
-
-    fn went_on(record: Record) -> Self {
-        Self { record, entry: STARTED }
-    }
-}
-
 impl Worker<'_> {
     fn evaluate(&mut self) -> Result<Ending, EvaluatorError> {
         let start = match self.format() {
@@ -232,7 +222,9 @@ impl Worker<'_> {
             ));
             let driven = self.route(&leg, &outcome)?;
             let stops = driven.entry != STARTED;
-            self.register(&leg, driven)?;
+            if !(stops && self.faults.loses_record(number)) {
+                self.register(&leg, driven)?;
+            }
             if !stops || self.format() == Format::V2 {
                 self.file.routes.progress = vec![number, self.legs.len()];
                 self.write(number)?;
@@ -278,16 +270,14 @@ impl Worker<'_> {
         } else {
             None
         };
-        let start = match earlier.and_then(|saved| Some((resume::first_route(&saved, &self.ids())?, saved))) {
-            Some((start, saved)) => {
-                self.say_resuming(start);
-                self.file.routes.records = saved.routes.records;
-                start
-            }
-            None => {
-                self.clear()?;
-                0
-            }
+        let resumed = earlier.and_then(|saved| Some((resume::first_route(&saved, &self.ids())?, saved)));
+        let start = if let Some((start, saved)) = resumed {
+            self.say_resuming(start);
+            self.file.routes.records = saved.routes.records;
+            start
+        } else {
+            self.clear()?;
+            0
         };
         self.file.routes.progress = vec![start, self.legs.len()];
         self.write(start)?;
@@ -326,7 +316,10 @@ impl Worker<'_> {
                 source,
             })?;
         }
-        let not_loaded = || Driven::stopped(CRASHED, outcome.not_begun(format, leg, NOT_LOADED));
+        let not_loaded = || Driven {
+            record: outcome.not_begun(format, leg, NOT_LOADED),
+            entry: CRASHED,
+        };
         if format == Format::V2 && !self.load_world(leg)? {
             return Ok(not_loaded());
         }
@@ -339,10 +332,12 @@ impl Worker<'_> {
         let driven = if drive(&mut self.link, &self.faults, self.invocation, self.route_time, leg) {
             let mut record = outcome.record(format, leg);
             self.faults.falsify(leg.index + 1, &mut record);
-            Driven::went_on(record)
+            let entry = STARTED;
+            Driven { record, entry }
         } else {
             say("> The simulation crashed");
-            Driven::stopped(CRASHED, outcome.broken_off(format, leg))
+            let (record, entry) = (outcome.broken_off(format, leg), CRASHED);
+            Driven { record, entry }
         };
         self.await_copy();
         Ok(driven)
@@ -366,15 +361,17 @@ impl Worker<'_> {
     fn set_up(&mut self, leg: &Leg, outcome: &Outcome) -> Result<Option<Driven>, EvaluatorError> {
         let (format, number) = (self.format(), leg.index + 1);
         say("> Setting up the agent");
-        if self.faults.rejects(number) {
-            say("The sensor's configuration used is invalid");
-            let record = outcome.not_begun(format, leg, "Agent's sensors were invalid");
-            return Ok(Some(Driven::stopped("Rejected", record)));
-        }
-        if self.faults.keeps_from_setting_up(number) {
-            say("Could not set up the required agent");
-            let record = outcome.not_begun(format, leg, "Agent couldn't be set up");
-            return Ok(Some(Driven::went_on(record)));
+        let failed = if self.faults.rejects(number) {
+            Some(("Agent's sensors were invalid", "Rejected"))
+        } else if self.faults.keeps_from_setting_up(number) {
+            Some(("Agent couldn't be set up", STARTED))
+        } else {
+            None
+        };
+        if let Some((why, entry)) = failed {
+            say(&format!("The set-up failed: {why}"));
+            let record = outcome.not_begun(format, leg, why);
+            return Ok(Some(Driven { record, entry }));
         }
         let is_first = !std::mem::replace(&mut self.is_set_up, true);
         if is_first && (format == Format::V2 || self.file.sensors.is_empty()) {

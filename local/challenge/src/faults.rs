@@ -31,6 +31,7 @@ pub const KNOBS: &[Known] = &[
     ("reject", Shape::At),
     ("no-setup", Shape::At),
     ("no-world", Shape::At),
+    ("no-record", Shape::At),
     ("dies-after", Shape::At),
     ("once-more", Shape::Plain),
     ("replay", Shape::Value),
@@ -144,6 +145,11 @@ impl Faults {
     /// Can the world of this route not be loaded?
     pub fn keeps_from_loading(&self, number: usize) -> bool {
         self.knobs.fires("no-world", number, &self.markers)
+    }
+
+    /// Does stopping this route fail, after its simulation has crashed?
+    pub fn loses_record(&self, number: usize) -> bool {
+        self.knobs.fires("no-record", number, &self.markers)
     }
 
     /// After the last write of a route.

@@ -36,8 +36,7 @@ fn folder_with(name: &str) -> Folder {
 
 /// The file without the content of its records, and without what follows from that.
 fn shape(mut file: Value) -> Value {
-    let length = |value: &Value| json!(value.as_array().unwrap().len());
-    file["values"] = length(&file["values"]);
+    file["values"] = json!(file["values"].as_array().unwrap().len());
     file["sensors"] = json!(file["sensors"].as_array().unwrap().is_empty());
     let routes = &mut file["_checkpoint"];
     let keys: Vec<String> = routes["global_record"].as_object().unwrap().keys().cloned().collect();
@@ -101,6 +100,31 @@ fn who_dies_while_it_loads_its_first_world_leaves_its_first_write_however_often(
             "route {index} stays as it was"
         );
     }
+}
+
+#[test]
+fn a_route_that_cannot_be_stopped_has_progress_and_no_record_and_costs_the_one_before() {
+    let folder = Folder::new();
+    let carla = simulator(&folder, "crash@4");
+    let first = Agent {
+        resume: "",
+        knobs: "no-record@4",
+        ..resumed(&folder, carla.port)
+    };
+    assert_eq!(first.run().code(), Some(255));
+    let found = folder.checkpoint();
+    let records = found["_checkpoint"]["records"].as_array().unwrap().len();
+    assert_eq!(
+        (&found["entry_status"], &found["_checkpoint"]["progress"], records),
+        (&json!("Started"), &json!([4, 4]), 3)
+    );
+    let carla = simulator(&folder, "");
+    let mut second = resumed(&folder, carla.port).start();
+    second.until("> Resuming at route 3 of 4");
+    assert!(second.end().1.success());
+    let mut expected = shape_of("done-4");
+    expected["sensors"] = json!(false);
+    assert_eq!(shape(folder.checkpoint()), expected);
 }
 
 #[test]

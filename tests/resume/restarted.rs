@@ -10,9 +10,9 @@ use leaderboard_operator::pod::report::Report;
 use leaderboard_runner::protocol::{Mark, Side, StatusFile};
 
 use super::kubelet::{Kubelet, members};
-use super::results::report;
+use super::results::{report, results};
 use super::singles::{rounds_past, until_reported};
-use super::submission::{FASTER, ROUTES_OF_PAIR, Submission};
+use super::submission::{FASTER, PAIRS, ROUTES_OF_PAIR, Submission};
 use crate::ministack::server;
 
 const LIMIT: Duration = Duration::from_mins(1);
@@ -138,6 +138,52 @@ async fn a_resume_whose_last_routes_are_not_set_up_keeps_the_sensors_of_before()
         is_complete && last.entry_status == "Finished",
         "{last:?}\n{}",
         kubelet.story()
+    );
+}
+
+/// Stopping a route can fail when its simulator is gone: the route has progress and no record then. It is driven again with the one
+/// before it.
+#[tokio::test(flavor = "multi_thread", worker_threads = 2)]
+async fn a_last_route_without_a_record_is_driven_although_the_progress_counts_it() {
+    // A server that crashes would end its evaluator before that has written.
+    let submission = submission(LeaderboardVersion::V2, "no-world@5:once,no-record@5:once").await;
+    let mut kubelet = Kubelet::new(&submission);
+    kubelet.make_pod();
+    let last = to_the_end(&submission, &mut kubelet).await;
+    let is_complete = last.is_final && last.eligible && last.done == ROUTES;
+    assert!(
+        is_complete && last.entry_status == "Finished",
+        "{last:?}\n{}",
+        kubelet.story()
+    );
+    for begun in kubelet.begun() {
+        assert_eq!(
+            begun.len(),
+            usize::from(ROUTES_OF_PAIR) + 1,
+            "the fourth again, and the fifth: {begun:?}"
+        );
+    }
+}
+
+/// What the original's own writer leaves of 16 routes when it is started once more on complete files.
+#[tokio::test(flavor = "multi_thread", worker_threads = 2)]
+async fn complete_files_of_a_real_evaluator_without_sensors_finish_with_the_originals_merge() {
+    let mut submission = submission(LeaderboardVersion::V2, "replay=real/done-{pair}.json").await;
+    let plan = &mut submission.run.plan;
+    (plan.slices, plan.routes) = (leaderboard_api::effective::slices(16, PAIRS.into()), 16);
+    let mut kubelet = Kubelet::new(&submission);
+    kubelet.make_pod();
+    let last = to_the_end(&submission, &mut kubelet).await;
+    let is_complete = last.is_final && last.eligible && last.done == 16;
+    assert!(
+        is_complete && last.entry_status == "Finished",
+        "{last:?}\n{}",
+        kubelet.story()
+    );
+    let stored = results(&submission.archive).await;
+    assert_eq!(
+        stored["agent/agent_results.json"],
+        include_str!("../../local/challenge/expected-again.json")
     );
 }
 
