@@ -35,4 +35,5 @@ mod start;
 mod stop;
 mod usage;
 mod waits;
+mod words;
 mod writes;
