@@ -7,14 +7,15 @@ use serde::{Deserialize, Serialize};
 
 use super::reasons;
 
-/// Infrastructure failures that an agent can cause: it can crash its simulator, store more than its time allows, use up its
+/// Infrastructure failures that an agent can cause: it can crash its simulator, store more than its time allows, fill a disk, use up its
 /// node until that falls silent or starts nothing more, or be an image that no node takes. Of pulls only those of agents' images count.
-pub const CAN_BE_CAUSED: [&str; 6] = [
+pub const CAN_BE_CAUSED: [&str; 7] = [
     reasons::SIMULATION_CRASHED,
     reasons::RESULTS_NOT_STORED,
     reasons::JOB_FAILED,
     reasons::NODE_LOST,
     reasons::NODE_CANNOT_START,
+    reasons::DISK_FULL,
     reasons::IMAGE_PULL,
 ];
 

@@ -204,8 +204,12 @@ reasons! {
             log: "the log of simulator `<n>`, read from its node before the Pod ends, else `simulator/console-<n>.log`; where no simulator \
              failed, the log of `logcopy`";
         DISK_FULL = "DiskFull",
-            "The Pod was evicted because the agent filled its disk.",
+            "The Pod was evicted because its disk was full. A participant failure if the kubelet names an agent's container or a volume that \
+             agents alone write to, or if `logcopy` has measured that agents fill the logs. What others write to as well also holds \
+             what CARLA saves and its core dumps: then it is an infrastructure failure, which is counted by team.",
             "Write less to disk or to the log.",
+            after_failure: "Look at what fills the disk, such as the simulator's Saved and core dumps, or raise the limit; then resume the \
+             submission.",
             log: "the log of the agent of the first pair that was not done, else of the first pair";
     }
     Infrastructure {

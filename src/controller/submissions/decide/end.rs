@@ -5,7 +5,7 @@ use std::time::Duration;
 use k8s_openapi::apimachinery::pkg::apis::meta::v1::Time;
 
 use super::plan_builder::{PlanBuilder, after};
-use super::{allowance, clock, crashes, failure, interruption, reading, reported, requeue};
+use super::{allowance, clock, crashes, disk, failure, interruption, reading, reported, requeue};
 use crate::controller::submissions::report_digest::ReportDigest;
 use crate::controller::submissions::view::{JobEnd, ObservedReport, Stage};
 use leaderboard_api::conditions::{self, Truth};
@@ -158,7 +158,7 @@ fn cause(draft: &PlanBuilder<'_>, report: Option<&ReportDigest>, job_end: Option
 
 /// The failure of a Job that ended without final results.
 fn of_job(draft: &PlanBuilder<'_>, end: &JobEnd) -> Failure {
-    if let Some(found) = draft.view.pod.as_ref().and_then(failure::disk_full) {
+    if let Some(found) = disk::full(draft) {
         return found;
     }
     match end {

@@ -98,6 +98,7 @@ fn places(status: &SubmissionStatus, pod: Option<&PodView>) -> Vec<LogPlace> {
         | reasons::IMAGE_PLATFORM
         | reasons::IMAGE_PULL
         | reasons::CONTAINER_CONFIG => Vec::new(),
+        reasons::DISK_FULL => vec![Some(stored(&agent, agent_log(pair))), on_node(&agent)],
         _ if failure.class == FailureClass::Participant => vec![Some(stored(&agent, agent_log(pair))), on_node(&agent)],
         _ => Vec::new(),
     };

@@ -9,6 +9,7 @@ mod builders;
 mod check;
 mod clock;
 mod crashes;
+mod disk;
 mod end;
 mod failure;
 mod finalizer;
