@@ -17,7 +17,7 @@ use leaderboard_api::{Failure, names, reasons};
 
 /// The message for a Pod that starts as it should.
 pub(super) const PREPARED: &str = "The Pod is being prepared.";
-/// What the kubelet calls a Pod whose devices a device plugin does not give, though the scheduler counted on them.
+/// The kubelet's reason where a device plugin does not give the devices on which the scheduler counted.
 const NOT_ADMITTED: &str = "UnexpectedAdmissionError";
 const LOST: &str = "The Pod was lost. A new Pod will resume from the results in S3.";
 /// How long a Pod may be silent before what it is at is shown; a healthy one costs no write until then. Less than the minute
@@ -63,14 +63,15 @@ pub(super) fn watch(draft: &mut PlanBuilder<'_>, job: &JobView) {
     // Until the scheduler has spoken there is no node that could be late.
     let limit = pulls::limit(pod, &draft.deadlines(), stalled);
     let over = limit.filter(|limit| draft.now() >= limit.at);
+    let lasted = found.as_ref().and_then(|found| lasts(draft, found));
     let has_started = pod.agent_started.is_some();
     match (found, over) {
         (Some(found), _) if found.is_hopeless => draft.fail(failure_of(&found, pod, 0)),
         (Some(found), Some(over)) if found.is_start => draft.fail(failure_of(&found, pod, over.seconds)),
-        (Some(found), _) if found.is_start && lasts_in_check(draft, found.reason) => {
-            draft.fail(failure_of(&found, pod, CHECK_SECONDS));
-        }
         (Some(found), _) => {
+            if let Some(seconds) = lasted {
+                return draft.fail(failure_of(&found, pod, seconds));
+            }
             show_trouble(draft, &found, has_started);
             if let Some(limit) = limit.filter(|_| found.is_start) {
                 draft.requeue_at(limit.at);
@@ -108,15 +109,18 @@ fn node_of(pod: &PodView) -> String {
         .map_or_else(|| "its node".to_owned(), |node| format!("node {node}"))
 }
 
-/// Whether a check has been held up by the same thing for too long. If not yet, it is looked at again then.
-fn lasts_in_check(draft: &mut PlanBuilder<'_>, reason: &str) -> bool {
-    if !draft.spec().check {
-        return false;
-    }
-    let since = draft.blocked_since(reason).unwrap_or(draft.now());
-    let until = after(since, CHECK_SECONDS);
+/// For how many seconds the same thing has held up a check, or a node has not started a container again in mid-run, if that is too long: such
+/// a container has no end that would count as a crash. If it is not yet, it is looked at again then.
+fn lasts(draft: &mut PlanBuilder<'_>, found: &Trouble) -> Option<i64> {
+    let seconds = match found.is_start {
+        true if draft.spec().check => CHECK_SECONDS,
+        false if found.cause == Cause::Node => draft.deadlines().start_seconds,
+        _ => return None,
+    };
+    let since = draft.blocked_since(found.reason).unwrap_or(draft.now());
+    let until = after(since, seconds);
     draft.requeue_at(until);
-    draft.now() >= until
+    (draft.now() >= until).then_some(seconds)
 }
 
 /// The message for a run whose node is away, before Kubernetes has given its Pod up.

@@ -468,6 +468,24 @@ fn a_pull_that_fails_in_mid_run_is_shown_and_does_not_end_it() {
 }
 
 #[test]
+fn a_node_that_does_not_start_an_agent_again_in_mid_run_has_the_time_of_a_start() {
+    let mut world = World::local().running();
+    world.go_to(40_000);
+    let mut agent = ended("agent-1", 1, "exited", 1, 39_000);
+    agent.waiting = Some(("CreateContainerError".into(), CDI.into()));
+    world.see(agent);
+    world.pass_to(Running, reasons::NODE_CANNOT_START);
+    world.go_to(41_799);
+    world.pass_to(Running, reasons::NODE_CANNOT_START);
+    world.go_to(41_800);
+    let failure = world.pass_to(Running, reasons::STOPPING).status.failure.unwrap();
+    assert_eq!(
+        (failure.reason.as_str(), failure.class),
+        (reasons::NODE_CANNOT_START, Infrastructure)
+    );
+}
+
+#[test]
 fn an_image_name_that_the_kubelet_refuses_fails_at_once() {
     let words = "Failed to apply default image tag \"team/Agent\": couldn't parse image name";
     let mut world = World::local().with_pod();
