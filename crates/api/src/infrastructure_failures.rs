@@ -8,7 +8,7 @@ use serde::{Deserialize, Serialize};
 use super::reasons;
 
 /// Infrastructure failures that an agent can cause: it can crash its simulator, store more than its time allows, fill a disk, use up its
-/// node until that falls silent or starts nothing more, or be an image that no node takes. Of pulls only those of agents' images count.
+/// node until that falls silent or starts nothing more, or be an image that no node takes. A pull counts only where it is that of an agent's image.
 pub const CAN_BE_CAUSED: [&str; 7] = [
     reasons::SIMULATION_CRASHED,
     reasons::RESULTS_NOT_STORED,

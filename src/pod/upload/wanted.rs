@@ -51,7 +51,7 @@ pub struct Files {
     pub activity: u64,
     /// Entries that are no files, or beyond the limits.
     pub left_out: usize,
-    /// What the agents' folders hold fills the volume, and not what the simulators save.
+    /// The agents' folders hold most of the volume, and enough to fill one.
     pub agents_fill_disk: bool,
 }
 

@@ -155,7 +155,7 @@ reasons! {
             log: "the log of agent `<n>`, `agent/agent<n>/leaderboard.log`";
         CANNOT_START = "CannotStart",
             "The agent's command is missing in the image, may not be executed, or is not for this machine; or the image has no user \
-             of the name that it asks for. For a simulator: an infrastructure failure. What a node fails at is `NodeCannotStart`.",
+             of the name that it asks for. For a simulator: an infrastructure failure. `NodeCannotStart` is for a node that fails.",
             "Rebuild the image for linux/amd64.",
             after_failure: "Fix this, then resume the submission.",
             log: "the log of agent `<n>`, `agent/agent<n>/leaderboard.log`";
@@ -205,8 +205,8 @@ reasons! {
              failed, the log of `logcopy`";
         DISK_FULL = "DiskFull",
             "The Pod was evicted because its disk was full. A participant failure if the kubelet names an agent's container or a volume that \
-             agents alone write to, or if `logcopy` has measured that agents fill the logs. What others write to as well also holds \
-             what CARLA saves and its core dumps: then it is an infrastructure failure, which is counted by team.",
+             agents alone write to, or if `logcopy` has measured that agents fill the logs. Else it is an infrastructure failure, \
+             which is counted by team: CARLA's saves and core dumps are on the same account.",
             "Write less to disk or to the log.",
             after_failure: "Look at what fills the disk, such as the simulator's Saved and core dumps, or raise the limit; then resume the \
              submission.",

@@ -167,7 +167,7 @@ fn of_simulator(end: &EndView) -> EndReason {
     }
 }
 
-/// What the agent's own end shows. All of it is the agent's fault, but for what the kubelet writes of a node that cannot start it.
+/// The agent's own end. All of it is the agent's fault, but for the kubelet's words of a node that cannot start it.
 fn of_agent(end: &EndView) -> EndReason {
     let exit_code = end.verdict.as_ref().and_then(|verdict| verdict.exit_code);
     match what(end) {

@@ -153,7 +153,7 @@ fn of_pair(pair: &PairStatus, cause: EndReason, node: Option<&str>) -> Failure {
     }
 }
 
-/// What the node lacked: to draw, or to start an agent.
+/// The node lacked something: to draw, or to start an agent.
 fn of_node(id: i32, times: &str, cause: EndReason, node: Option<&str>) -> Option<(&'static str, String)> {
     let node = node.map_or_else(|| "the node".to_owned(), |node| format!("node {node}"));
     match cause {

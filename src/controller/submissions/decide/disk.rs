@@ -1,4 +1,4 @@
-//! Whose disk was full: from the kubelet's words of an eviction to a failure. Pure.
+//! Full disks: from the kubelet's words of an eviction to a failure, and its class. Pure.
 //!
 //! Called by `live` and `end`. Only what was measured of agents alone is evidence against them, by the kubelet or, on the volume of the logs,
 //! by `logcopy`. The Pod's own account, and a volume that others write to as well, hold what CARLA saves and its core dumps; such an end
@@ -67,7 +67,7 @@ fn is_agent(name: &str) -> bool {
     name == "agent" || name.starts_with("agent-")
 }
 
-/// Whether agents write to a volume of the hosts' own, and no other container does.
+/// True if agents write to a volume of the hosts' own, and no other container does.
 fn is_of_agents_alone(volume: &str, leaderboard: Option<&LeaderboardSpec>) -> bool {
     let Some(pod) = leaderboard.and_then(|spec| spec.pod_overrides.as_ref()?.get("spec")) else {
         return false;

@@ -238,7 +238,7 @@ fn retry(draft: &mut PlanBuilder<'_>, found: &Failure) {
     draft.requeue_at(at);
 }
 
-/// Counts a Job that a node has failed. Of too many nodes the oldest is forgotten.
+/// Counts a Job that a node has failed. If there are too many nodes, the oldest is forgotten.
 pub(super) fn note_failed_node(nodes: &mut Vec<FailedNode>, node_name: String) {
     if let Some(known) = nodes.iter_mut().find(|known| known.node_name == node_name) {
         known.jobs = known.jobs.saturating_add(1);

@@ -1,12 +1,12 @@
-//! Whose fault it is that a container does not start: the words of the kubelet, the container engine, the GPU toolkit, runc and the
-//! registries, in one table. Pure.
+//! The cause of a start that fails, by the words of the kubelet, the container engine, the GPU toolkit, runc and the registries: one
+//! table. Pure.
 //!
 //! Called by `trouble` and `blame`. An image is the cause only where the words prove it. A node without disk, driver or memory must charge
 //! nobody, and its words are endless; so what the table does not know is the node's, or the registry's.
 
 use crate::pod::run::TOOLS;
 
-/// What keeps a container from starting.
+/// The cause that keeps a container from starting.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 pub(super) enum Cause {
     /// The image runs as a user that the Pod's security context forbids, or cannot judge.
@@ -17,20 +17,20 @@ pub(super) enum Cause {
     ImageMissing,
     /// The registry has the image for other machines only.
     ImagePlatform,
-    /// What the registry has is of a kind that no container is made of.
+    /// The registry has something of a kind that no container is made of.
     ImageKind,
-    /// What was submitted is the name of no image.
+    /// The text that was submitted is the name of no image.
     ImageName,
     /// The registry, or the way to it.
     Registry,
     /// The node: its kubelet, container engine, GPU toolkit, disk or memory.
     Node,
-    /// What the challenge's hosts have set up.
+    /// The set-up of the challenge's hosts.
     Host,
 }
 
 impl Cause {
-    /// Whether another image would start.
+    /// True if another image would start.
     pub(super) fn is_images(self) -> bool {
         match self {
             Self::ImageUser
@@ -44,7 +44,7 @@ impl Cause {
     }
 }
 
-/// Words that all have to be there, and what they show. Of several rows the first counts.
+/// Words that all have to be there, and what they show. The first row that fits counts.
 type Row = (&'static [&'static str], Cause);
 
 /// `CreateContainerConfigError`: the kubelet's own words. The settings are the hosts', unless it is the image's user that is refused.
@@ -59,8 +59,8 @@ const CONFIGS: [Row; 2] = [
     ),
 ];
 
-/// `CreateContainerError`, `RunContainerError`, `StartError`, `ContainerCannotRun`; in small letters. Those of nodes stand first: they
-/// quote programs and files of their own that are missing.
+/// `CreateContainerError`, `RunContainerError`, `StartError`, `ContainerCannotRun`; in small letters. The words of nodes stand first:
+/// they quote programs and files of their own that are missing.
 const STARTS: [Row; 19] = [
     // NVIDIA's toolkit, as the runtime of a container or as a hook of it.
     (&["nvidia-container-"], Cause::Node),
@@ -96,8 +96,8 @@ const STARTS: [Row; 19] = [
     (&["chdir to cwd (", "not a directory"], Cause::ImageProgram),
 ];
 
-/// `ErrImagePull`, `ImagePullBackOff`. Of what is `not found` only the image counts, which the registry itself has looked for: a host, a
-/// token or a layer is the registry's, and what containerd has lost the node's.
+/// `ErrImagePull`, `ImagePullBackOff`. An image is missing only where the registry itself has looked for it. A host, a token or a layer that
+/// is `not found` is the registry's, and what containerd has lost the node's.
 const PULLS: [Row; 10] = [
     (&["failed to do request"], Cause::Registry),
     (&["failed to authorize"], Cause::Registry),

@@ -138,7 +138,7 @@ fn ends_that_an_agent_can_bring_about_are_counted_and_those_of_the_hosts_images_
                     "agent-1",
                     "CreateContainerError",
                     "too many open files in system",
-                )
+                );
             },
             reasons::NODE_CANNOT_START,
             1,

@@ -41,7 +41,7 @@ fn an_eviction_for_the_agents_disk_is_the_participants_and_stops_the_job() {
         (volume("maps"), Infrastructure),
         (volume("common"), Infrastructure),
         (volume("leaderboard"), Infrastructure),
-        // What CARLA saves and its core dumps are on the Pod's account.
+        // CARLA's saves and core dumps are on the Pod's account.
         (
             "Pod ephemeral local storage usage exceeds the total limit of containers 20Mi. ".into(),
             Infrastructure,

@@ -1,4 +1,5 @@
-//! Whose fault a start is: a row for each of the words that kubelets, container engines, GPU toolkits, shims, runc and registries use.
+//! The cause of a failed start: a row for each of the words that kubelets, container engines, GPU toolkits, shims, runc and registries
+//! use.
 
 use crate::controller::submissions::decide::words::Cause::{
     self, Host, ImageKind, ImageMissing, ImagePlatform, ImageProgram, ImageUser, Node, Registry,
@@ -9,7 +10,7 @@ const TASK: &str =
     "failed to create containerd task: failed to create shim task: OCI runtime create failed: runc create failed: ";
 const PULL: &str = "rpc error: code = Unknown desc = failed to pull and unpack image \"r.example/team/agent:1\": ";
 
-/// Who says it, in which words, and what they show.
+/// The source, its words, and the cause that they show.
 type Row = (&'static str, &'static str, Cause);
 
 fn check(judge: impl Fn(&str) -> Cause, prefix: &str, rows: &[Row]) {
