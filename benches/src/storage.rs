@@ -187,6 +187,7 @@ fn report(is_final: bool) -> Report {
         logs: None,
         results: RESULTS.into(),
         partial_results: (!is_final).then(|| RESULTS.into()),
+        agents_fill_disk: false,
         files,
     }
 }

@@ -115,6 +115,9 @@ pub struct Report {
     /// from an older operator's Pod.
     #[serde(default, skip_serializing_if = "Option::is_none")]
     pub partial_results: Option<String>,
+    /// Most of what is on the volume of the logs, and enough to fill one, is in the agents' folders.
+    #[serde(default, skip_serializing_if = "std::ops::Not::not")]
+    pub agents_fill_disk: bool,
     /// Files of `evalai/` as stored in this round, by key below the prefix.
     #[serde(default)]
     pub files: BTreeMap<String, StoredFile>,

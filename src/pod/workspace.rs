@@ -361,6 +361,7 @@ fn first_report(run: &Run, pod_uid: &str) -> Result<Report, WorkspaceError> {
         logs: None,
         results: leaderboard_results::render(&plan, None)?.results_json,
         partial_results: None,
+        agents_fill_disk: false,
         files: std::collections::BTreeMap::new(),
     })
 }

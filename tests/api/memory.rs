@@ -91,6 +91,7 @@ fn report(submission_uid: String, text: &str) -> String {
         logs: None,
         results: json!([{"split": "leaderboard", "show_to_participant": true, "accuracies": accuracies}]).to_string(),
         partial_results: None,
+        agents_fill_disk: false,
         files: [(METADATA.to_owned(), file)].into(),
     };
     serde_json::to_string(&report).unwrap()

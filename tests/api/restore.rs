@@ -256,6 +256,7 @@ async fn report(world: &World, run: &str, name: &str, done: u32) {
         logs: None,
         results: json!([{"split": "leaderboard", "show_to_participant": true, "accuracies": accuracies}]).to_string(),
         partial_results: None,
+        agents_fill_disk: false,
         files: BTreeMap::new(),
     };
     let s3 = world.aws.aws.s3(None, Some(&world.aws.endpoint));

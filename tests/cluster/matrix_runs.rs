@@ -53,15 +53,11 @@ fn row(name: &'static str, change: Value, expected: &'static str) -> Row {
 }
 
 /// An image that can't be pulled.
-fn unpullable(name: &'static str, image: String, words: &'static str) -> Row {
+fn unpullable(name: &'static str, image: String, words: &'static str, expected: &'static str) -> Row {
     Row {
         image,
         then: Then::GiveUp(words),
-        ..row(
-            name,
-            json!({}),
-            "Pending ImagePull; Failed ImagePull (participant, charged); EvalAI failed",
-        )
+        ..row(name, json!({}), expected)
     }
 }
 
@@ -124,9 +120,26 @@ fn of_images(other_machines: String, private: &Registry, gate: &Gate) -> Vec<Row
             "image missing",
             "agent:nobody-pushed-this".to_owned(),
             "nobody-pushed-this: not found",
+            "Pending ImagePull; Failed ImageNotFound (participant, charged); EvalAI failed",
         ),
-        unpullable("image unauthorised", private.image(), "401 Unauthorized"),
-        unpullable("image for another machine", other_machines, "no match for platform"),
+        unpullable(
+            "image unauthorised",
+            private.image(),
+            "401 Unauthorized",
+            "Pending ImagePull; Failed ImagePull (infrastructure, not charged); EvalAI failed",
+        ),
+        unpullable(
+            "image for another machine",
+            other_machines,
+            "no match for platform",
+            "Pending ImagePull; Failed ImagePlatform (participant, charged); EvalAI failed",
+        ),
+        // It ends long before startSeconds.
+        row(
+            "image of root where the Pod forbids it",
+            json!({"agent": {"securityContext": {"runAsNonRoot": true}}}),
+            "Failed ImageInvalid (participant, charged); EvalAI failed",
+        ),
         unstartable("command missing in the image", "agent:no-shell"),
         unstartable("exec format error", "agent:no-program"),
     ]

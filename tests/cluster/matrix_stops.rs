@@ -96,8 +96,9 @@ async fn in_line(scene: &Scene) {
 }
 
 async fn while_an_image_is_pulled(scene: &Scene) {
-    let mut case = Case::open("cancel while an image is pulled", "Pending ImagePull; Cancelled");
-    board(scene, "pulling", json!({})).await;
+    let mut case = Case::open("cancel while an image can't be pulled", "Pending ImagePull; Cancelled");
+    // Simulator and logcopy run. Nothing waits for what they could store: the test would not.
+    board(scene, "pulling", json!({"deadlines": {"cancelSeconds": 600}})).await;
     scene.submit_to("pulling", "pulling", "agent:nobody-pushed-this").await;
     await_pull_error(scene, "pulling").await;
     case.shows(scene, "pulling", "ImagePull", "").await;

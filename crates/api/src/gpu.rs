@@ -1,14 +1,10 @@
-//! The parts of a Leaderboard that define which container gets which GPU and where a simulator draws, and what a Submission's status
-//! remembers of nodes without one.
+//! The parts of a Leaderboard that define which container gets which GPU and where a simulator draws.
 //!
 //! Owned by `api`; `leaderboard_parts` hands it on.
 
 use kube::KubeSchema;
 use schemars::JsonSchema;
 use serde::{Deserialize, Serialize};
-
-/// Nodes that one status names at most.
-pub const MAX_NODES_WITHOUT_GPU: usize = 8;
 
 /// `None`: the operator requests no GPU and checks for none. `PerContainer`: simulator and agent request one `resourceName` each. `NodeIndex`: simulators request one each, and both containers of pair n use the node's GPU n-1. `Claim`: both containers of a pair share one ResourceClaim. Default: `PerContainer` with a `resourceName`, else `None`. docs/gpu.md has what each one needs of a cluster.
 #[derive(Serialize, Deserialize, JsonSchema, Clone, Copy, Debug, PartialEq, Eq)]
@@ -143,17 +139,6 @@ impl Default for X11 {
             display: defaults::display(),
         }
     }
-}
-
-/// A node that gave a simulator no GPU although the Leaderboard asks for one.
-#[derive(Serialize, Deserialize, JsonSchema, Clone, Debug, PartialEq, Eq)]
-#[serde(rename_all = "camelCase")]
-pub struct NodeWithoutGpu {
-    /// The node.
-    #[schemars(length(max = 253))]
-    pub node_name: String,
-    /// Jobs of this attempt that ended so on it.
-    pub jobs: i32,
 }
 
 mod defaults {

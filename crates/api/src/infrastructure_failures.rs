@@ -7,12 +7,16 @@ use serde::{Deserialize, Serialize};
 
 use super::reasons;
 
-/// Infrastructure failures that an agent can cause: it can crash its simulator, store more than its time allows, or take its node's
-/// memory.
-pub const CAN_BE_CAUSED: [&str; 3] = [
+/// Infrastructure failures that an agent can cause: it can crash its simulator, store more than its time allows, fill a disk, use up its
+/// node until that falls silent or starts nothing more, or be an image that no node takes. A pull counts only where it is that of an agent's image.
+pub const CAN_BE_CAUSED: [&str; 7] = [
     reasons::SIMULATION_CRASHED,
     reasons::RESULTS_NOT_STORED,
     reasons::JOB_FAILED,
+    reasons::NODE_LOST,
+    reasons::NODE_CANNOT_START,
+    reasons::DISK_FULL,
+    reasons::IMAGE_PULL,
 ];
 
 /// Nodes that are remembered of a submission.

@@ -56,8 +56,10 @@ pub enum EndReason {
     OutOfMemory,
     /// The agent's command is missing in the image or not for this machine.
     CannotStart,
-    /// The kubelet could not start the agent's container.
+    /// The kubelet could not start the agent's container, because of its image.
     StartError,
+    /// The kubelet could not start the agent's container, because of the node.
+    NodeCannotStart,
     /// The agent's verdict blames a simulator that has not failed.
     BlamesSimulator,
     /// The simulator followed its agent, whose own end is not known.

@@ -9,7 +9,7 @@ use serde::{Deserialize, Serialize};
 
 use super::attempt::Attempt;
 use super::conditions::Condition;
-use super::gpu::{MAX_NODES_WITHOUT_GPU, NodeWithoutGpu};
+use super::failed_node::{FailedNode, MAX_FAILED_NODES};
 use super::infrastructure_failures::InfrastructureFailures;
 use super::leaderboard_parts::{LeaderboardVersion, Storage};
 use super::pair_status::PairStatus;
@@ -144,11 +144,12 @@ pub struct SubmissionStatus {
     #[serde(default, skip_serializing_if = "Option::is_none")]
     #[schemars(length(max = 253))]
     pub node_name: Option<String>,
-    /// Nodes that gave a simulator of this attempt no GPU. One that did so twice gets no further Job of the attempt.
-    #[serde(rename = "nodesWithoutGPU", default, skip_serializing_if = "Vec::is_empty")]
+    /// Nodes that gave a Job of this attempt no GPU, or could not start its Pod. The next Job prefers other nodes; a node that did so twice
+    /// gets no further Job of the attempt.
+    #[serde(default, skip_serializing_if = "Vec::is_empty")]
     #[x_kube(merge_strategy = ListMerge::Map(vec!["nodeName".into()]))]
-    #[schemars(length(max = MAX_NODES_WITHOUT_GPU))]
-    pub nodes_without_gpu: Vec<NodeWithoutGpu>,
+    #[schemars(length(max = MAX_FAILED_NODES))]
+    pub failed_nodes: Vec<FailedNode>,
     /// The submission that this one re-runs: EvalAI made a new row for it.
     #[serde(default, skip_serializing_if = "Option::is_none")]
     pub rerun_of: Option<Box<Rerun>>,

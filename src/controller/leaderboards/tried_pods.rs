@@ -93,7 +93,7 @@ fn sample_job(settings: &Settings, leaderboard: &Leaderboard, track: &Track) -> 
         plan: &plan,
         number: JobNumber::default(),
         settings,
-        without_gpu: &[],
+        failed_nodes: &[],
         addresses: None,
         now: Timestamp::now(),
     }))

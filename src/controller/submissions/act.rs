@@ -279,7 +279,7 @@ impl Actor<'_> {
             plan: &plan,
             number,
             settings: self.uses.settings,
-            without_gpu: &status.nodes_without_gpu,
+            failed_nodes: &status.failed_nodes,
             addresses: addresses.as_ref(),
             now: self.view.now,
         });

@@ -47,6 +47,8 @@ pub struct ReportDigest {
     pub warning: Option<String>,
     /// Whether the lines of the run come to CloudWatch.
     pub logs: Option<Logs>,
+    /// The agents' folders fill the volume of the logs.
+    pub agents_fill_disk: bool,
     /// The metrics of a final report, for the table.
     pub metrics: Option<Box<Map<String, Value>>>,
 }
@@ -122,6 +124,7 @@ impl ReportDigest {
                 Logs::Sent => Logs::Sent,
                 Logs::Refused(why) => Logs::Refused(cut(why)),
             }),
+            agents_fill_disk: report.agents_fill_disk,
             metrics: report.is_final.then(|| accuracies(&report.results)).flatten(),
         }
     }

@@ -65,7 +65,7 @@ fn job(number: usize) -> Value {
         plan,
         number: JobNumber::first(Attempt(1)),
         settings: &settings(),
-        without_gpu: &[],
+        failed_nodes: &[],
         addresses: None,
         now: jiff::Timestamp::now(),
     }));

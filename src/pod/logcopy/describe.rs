@@ -58,6 +58,7 @@ pub(super) fn describe(setting: &Setting, gathered: &Gathered, ending: Option<&E
         logs: None,
         results: gathered.files.results_json.clone(),
         partial_results: gathered.files.partial_json.clone().filter(|_| ending.is_none()),
+        agents_fill_disk: false,
         files: gathered.digests(),
     }
 }

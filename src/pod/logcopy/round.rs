@@ -55,6 +55,7 @@ struct Found {
     activity: u64,
     /// Entries that are not looked at.
     left_out: usize,
+    agents_fill_disk: bool,
 }
 
 /// What the rounds hear of other tasks.
@@ -216,7 +217,7 @@ impl Rounds {
         self.store_statuses(&found.statuses).await?;
         if !self.finished {
             // Logs must keep neither the progress back nor the end.
-            self.report(&found.gathered).await?;
+            self.report(&found).await?;
         }
         if found.left_out > 0 {
             self.uploader.complain("logs", &Complaint::Entries(found.left_out));
@@ -242,6 +243,7 @@ impl Rounds {
                 statuses: protocol::present(&status, u16::try_from(pairs).unwrap_or(u16::MAX)),
                 activity: files.activity,
                 left_out: files.left_out,
+                agents_fill_disk: files.agents_fill_disk,
             }
         };
         Ok(blocking(read).await?)
@@ -364,9 +366,10 @@ impl Rounds {
     }
 
     /// Stores the report, if it differs from the last one.
-    async fn report(&mut self, gathered: &Gathered) -> Result<(), ArchiveError> {
-        let mut report = describe(&self.setting, gathered, self.ending.as_ref());
+    async fn report(&mut self, found: &Found) -> Result<(), ArchiveError> {
+        let mut report = describe(&self.setting, &found.gathered, self.ending.as_ref());
         report.round = self.round;
+        report.agents_fill_disk = found.agents_fill_disk;
         report.logs.clone_from(&self.logs.borrow());
         if self.reported.as_ref() == Some(&report) {
             return Ok(());

@@ -14,6 +14,8 @@ use leaderboard_runner::protocol::Pair;
 const AGENT_ENTRIES: usize = 5_000;
 /// Entries read in all agents' folders, and in the simulators': what is listed is in memory.
 const ENTRIES: usize = 20_000;
+/// Less than that fills no volume.
+const FILLING: u64 = 512 << 20;
 
 /// A file that is to be stored.
 #[derive(Clone, Debug, PartialEq, Eq)]
@@ -49,6 +51,8 @@ pub struct Files {
     pub activity: u64,
     /// Entries that are no files, or beyond the limits.
     pub left_out: usize,
+    /// The agents' folders hold most of the volume, and enough to fill one.
+    pub agents_fill_disk: bool,
 }
 
 impl Files {
@@ -73,7 +77,15 @@ impl Files {
         found.activity = activity.finish();
         found.walk(tree, "simulator", ENTRIES);
         found.files.extend(logs);
+        let agents = found.bytes_below("agent/");
+        found.agents_fill_disk = agents >= FILLING && agents > found.bytes_below("simulator/");
         found
+    }
+
+    /// A file with holes counts whole: an agent that makes one speaks against itself alone.
+    fn bytes_below(&self, folder: &str) -> u64 {
+        let sizes = self.files.iter().filter(|(path, _)| path.starts_with(folder));
+        sizes.map(|(_, stamp)| stamp.size).fold(0, u64::saturating_add)
     }
 
     fn walk(&mut self, tree: &Tree, folder: &str, limit: usize) {
@@ -133,6 +145,21 @@ mod tests {
         assert_eq!(Files::find(&tree, 1).activity, before);
         fs::write(at(&logs[0]), "another line\n").unwrap();
         assert_ne!(Files::find(&tree, 1).activity, before);
+    }
+
+    #[test]
+    fn what_fills_the_volume_is_the_agents_only_if_their_folders_hold_more_than_the_simulators() {
+        let holds = |agent: u64, simulator: u64| {
+            let dir = tempfile::tempdir().unwrap();
+            for (path, size) in [("agent/agent1/junk", agent), ("simulator/Saved.log", simulator)] {
+                let path = dir.path().join(path);
+                fs::create_dir_all(path.parent().unwrap()).unwrap();
+                fs::File::create(path).unwrap().set_len(size).unwrap();
+            }
+            Files::find(&Tree::open(dir.path()).unwrap(), 1).agents_fill_disk
+        };
+        assert!(holds(FILLING, FILLING - 1));
+        assert!(!holds(FILLING - 1, 0) && !holds(FILLING, FILLING) && !holds(FILLING, 2 * FILLING));
     }
 
     #[test]

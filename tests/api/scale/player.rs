@@ -280,6 +280,7 @@ fn first_report(stage: &Stage, job: &Job, pod: &Pod) -> Report {
         logs: None,
         results: String::new(),
         partial_results: None,
+        agents_fill_disk: false,
         files: BTreeMap::new(),
     };
     assert!(!stage.props.labels.is_empty());

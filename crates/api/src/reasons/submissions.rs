@@ -68,14 +68,16 @@ reasons! {
             "The API server refuses the Job or its Pod: a LimitRange, Pod Security, or a webhook.",
             "Fix what the message names, in the Leaderboard or in the namespace.";
         IMAGE_PULL = "ImagePull",
-            "An image cannot be pulled. The submission fails after `deadlines.startSeconds`: as a participant failure if it is the \
-             agent's image and the registry answers, else as an infrastructure failure.",
-            "The participant pushes the image again for linux/amd64. For the host's images and the registry: fix the name, the \
-             rights or the network.",
+            "An image cannot be pulled. The submission fails after `deadlines.startSeconds`. The agent's image is the cause only where its \
+             registry has no such image, has it for other machines, or has what is no container image: `ImageNotFound`, \
+             `ImagePlatform`, `ImageInvalid`. Every other cause, such as refused rights, a time-out or a full disk, is an \
+             infrastructure failure.",
+            "Fix the name, the rights of the nodes, or the network, as the message asks. If the registry does not have the agent's image, \
+             the participant pushes it again for linux/amd64.",
             after_failure: "Fix this, then resume the submission.";
         CONTAINER_CONFIG = "ContainerConfig",
-            "A container cannot be set up: a Secret or a key is missing, or the image's user is not allowed.",
-            "Create what the message names.",
+            "A container cannot be set up: a Secret or a key is missing, or the Leaderboard's settings of its user contradict each other.",
+            "Create what the message names, or correct the settings.",
             after_failure: "Fix this, then resume the submission.";
         NAME_NOT_RESOLVED = "NameNotResolved",
             "`network.dns` is `Pinned`, and the operator has no address for a service that the Pod's own containers need: the name \
@@ -152,7 +154,8 @@ reasons! {
             "Look at `agent/agent<n>/leaderboard.log` of the results; the participant fixes the agent and submits again.",
             log: "the log of agent `<n>`, `agent/agent<n>/leaderboard.log`";
         CANNOT_START = "CannotStart",
-            "The agent's command is missing in the image or is not for this machine. For a simulator: an infrastructure failure.",
+            "The agent's command is missing in the image, may not be executed, or is not for this machine; or the image has no user \
+             of the name that it asks for. For a simulator: an infrastructure failure. `NodeCannotStart` is for a node that fails.",
             "Rebuild the image for linux/amd64.",
             after_failure: "Fix this, then resume the submission.",
             log: "the log of agent `<n>`, `agent/agent<n>/leaderboard.log`";
@@ -170,21 +173,24 @@ reasons! {
             log: "the log of the agent of the first pair that was not done, else of the first pair";
         IMAGE_INVALID = "ImageInvalid",
             "The submitted image is not a valid image reference: empty, no text, upper-case letters in the repository, or white \
-             space; or what its registry has under that name is not a container image. The submission fails at once, usually before a \
-             Job is created; where only the kubelet refuses the name, with the first Pod.",
+             space; or what its registry has under that name is not a container image; or the Pod sets `runAsNonRoot`, and the image runs as \
+             root or names its user instead of giving its number. The submission fails at once, usually before a Job is created; where \
+             only the kubelet refuses the image, with the first Pod.",
             "Submit again with an image such as registry.example/team/agent:1.";
         IMAGE_NOT_ALLOWED = "ImageNotAllowed",
             "`agent.images` of the Leaderboard does not allow the submitted image: it is another team's, of another registry, or the \
              host's own. No Job is created.",
             "Push the image to the team's own repository, and submit again.";
         IMAGE_NOT_FOUND = "ImageNotFound",
-            "The registry does not have the submitted image. No Job is created.",
+            "The registry does not have the submitted image. No Job is created; where only the node asks the registry, the submission \
+             fails after `deadlines.startSeconds`.",
             "Push the image under the name that is submitted, and submit again.";
         IMAGE_TOO_LARGE = "ImageTooLarge",
             "The layers of the submitted image are larger than `agent.imageSizeLimit`, compressed. No Job is created.",
             "Make the image smaller, and submit again.";
         IMAGE_PLATFORM = "ImagePlatform",
-            "The registry has the submitted image for other machines only. No Job is created.",
+            "The registry has the submitted image for other machines only. No Job is created; where only the node asks the registry, \
+             the submission fails after `deadlines.startSeconds`.",
             "Build the image for linux/amd64, and submit again.";
         IMAGE_VOLUMES = "ImageVolumes",
             "The submitted image declares volumes, whose content no limit of the cluster counts. No Job is created.",
@@ -198,8 +204,12 @@ reasons! {
             log: "the log of simulator `<n>`, read from its node before the Pod ends, else `simulator/console-<n>.log`; where no simulator \
              failed, the log of `logcopy`";
         DISK_FULL = "DiskFull",
-            "The Pod was evicted because the agent filled its disk.",
+            "The Pod was evicted because its disk was full. A participant failure if the kubelet names an agent's container or a volume that \
+             agents alone write to, or if `logcopy` has measured that agents fill the logs. Else it is an infrastructure failure, \
+             which is counted by team: CARLA's saves and core dumps are on the same account.",
             "Write less to disk or to the log.",
+            after_failure: "Look at what fills the disk, such as the simulator's Saved and core dumps, or raise the limit; then resume the \
+             submission.",
             log: "the log of the agent of the first pair that was not done, else of the first pair";
     }
     Infrastructure {
@@ -213,6 +223,14 @@ reasons! {
              node the Jobs of this attempt avoid it.",
             "Look at the node: driver, device plugin, container runtime, and what docs/gpu.md asks for the Leaderboard's `gpu.mode`. Then \
              resume the submission.";
+        NODE_CANNOT_START = "NodeCannotStart",
+            "The node could not start a container, or its kubelet did not admit the Pod (`UnexpectedAdmissionError`): the container engine, \
+             the GPU toolkit or device plugin, a full disk, too many open files. All that is not proven to be the image's counts here. \
+             Another Job follows, which prefers other nodes; after two on one node the Jobs of this attempt avoid it \
+             (`status.failedNodes`).",
+            "Look at the node that the message names. The participant's image is not the cause.",
+            after_failure: "Look at the node that the message names: its container engine, GPU toolkit, device plugin and disk. Then resume the \
+             submission.";
         GRAPHICS_DRIVER_MISSING = "GraphicsDriverMissing",
             "A simulator saw its GPU, but the node's NVIDIA driver has no Vulkan/OpenGL part: nvidia_icd.json (V2) or libGLX_nvidia.so.0 (V1) \
              is missing in the container. It was not started. There is no retry.",

@@ -269,6 +269,11 @@ const BROKEN_BY: &[(&str, &str, Part)] = &[
         "Agent-1 cannot be started: bash is missing.",
         Part::Agent,
     ),
+    (
+        "NodeCannotStart",
+        "Simulator-1 cannot be started: too many open files in system.",
+        Part::Node,
+    ),
     ("NotIsolated", "The Pod could reach 10.96.0.1:443.", Part::Network),
     ("SimulationCrashed", "Simulator 1 crashed.", Part::Simulator),
     ("NoGPU", "Simulator 1 has no GPU.", Part::Simulator),

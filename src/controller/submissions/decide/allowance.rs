@@ -58,7 +58,9 @@ pub(super) fn counted(draft: &mut PlanBuilder<'_>, found: Failure) -> Failure {
 }
 
 fn is_counted(found: &Failure) -> bool {
-    found.class == FailureClass::Infrastructure && CAN_BE_CAUSED.contains(&found.reason.as_str())
+    // Only an agent's image belongs to a pair.
+    let is_of_hosts = found.reason == reasons::IMAGE_PULL && found.pair.is_none();
+    found.class == FailureClass::Infrastructure && !is_of_hosts && CAN_BE_CAUSED.contains(&found.reason.as_str())
 }
 
 fn is_charged(draft: &PlanBuilder<'_>) -> bool {

@@ -7,6 +7,7 @@
 
 use jiff::Timestamp;
 
+use super::words;
 use crate::controller::submissions::view::{ContainerView, EndView};
 use leaderboard_api::EndReason;
 use leaderboard_runner::verdict::What;
@@ -166,7 +167,7 @@ fn of_simulator(end: &EndView) -> EndReason {
     }
 }
 
-/// What the agent's own end shows; all of it is the agent's fault.
+/// The agent's own end. All of it is the agent's fault, but for the kubelet's words of a node that cannot start it.
 fn of_agent(end: &EndView) -> EndReason {
     let exit_code = end.verdict.as_ref().and_then(|verdict| verdict.exit_code);
     match what(end) {
@@ -184,7 +185,15 @@ fn of_agent(end: &EndView) -> EndReason {
         Some(What::Exited) if exit_code == Some(0) => EndReason::Incomplete,
         Some(What::Exited) => EndReason::Exited,
         Some(What::SilentDeath) => EndReason::SilentDeath,
-        None if end.is_start_error() => EndReason::StartError,
+        None if end.is_start_error() => of_start_error(end),
         _ => EndReason::Killed,
+    }
+}
+
+fn of_start_error(end: &EndView) -> EndReason {
+    if words::of_start(end.why.as_deref().unwrap_or_default()).is_images() {
+        EndReason::StartError
+    } else {
+        EndReason::NodeCannotStart
     }
 }

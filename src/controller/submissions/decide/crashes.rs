@@ -128,7 +128,7 @@ fn cause(pair: &PairStatus) -> Option<EndReason> {
 fn is_hopeless(cause: EndReason) -> bool {
     matches!(
         cause,
-        EndReason::CannotStart | EndReason::NoGPU | EndReason::GraphicsDriverMissing
+        EndReason::CannotStart | EndReason::StartError | EndReason::NoGPU | EndReason::GraphicsDriverMissing
     )
 }
 
@@ -138,7 +138,7 @@ fn of_pair(pair: &PairStatus, cause: EndReason, node: Option<&str>) -> Failure {
         1 => "once".to_owned(),
         crashes => format!("{crashes} times"),
     };
-    let failure = if let Some((reason, what)) = of_graphics(id, cause, node) {
+    let failure = if let Some((reason, what)) = of_node(id, &times, cause, node) {
         infrastructure(reason, &what)
     } else if let Some(what) = of_simulator(cause) {
         let what = format!("The simulator of pair {id} failed {times}: {what}.");
@@ -153,8 +153,8 @@ fn of_pair(pair: &PairStatus, cause: EndReason, node: Option<&str>) -> Failure {
     }
 }
 
-/// What a simulator lacked to draw.
-fn of_graphics(id: i32, cause: EndReason, node: Option<&str>) -> Option<(&'static str, String)> {
+/// The node lacked something: to draw, or to start an agent.
+fn of_node(id: i32, times: &str, cause: EndReason, node: Option<&str>) -> Option<(&'static str, String)> {
     let node = node.map_or_else(|| "the node".to_owned(), |node| format!("node {node}"));
     match cause {
         EndReason::NoGPU => Some((
@@ -169,6 +169,12 @@ fn of_graphics(id: i32, cause: EndReason, node: Option<&str>) -> Option<(&'stati
             format!(
                 "Simulator {id} had a GPU and could not draw: the NVIDIA driver of {node} has no Vulkan/OpenGL part \
                  (nvidia_icd.json)."
+            ),
+        )),
+        EndReason::NodeCannotStart => Some((
+            reasons::NODE_CANNOT_START,
+            format!(
+                "The container of agent {id} could not be started {times} on {node}; nothing of its image is the cause."
             ),
         )),
         _ => None,

@@ -5,12 +5,12 @@ use std::time::Duration;
 use k8s_openapi::apimachinery::pkg::apis::meta::v1::Time;
 
 use super::plan_builder::{PlanBuilder, after};
-use super::{allowance, clock, crashes, failure, interruption, reading, reported, requeue};
+use super::{allowance, clock, crashes, disk, failure, interruption, reading, reported, requeue};
 use crate::controller::submissions::report_digest::ReportDigest;
 use crate::controller::submissions::view::{JobEnd, ObservedReport, Stage};
 use leaderboard_api::conditions::{self, Truth};
 use leaderboard_api::text::sentence;
-use leaderboard_api::{Failure, FailureClass, MAX_NODES_WITHOUT_GPU, NodeWithoutGpu, reasons};
+use leaderboard_api::{FailedNode, Failure, FailureClass, MAX_FAILED_NODES, reasons};
 
 /// Shown while the report of an ended run has been asked for and no answer has come, not even a refusal.
 const NO_ANSWER: &str = "its bucket has not answered yet.";
@@ -24,6 +24,9 @@ pub(super) const LONGEST_RETRY_SECONDS: i64 = RETRY_SECONDS << MAX_DOUBLINGS;
 const READ_SECONDS: i64 = 86_400;
 /// The same of one that was cancelled, which has `deadlines.cancelSeconds`: a bucket that hung is left alone for up to half of it.
 const READ_AT_LEAST_SECONDS: i64 = 60;
+
+/// Failures after which the next Jobs keep off the node.
+const OF_NODES: [&str; 2] = [reasons::NO_GPU, reasons::NODE_CANNOT_START];
 
 /// The Job is terminal, or gone because we ended it (`None`).
 pub(super) fn decide(draft: &mut PlanBuilder<'_>, job_end: Option<&JobEnd>) {
@@ -155,7 +158,7 @@ fn cause(draft: &PlanBuilder<'_>, report: Option<&ReportDigest>, job_end: Option
 
 /// The failure of a Job that ended without final results.
 fn of_job(draft: &PlanBuilder<'_>, end: &JobEnd) -> Failure {
-    if let Some(found) = draft.view.pod.as_ref().and_then(failure::disk_full) {
+    if let Some(found) = disk::full(draft) {
         return found;
     }
     match end {
@@ -215,8 +218,8 @@ fn retry(draft: &mut PlanBuilder<'_>, found: &Failure) {
     draft.status.retry += 1;
     draft.status.job_name = None;
     let node = draft.status.node_name.take();
-    if let Some(node) = node.filter(|_| found.reason == reasons::NO_GPU) {
-        note_without_gpu(&mut draft.status.nodes_without_gpu, node);
+    if let Some(node) = node.filter(|_| OF_NODES.contains(&found.reason.as_str())) {
+        note_failed_node(&mut draft.status.failed_nodes, node);
     }
     draft.status.failure = None;
     draft.status.recreated = 0;
@@ -235,16 +238,16 @@ fn retry(draft: &mut PlanBuilder<'_>, found: &Failure) {
     draft.requeue_at(at);
 }
 
-/// Counts a Job that a node gave no GPU. Of too many nodes the oldest is forgotten.
-pub(super) fn note_without_gpu(nodes: &mut Vec<NodeWithoutGpu>, node_name: String) {
+/// Counts a Job that a node has failed. If there are too many nodes, the oldest is forgotten.
+pub(super) fn note_failed_node(nodes: &mut Vec<FailedNode>, node_name: String) {
     if let Some(known) = nodes.iter_mut().find(|known| known.node_name == node_name) {
         known.jobs = known.jobs.saturating_add(1);
         return;
     }
-    if nodes.len() >= MAX_NODES_WITHOUT_GPU {
+    if nodes.len() >= MAX_FAILED_NODES {
         nodes.remove(0);
     }
-    nodes.push(NodeWithoutGpu { node_name, jobs: 1 });
+    nodes.push(FailedNode { node_name, jobs: 1 });
 }
 
 fn finished(draft: &mut PlanBuilder<'_>, report: &ReportDigest) {

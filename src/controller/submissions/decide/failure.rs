@@ -4,7 +4,7 @@
 //! pairs are in `crashes`.
 
 use super::next_steps::{Steps, for_both, infrastructure_for_participants, of_infrastructure, of_participant};
-use crate::controller::submissions::view::{ObservedNode, PodView};
+use crate::controller::submissions::view::ObservedNode;
 use crate::pod::run::Stop;
 use leaderboard_api::text::sentence;
 use leaderboard_api::{Failure, FailureClass, reasons};
@@ -127,26 +127,6 @@ pub(super) fn not_eligible(entry_status: &str) -> Failure {
     }
     let what = format!("The run ended as {entry_status}, so its results do not count.");
     charged(reasons::NOT_ELIGIBLE, &what)
-}
-
-/// A Pod that was evicted because the agent's side filled its disk. Another Pod would run into it again.
-pub(super) fn disk_full(pod: &PodView) -> Option<Failure> {
-    let (reason, message) = pod.ended_by_node.as_ref()?;
-    let is_agents = reason == "Evicted" && is_agents_disk(message);
-    is_agents.then(|| {
-        let what = format!("The Pod was evicted because it filled its disk: {}", sentence(message));
-        charged(reasons::DISK_FULL, &what)
-    })
-}
-
-/// A limit of the Pod, the logs or an agent; not the node's own shortage, nor a limit of the host's containers.
-fn is_agents_disk(message: &str) -> bool {
-    let signs = [
-        "Pod ephemeral local storage usage exceeds",
-        "EmptyDir volume \"logs\"",
-        "Container agent-",
-    ];
-    !message.starts_with("The node was low on") && signs.iter().any(|sign| message.contains(sign))
 }
 
 /// The stop that a failure calls for.

@@ -6,7 +6,7 @@ use std::time::Duration;
 use super::plan::{Action, EvalaiUpdate, TableUpdate};
 use super::plan_builder::{PlanBuilder, after};
 use super::{
-    accept, addresses, clock, crashes, end, failure, interruption, isolation, line, reading, reported, requeue,
+    accept, addresses, clock, crashes, disk, end, failure, interruption, isolation, line, reading, reported, requeue,
     restored, start, stop,
 };
 use crate::controller::submissions::job_spec;
@@ -304,8 +304,7 @@ fn take_pod(draft: &mut PlanBuilder<'_>, pod: &PodView) {
 
 /// Limits of a run under way: disk, crashes, time.
 fn watch_run(draft: &mut PlanBuilder<'_>) {
-    let evicted = draft.view.pod.as_ref().and_then(failure::disk_full);
-    if let Some(found) = evicted.or_else(|| crashes::too_many(draft)) {
+    if let Some(found) = disk::full(draft).or_else(|| crashes::too_many(draft)) {
         return draft.fail(found);
     }
     // One that outlives its Leaderboard is charged for no limit that nobody has set; the Pod has a net of its own.

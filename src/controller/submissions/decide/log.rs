@@ -93,7 +93,12 @@ fn places(status: &SubmissionStatus, pod: Option<&PodView>) -> Vec<LogPlace> {
             Some(stored(names::CONTAINER_LOGCOPY, crate::pod::ownlog::OWN_LOG.into())),
         ],
         // It never ran.
-        reasons::IMAGE_INVALID | reasons::IMAGE_PULL | reasons::CONTAINER_CONFIG => Vec::new(),
+        reasons::IMAGE_INVALID
+        | reasons::IMAGE_NOT_FOUND
+        | reasons::IMAGE_PLATFORM
+        | reasons::IMAGE_PULL
+        | reasons::CONTAINER_CONFIG => Vec::new(),
+        reasons::DISK_FULL => vec![Some(stored(&agent, agent_log(pair))), on_node(&agent)],
         _ if failure.class == FailureClass::Participant => vec![Some(stored(&agent, agent_log(pair))), on_node(&agent)],
         _ => Vec::new(),
     };

@@ -9,6 +9,7 @@ use super::next_steps::for_both;
 use super::plan_builder::{PlanBuilder, after};
 use super::pulls::{self, Limit};
 use super::trouble::{self, Trouble};
+use super::words::Cause;
 use crate::controller::submissions::view::{JobView, ObservedNode, PodView, ScaleUp};
 use leaderboard_api::conditions::{self, Truth};
 use leaderboard_api::text::sentence;
@@ -16,6 +17,8 @@ use leaderboard_api::{Failure, names, reasons};
 
 /// The message for a Pod that starts as it should.
 pub(super) const PREPARED: &str = "The Pod is being prepared.";
+/// The kubelet's reason where a device plugin does not give the devices on which the scheduler counted.
+const NOT_ADMITTED: &str = "UnexpectedAdmissionError";
 const LOST: &str = "The Pod was lost. A new Pod will resume from the results in S3.";
 /// How long a Pod may be silent before what it is at is shown; a healthy one costs no write until then. Less than the minute
 /// in which people want to see a cause.
@@ -38,7 +41,10 @@ pub(super) fn watch(draft: &mut PlanBuilder<'_>, job: &JobView) {
     let Some(pod) = &view.pod else {
         return without_pod(draft, job);
     };
-    if pod.delete_by.is_some() || pod.ended_by_node.is_some() {
+    if let Some((reason, words)) = &pod.ended_by_node {
+        return ended_by_node(draft, pod, reason, words);
+    }
+    if pod.delete_by.is_some() {
         draft.moves();
         return replacing(draft, LOST);
     }
@@ -57,14 +63,15 @@ pub(super) fn watch(draft: &mut PlanBuilder<'_>, job: &JobView) {
     // Until the scheduler has spoken there is no node that could be late.
     let limit = pulls::limit(pod, &draft.deadlines(), stalled);
     let over = limit.filter(|limit| draft.now() >= limit.at);
+    let lasted = found.as_ref().and_then(|found| lasts(draft, found));
     let has_started = pod.agent_started.is_some();
     match (found, over) {
-        (Some(found), _) if found.is_hopeless => draft.fail(too_late(&found, draft.deadlines().start_seconds)),
-        (Some(found), Some(over)) if found.is_start => draft.fail(too_late(&found, over.seconds)),
-        (Some(found), _) if found.is_start && lasts_in_check(draft, found.reason) => {
-            draft.fail(too_late(&found, CHECK_SECONDS));
-        }
+        (Some(found), _) if found.is_hopeless => draft.fail(failure_of(&found, pod, 0)),
+        (Some(found), Some(over)) if found.is_start => draft.fail(failure_of(&found, pod, over.seconds)),
         (Some(found), _) => {
+            if let Some(seconds) = lasted {
+                return draft.fail(failure_of(&found, pod, seconds));
+            }
             show_trouble(draft, &found, has_started);
             if let Some(limit) = limit.filter(|_| found.is_start) {
                 draft.requeue_at(limit.at);
@@ -81,15 +88,39 @@ pub(super) fn watch(draft: &mut PlanBuilder<'_>, job: &JobView) {
     }
 }
 
-/// Whether a check has been held up by the same thing for too long. If not yet, it is looked at again then.
-fn lasts_in_check(draft: &mut PlanBuilder<'_>, reason: &str) -> bool {
-    if !draft.spec().check {
-        return false;
+/// The kubelet ended the Pod as a whole. The Job makes another, unless the node has not even admitted this one: it would not admit the
+/// next one either, and looks free to the scheduler.
+fn ended_by_node(draft: &mut PlanBuilder<'_>, pod: &PodView, reason: &str, words: &str) {
+    let node = node_of(pod);
+    if reason == NOT_ADMITTED {
+        let what = sentence(&format!(
+            "On {node} the kubelet did not admit the Pod ({reason}): {words}"
+        ));
+        return draft.fail(infrastructure(reasons::NODE_CANNOT_START, &what));
     }
-    let since = draft.blocked_since(reason).unwrap_or(draft.now());
-    let until = after(since, CHECK_SECONDS);
+    let what = sentence(&format!("On {node} the kubelet ended the Pod ({reason}): {words}"));
+    draft.moves();
+    replacing(draft, &format!("{what} A new Pod will resume from the results in S3."));
+}
+
+fn node_of(pod: &PodView) -> String {
+    pod.node
+        .as_deref()
+        .map_or_else(|| "its node".to_owned(), |node| format!("node {node}"))
+}
+
+/// For how many seconds the same thing has held up a check, or a node has not started a container again in mid-run, if that is too long: such
+/// a container has no end that would count as a crash. If it is not yet, it is looked at again then.
+fn lasts(draft: &mut PlanBuilder<'_>, found: &Trouble) -> Option<i64> {
+    let seconds = match found.is_start {
+        true if draft.spec().check => CHECK_SECONDS,
+        false if found.cause == Cause::Node => draft.deadlines().start_seconds,
+        _ => return None,
+    };
+    let since = draft.blocked_since(found.reason).unwrap_or(draft.now());
+    let until = after(since, seconds);
     draft.requeue_at(until);
-    draft.now() >= until
+    (draft.now() >= until).then_some(seconds)
 }
 
 /// The message for a run whose node is away, before Kubernetes has given its Pod up.
@@ -295,36 +326,58 @@ fn is_late(draft: &mut PlanBuilder<'_>, job: &JobView, reason: &str, message: &s
     false
 }
 
-fn too_late(found: &Trouble, seconds: i64) -> Failure {
-    match found.reason {
-        reasons::PREFIX_IN_USE | reasons::NOT_ISOLATED => return infrastructure(found.reason, &found.message),
-        reasons::IMAGE_INVALID => return failure::image_invalid(&found.message),
-        _ => {}
-    }
-    let reason = if found.reason == reasons::PREPARING {
-        reasons::START_DEADLINE
-    } else {
-        found.reason
-    };
-    let what = format!("{} It was tried for {seconds} s.", found.message);
-    if found.is_participants {
-        let next = for_both("Push the image again and check that it runs on linux/amd64.");
-        let failure = participant(reason, &what, &next);
-        Failure {
-            // A registry's own words, or the network's, would show a participant what the nodes can reach.
-            participant_message: if reason == reasons::IMAGE_PULL {
-                Some(format!(
-                    "{} {}",
-                    trouble::pull_for_participants(&found.message),
-                    next.participant
-                ))
-            } else {
-                failure.participant_message
-            },
-            ..failure
+/// The failure of a start that was tried for so many seconds, or that no further try would change.
+fn failure_of(found: &Trouble, pod: &PodView, seconds: i64) -> Failure {
+    let message = &found.message;
+    let tried = format!("{message} It was tried for {seconds} s on {}.", node_of(pod));
+    let failure = match found.cause {
+        Cause::ImageName => failure::image_invalid(message),
+        Cause::ImageUser => of_image(
+            reasons::IMAGE_INVALID,
+            message,
+            "The submitted image runs as root, or names its user, and this challenge runs agents as another user.",
+            "Set USER of the image to a number other than 0, and submit again.",
+        ),
+        Cause::ImageProgram => {
+            let next = for_both("Push the image again and check that it runs on linux/amd64.");
+            participant(reasons::CANNOT_START, &tried, &next)
         }
-    } else {
-        infrastructure(reason, &what)
+        Cause::ImageMissing => of_image(
+            reasons::IMAGE_NOT_FOUND,
+            &tried,
+            "The submitted image is not in its registry.",
+            "Push the image under the name that is submitted, and submit again.",
+        ),
+        Cause::ImagePlatform => of_image(
+            reasons::IMAGE_PLATFORM,
+            &tried,
+            "The submitted image is not for linux/amd64.",
+            "Build the image for linux/amd64, and submit again.",
+        ),
+        Cause::ImageKind => of_image(
+            reasons::IMAGE_INVALID,
+            &tried,
+            "The submitted image is of a kind that cannot be run.",
+            "Build the image with a present version of its tool, and submit again.",
+        ),
+        Cause::Registry | Cause::Node | Cause::Host => match found.reason {
+            reasons::PREFIX_IN_USE | reasons::NOT_ISOLATED => infrastructure(found.reason, message),
+            reasons::PREPARING => infrastructure(reasons::START_DEADLINE, &tried),
+            reason => infrastructure(reason, &tried),
+        },
+    };
+    Failure {
+        pair: found.pair,
+        ..failure
+    }
+}
+
+/// A failure of the image, of which hosts read all. The words of a registry or of a node would show a participant what the nodes can
+/// reach.
+fn of_image(reason: &str, what: &str, for_participants: &str, step: &str) -> Failure {
+    Failure {
+        participant_message: Some(format!("{for_participants} {step}")),
+        ..participant(reason, what, &for_both(step))
     }
 }
 

@@ -46,12 +46,8 @@ pub(super) fn decide(draft: &mut PlanBuilder<'_>, job: &JobView) {
             DELETE_GRACE_SECONDS,
         )
     };
-    // Without agents there is nothing to store; with them, a logcopy that is being restarted may still do so.
-    let listening = view
-        .pod
-        .as_ref()
-        .filter(|p| p.logcopy_running || p.agent_started.is_some());
-    let Some(pod) = listening else {
+    // Before the first agent there is nothing to store, and none may ever begin: logcopy alone would wait for the end of all.
+    let Some(pod) = view.pod.as_ref().filter(|pod| pod.agent_started.is_some()) else {
         return end_job(draft, job, grace, log_left);
     };
     let delete_at = after(since, seconds);

@@ -1,10 +1,12 @@
 //! Why a container of a Pod does not start: from Kubernetes' words to a reason, a sentence, and whose fault it is.
 //!
-//! Called by `start`. Agents and simulators that started and crashed are judged by `failure`, not here.
+//! Called by `start`. `words` has the words themselves. Agents and simulators that started and crashed are judged by `failure`, not here.
 
+use super::words::{self, Cause};
 use crate::controller::submissions::view::{ContainerView, PodView};
 use leaderboard_api::text::sentence;
 use leaderboard_api::{names, reasons};
+use leaderboard_runner::protocol::{Member, Side};
 
 /// What is shown should `workspace` not report it itself.
 const PREFIX_IN_USE: &str = "The run's place in the bucket holds another object's results. Apply it with attempt: 2 to take \
@@ -19,8 +21,9 @@ pub(super) struct Trouble {
     pub(super) reason: &'static str,
     /// A sentence. It stays the same while Kubernetes goes back and forth between trying and waiting.
     pub(super) message: String,
-    /// The participant's image is the cause, not the host's set-up.
-    pub(super) is_participants: bool,
+    pub(super) cause: Cause,
+    /// The pair of an agent that does not start.
+    pub(super) pair: Option<i32>,
     /// No amount of waiting helps.
     pub(super) is_hopeless: bool,
     /// It keeps the run from starting, so that the deadline of the start counts; else it is a restart of a container
@@ -28,10 +31,13 @@ pub(super) struct Trouble {
     pub(super) is_start: bool,
 }
 
-/// The first container of a Pod that does not start.
+/// The container that keeps a Pod from starting: of the hosts' own ones first, which every submission has. A node that fails them fails the
+/// agents for the same cause.
 pub(super) fn of_pod(pod: &PodView) -> Option<Trouble> {
+    let (agents, hosts): (Vec<_>, Vec<_>) = pod.containers.iter().partition(|container| agent(container).is_some());
+    let mut all = hosts.into_iter().chain(agents);
     let has_started = pod.agent_started.is_some();
-    pod.containers.iter().find_map(|container| {
+    all.find_map(|container| {
         let is_init = container.is_before_agents();
         if is_init && has_started {
             return None;
@@ -55,37 +61,55 @@ fn of_container(container: &ContainerView, is_init: bool) -> Option<Trouble> {
     if container.running && (!is_init || container.name == names::CONTAINER_LOGCOPY) {
         return None;
     }
-    let name = &container.name;
     let (reason, words) = container
         .waiting
         .as_ref()
         .map_or(("", ""), |(reason, words)| (reason.as_str(), words.as_str()));
     match reason {
-        // The host's images are the Leaderboard's to fix, and are waited for.
-        "InvalidImageName" if is_agent(name) => {
-            let message = format!("The image of {name} is not a valid image reference: {words}");
-            Some(Trouble {
-                is_hopeless: true,
-                ..trouble(reasons::IMAGE_INVALID, &message, true)
-            })
-        }
-        "ErrImagePull" | "ImagePullBackOff" | "InvalidImageName" | "ErrImageNeverPull" => {
-            let words = pull_error(words);
-            let message = format!("The image of {name} cannot be pulled: {words}");
-            let is_participants = is_agent(name) && !is_registrys(words);
-            Some(trouble(reasons::IMAGE_PULL, &message, is_participants))
-        }
-        "CreateContainerConfigError" => {
-            let message = format!("{name} cannot be set up: {words}");
-            Some(trouble(reasons::CONTAINER_CONFIG, &message, false))
-        }
-        "CreateContainerError" | "RunContainerError" => {
+        "ErrImagePull"
+        | "ImagePullBackOff"
+        | "InvalidImageName"
+        | "ErrImageNeverPull"
+        | "ImageInspectError"
+        | "RegistryUnavailable"
+        | "SignatureValidationFailed" => Some(cannot_be_pulled(container, reason, words)),
+        "CreateContainerConfigError" => Some(cannot_be_set_up(container, words)),
+        "CreateContainerError" | "RunContainerError" | "PreCreateHookError" | "PreStartHookError" => {
             let told = container.last.as_ref().filter(|end| end.is_start_error());
             let words = told.and_then(|end| end.why.as_deref()).unwrap_or(words);
-            Some(cannot_start(name, words))
+            Some(cannot_start(container, words))
         }
         _ => of_end(container, is_init),
     }
+}
+
+fn cannot_be_pulled(container: &ContainerView, reason: &str, words: &str) -> Trouble {
+    let name = &container.name;
+    // The host's images are the Leaderboard's to fix, and are waited for.
+    if reason == "InvalidImageName" && agent(container).is_some() {
+        let message = format!("The image of {name} is not a valid image reference: {words}");
+        return Trouble {
+            is_hopeless: true,
+            ..trouble(container, reasons::IMAGE_INVALID, &message, Cause::ImageName)
+        };
+    }
+    let words = pull_error(words);
+    let message = format!("The image of {name} cannot be pulled: {words}");
+    trouble(container, reasons::IMAGE_PULL, &message, words::of_pull(words))
+}
+
+fn cannot_be_set_up(container: &ContainerView, words: &str) -> Trouble {
+    let name = &container.name;
+    let message = format!("{name} cannot be set up: {words}");
+    let cause = words::of_config(words);
+    if cause.is_images() && agent(container).is_some() {
+        // The kubelet finds the same on every node.
+        return Trouble {
+            is_hopeless: true,
+            ..trouble(container, reasons::IMAGE_INVALID, &message, cause)
+        };
+    }
+    trouble(container, reasons::CONTAINER_CONFIG, &message, cause)
 }
 
 /// How a container that ended, and is being tried again, speaks of its start.
@@ -93,7 +117,7 @@ fn of_end(container: &ContainerView, is_init: bool) -> Option<Trouble> {
     let end = container.last.as_ref().filter(|end| end.exit_code != 0)?;
     let name = &container.name;
     if end.is_start_error() {
-        return Some(cannot_start(name, end.why.as_deref().unwrap_or(&end.reason)));
+        return Some(cannot_start(container, end.why.as_deref().unwrap_or(&end.reason)));
     }
     if !is_init {
         return None;
@@ -108,69 +132,51 @@ fn of_end(container: &ContainerView, is_init: bool) -> Option<Trouble> {
     if let Some((reason, usual)) = found {
         return Some(Trouble {
             is_hopeless: true,
-            ..trouble(reason, end.why.as_deref().unwrap_or(usual), false)
+            ..trouble(container, reason, end.why.as_deref().unwrap_or(usual), Cause::Host)
         });
     }
     let code = || format!("it ended with code {} ({})", end.exit_code, end.reason);
     let why = end.why.clone().unwrap_or_else(code);
-    Some(trouble(reasons::PREPARING, &format!("{name} fails: {why}"), false))
+    let message = format!("{name} fails: {why}");
+    Some(trouble(container, reasons::PREPARING, &message, Cause::Host))
 }
 
-fn trouble(reason: &'static str, message: &str, is_participants: bool) -> Trouble {
+fn trouble(container: &ContainerView, reason: &'static str, message: &str, cause: Cause) -> Trouble {
+    let pair = agent(container);
+    // The hosts' own images are theirs to fix.
+    let cause = if pair.is_none() && cause.is_images() {
+        Cause::Host
+    } else {
+        cause
+    };
     Trouble {
         reason,
         message: sentence(message),
-        is_participants,
+        cause,
+        pair,
         is_hopeless: false,
         is_start: true,
     }
 }
 
-fn cannot_start(name: &str, words: &str) -> Trouble {
-    let message = format!("{name} cannot be started: {words}");
-    trouble(reasons::CANNOT_START, &message, is_agent(name))
+fn cannot_start(container: &ContainerView, words: &str) -> Trouble {
+    let message = format!("{} cannot be started: {words}", container.name);
+    let cause = words::of_start(words);
+    let reason = if cause == Cause::Node {
+        reasons::NODE_CANNOT_START
+    } else {
+        reasons::CANNOT_START
+    };
+    trouble(container, reason, &message, cause)
 }
 
-fn is_agent(name: &str) -> bool {
-    name.starts_with("agent-")
+/// The pair of an agent's container.
+fn agent(container: &ContainerView) -> Option<i32> {
+    let member = Member::parse(&container.name).filter(|member| member.side == Side::Agent)?;
+    Some(member.pair.get().into())
 }
 
 /// The cause in a kubelet's words: `ErrImagePull` and `ImagePullBackOff` alternate, and differ only in what is before it.
 fn pull_error(words: &str) -> &str {
     words.split_once("ErrImagePull: ").map_or(words, |(_, cause)| cause)
-}
-
-/// All that a participant reads of an image that cannot be pulled.
-pub(super) fn pull_for_participants(words: &str) -> &'static str {
-    let has = |signs: &[&str]| signs.iter().any(|sign| words.contains(sign));
-    match () {
-        () if has(&["no match for platform"]) => "The submitted image is not for linux/amd64.",
-        () if has(&["manifest unknown", "not found"]) => "The submitted image is not in its registry.",
-        () if has(&["401 Unauthorized", "403 Forbidden", "denied", "authorization failed"]) => {
-            "The registry does not let the challenge pull the submitted image."
-        }
-        () => "The submitted image cannot be pulled.",
-    }
-}
-
-/// Whether the registry, or the way to it, is the cause rather than the image.
-fn is_registrys(words: &str) -> bool {
-    const SIGNS: [&str; 13] = [
-        "connection refused",
-        "connection reset",
-        "no such host",
-        "i/o timeout",
-        "no route to host",
-        "network is unreachable",
-        "deadline exceeded",
-        "TLS handshake",
-        "x509:",
-        "unexpected EOF",
-        "Too Many Requests",
-        "toomanyrequests",
-        "no space left on device",
-    ];
-    // `failed with status code [manifests 1]: 503 Service Unavailable`
-    let is_server_error = words.contains("status code [") && words.contains("]: 5");
-    is_server_error || SIGNS.iter().any(|sign| words.contains(sign))
 }

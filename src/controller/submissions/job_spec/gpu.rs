@@ -9,11 +9,12 @@ use std::collections::BTreeMap;
 
 use k8s_openapi::api::core::v1::{EnvVar, PodResourceClaim, ResourceClaim, ResourceRequirements};
 use k8s_openapi::apimachinery::pkg::api::resource::Quantity;
-use leaderboard_api::{GpuSource, LeaderboardSpec, NodeWithoutGpu, names};
+use leaderboard_api::{GpuSource, LeaderboardSpec, names};
 use leaderboard_runner::graphics::{INDEX, Needs};
 use leaderboard_runner::protocol::{Member, Pair, Side};
 use serde_json::{Value, json};
 
+use super::failed_nodes::{HOSTNAME, REQUIRED};
 use super::{JobInput, variable};
 use crate::controller::gpu_claims::{source, template_name};
 
@@ -22,13 +23,6 @@ const CAPABILITIES: &str = "NVIDIA_DRIVER_CAPABILITIES";
 const NO_DEVICE: &str = "void";
 /// What the resources of NVIDIA's device plugin begin with: whole GPUs, shared ones, MIG slices.
 const RESOURCES: &str = "nvidia.com/";
-/// Taken as the node's name, which autoscalers understand in an affinity; of a node itself they know no name yet.
-const HOSTNAME: &str = "kubernetes.io/hostname";
-const REQUIRED: &str = "requiredDuringSchedulingIgnoredDuringExecution";
-
-/// Jobs of an attempt that a node may give no GPU.
-const AVOIDED_AFTER: i32 = 2;
-
 /// The variables of a container of a pair.
 pub(super) fn variables(source: GpuSource<'_>, member: Member) -> Vec<EnvVar> {
     let index = member.pair.index().to_string();
@@ -174,42 +168,20 @@ pub(super) fn member(container: &Value) -> Option<Member> {
     Member::parse(container["name"].as_str()?)
 }
 
-/// Nodes that a Job must not get: those that gave it no GPU so often that it is not by chance.
-pub(super) fn avoided(nodes: &[NodeWithoutGpu]) -> Vec<&str> {
-    let avoided = nodes.iter().filter(|node| node.jobs >= AVOIDED_AFTER);
-    avoided.map(|node| node.node_name.as_str()).collect()
-}
-
-/// Keeps a Pod whose pairs know their GPU by its index away from nodes with another submission's Pod, whatever its namespace, and
-/// every Pod away from nodes that gave it no GPU. It comes after the overlay, whose lists would take the place of these.
-pub(super) fn place(pod: &mut Value, source: GpuSource<'_>, avoided: &[&str]) {
-    if is_by_index(source) {
-        let others = json!({
-            "topologyKey": HOSTNAME,
-            "namespaceSelector": {},
-            "labelSelector": {"matchExpressions": [{"key": names::LABEL_SUBMISSION, "operator": "Exists"}]},
-        });
-        let terms = &mut pod["affinity"]["podAntiAffinity"][REQUIRED];
-        match terms.as_array_mut() {
-            Some(terms) => terms.push(others),
-            None => *terms = json!([others]),
-        }
-    }
-    if avoided.is_empty() {
+/// Keeps a Pod whose pairs know their GPU by its index away from nodes with another submission's Pod, whatever its namespace. It comes
+/// after the overlay, whose lists would take the place of these.
+pub(super) fn place(pod: &mut Value, source: GpuSource<'_>) {
+    if !is_by_index(source) {
         return;
     }
-    let elsewhere = json!({"key": HOSTNAME, "operator": "NotIn", "values": avoided});
-    let terms = &mut pod["affinity"]["nodeAffinity"][REQUIRED]["nodeSelectorTerms"];
-    // One of them has to hold, so each needs it.
-    match terms.as_array_mut().filter(|terms| !terms.is_empty()) {
-        Some(terms) => {
-            for term in terms {
-                match term["matchExpressions"].as_array_mut() {
-                    Some(expressions) => expressions.push(elsewhere.clone()),
-                    None => term["matchExpressions"] = json!([elsewhere]),
-                }
-            }
-        }
-        None => *terms = json!([{"matchExpressions": [elsewhere]}]),
+    let others = json!({
+        "topologyKey": HOSTNAME,
+        "namespaceSelector": {},
+        "labelSelector": {"matchExpressions": [{"key": names::LABEL_SUBMISSION, "operator": "Exists"}]},
+    });
+    let terms = &mut pod["affinity"]["podAntiAffinity"][REQUIRED];
+    match terms.as_array_mut() {
+        Some(terms) => terms.push(others),
+        None => *terms = json!([others]),
     }
 }

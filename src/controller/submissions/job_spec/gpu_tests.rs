@@ -1,6 +1,5 @@
 //! What each container of a built Job gets of its node's GPUs and of a screen, mode by mode.
 
-use leaderboard_api::NodeWithoutGpu;
 use serde_json::{Value, json};
 
 use super::tests::{Case, container, containers};
@@ -263,33 +262,6 @@ fn only_pods_that_share_by_index_keep_away_from_each_other() {
     let overlay = json!({"spec": {"affinity": {"podAntiAffinity": {required: [own]}}}});
     let found = affinity(json!({"gpu": index, "podOverrides": overlay}));
     assert_eq!(found["podAntiAffinity"][required], json!([own, apart]));
-}
-
-#[test]
-fn a_node_without_a_gpu_is_avoided_from_the_second_time_on() {
-    let required = "requiredDuringSchedulingIgnoredDuringExecution";
-    let node = |name: &str, jobs| NodeWithoutGpu {
-        node_name: name.into(),
-        jobs,
-    };
-    let terms = |more, nodes: &[NodeWithoutGpu]| {
-        let mut case = Case::new("V2", more);
-        case.without_gpu = nodes.to_vec();
-        let pod = &case.json()["spec"]["template"]["spec"];
-        pod["affinity"]["nodeAffinity"][required]["nodeSelectorTerms"].clone()
-    };
-    let elsewhere = json!({"key": "kubernetes.io/hostname", "operator": "NotIn", "values": ["b", "c"]});
-    let nodes = [node("a", 1), node("b", 2), node("c", 3)];
-    assert_eq!(terms(json!({}), &nodes[..1]), Value::Null);
-    assert_eq!(terms(json!({}), &nodes), json!([{"matchExpressions": [elsewhere]}]));
-    let own = json!({"key": "zone", "operator": "In", "values": ["z"]});
-    let hosts = json!([{"matchExpressions": [own]}, {"matchFields": [own]}]);
-    let overlay = json!({"spec": {"affinity": {"nodeAffinity": {required: {"nodeSelectorTerms": hosts}}}}});
-    let expected = json!([
-        {"matchExpressions": [own, elsewhere]},
-        {"matchFields": [own], "matchExpressions": [elsewhere]},
-    ]);
-    assert_eq!(terms(json!({"podOverrides": overlay}), &nodes), expected);
 }
 
 #[test]

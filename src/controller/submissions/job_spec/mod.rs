@@ -6,6 +6,7 @@
 mod commands;
 mod disk;
 mod display;
+mod failed_nodes;
 mod gpu;
 mod gpu_count;
 mod init;
@@ -44,7 +45,7 @@ use crate::pod::run::{Isolation, Run, SCHEMA};
 use crate::services::names::Addresses;
 pub use gpu_count::gpus;
 use leaderboard_api::{
-    Attempt, Deadlines, Enforcement, JobNumber, Leaderboard, LeaderboardSpec, NodeWithoutGpu, PolicySource, RunPlan,
+    Attempt, Deadlines, Enforcement, FailedNode, JobNumber, Leaderboard, LeaderboardSpec, PolicySource, RunPlan,
     Submission, Track, conditions, effective, names, reasons,
 };
 use leaderboard_runner::protocol::Pair;
@@ -73,8 +74,8 @@ pub struct JobInput<'a> {
     pub number: JobNumber,
     /// The operator's own image, with `workspace` and `logcopy` in it, and its region.
     pub settings: &'a Settings,
-    /// Nodes that gave it no GPU.
-    pub without_gpu: &'a [NodeWithoutGpu],
+    /// Nodes that have failed earlier Jobs of the attempt.
+    pub failed_nodes: &'a [FailedNode],
     /// Where the names lead that the Pod's own containers need; none: they look them up themselves.
     pub addresses: Option<&'a Addresses>,
     /// When it is made.
@@ -326,7 +327,8 @@ fn settle(template: &mut Value, input: &JobInput<'_>) {
             security::settle(container);
         }
     }
-    gpu::place(pod, gpus, &gpu::avoided(input.without_gpu));
+    gpu::place(pod, gpus);
+    failed_nodes::avoid(pod, input.failed_nodes);
     disk::fill(pod, volumes::logs_limit(input));
 }
 

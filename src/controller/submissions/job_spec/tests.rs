@@ -8,7 +8,7 @@ use serde_json::{Value, json};
 use super::*;
 use crate::allowed::Allowed;
 use crate::kubernetes::Namespaces;
-use leaderboard_api::{JobNumber, NodeWithoutGpu, effective};
+use leaderboard_api::{FailedNode, JobNumber, effective};
 
 pub(super) const OPERATOR_IMAGE: &str = "registry.example/leaderboard-operator:1";
 
@@ -19,7 +19,7 @@ pub(super) struct Case {
     pub(super) plan: RunPlan,
     pub(super) number: JobNumber,
     pub(super) settings: Settings,
-    pub(super) without_gpu: Vec<NodeWithoutGpu>,
+    pub(super) failed_nodes: Vec<FailedNode>,
     pub(super) addresses: Option<Addresses>,
 }
 
@@ -73,7 +73,7 @@ impl Case {
                 allowed: Allowed::default(),
                 concurrency: 16,
             },
-            without_gpu: Vec::new(),
+            failed_nodes: Vec::new(),
             addresses: None,
         }
     }
@@ -85,7 +85,7 @@ impl Case {
             plan: &self.plan,
             number: self.number,
             settings: &self.settings,
-            without_gpu: &self.without_gpu,
+            failed_nodes: &self.failed_nodes,
             addresses: self.addresses.as_ref(),
             now: "2026-11-01T12:00:00Z".parse().unwrap(),
         }

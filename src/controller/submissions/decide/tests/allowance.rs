@@ -113,6 +113,63 @@ fn results_that_an_agent_keeps_from_being_stored_are_counted_as_well() {
 }
 
 #[test]
+fn ends_that_an_agent_can_bring_about_are_counted_and_those_of_the_hosts_images_are_not() {
+    type Sees = fn(&mut World);
+    fn waits(world: &mut World, name: &str, reason: &str, words: &str) {
+        world.see(waiting(name, reason, words));
+        world.pass();
+        world.go_to(1800);
+    }
+    let cases: [(&str, Sees, &str, i32); 4] = [
+        (
+            "its node falls silent",
+            |world| {
+                world.pod().delete_by = Some(at(700));
+                world.go_to(730);
+            },
+            reasons::NODE_LOST,
+            1,
+        ),
+        (
+            "its node starts nothing more",
+            |world| {
+                waits(
+                    world,
+                    "agent-1",
+                    "CreateContainerError",
+                    "too many open files in system",
+                );
+            },
+            reasons::NODE_CANNOT_START,
+            1,
+        ),
+        (
+            "its image cannot be pulled",
+            |world| waits(world, "agent-1", "ErrImagePull", "401 Unauthorized"),
+            reasons::IMAGE_PULL,
+            1,
+        ),
+        (
+            "the simulator's cannot",
+            |world| waits(world, "simulator-1", "ErrImagePull", "401 Unauthorized"),
+            reasons::IMAGE_PULL,
+            0,
+        ),
+    ];
+    for (what, sees, reason, number) in cases {
+        let mut world = World::local().with_pod();
+        world.leaderboard().retries.infrastructure = 0;
+        sees(&mut world);
+        world.pass();
+        world.job_gone();
+        let status = world.pass_to(Failed, reason).status;
+        assert!(!status.failure.unwrap().charged, "{what}");
+        let counted = status.infrastructure_failures.map_or(0, |failures| failures.number);
+        assert_eq!(counted, number, "{what}");
+    }
+}
+
+#[test]
 fn the_times_of_the_last_three_are_remembered() {
     let known = |number: i32, recent: &[i64]| InfrastructureFailures {
         number,

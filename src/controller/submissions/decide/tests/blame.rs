@@ -254,6 +254,33 @@ fn a_simulator_that_the_kubelet_could_not_start_is_the_cause() {
 }
 
 #[test]
+fn an_agent_that_the_kubelet_cannot_start_is_its_images_only_by_the_kubelets_words() {
+    use EndReason::{NodeCannotStart, StartError};
+    let start_error = |why: Option<&str>| {
+        let mut agent = without_verdict(ended("agent-1", 2, "", 1, 100), "StartError", 128);
+        agent.last.as_mut().unwrap().why = why.map(str::to_owned);
+        agent
+    };
+    let followed = || ended("simulator-1", 2, "peerCrashed", 1, 100);
+    let no_user = "unable to start container process: unable to find user carla: no matching entries in passwd file";
+    check(vec![
+        row(
+            "no such user",
+            followed(),
+            start_error(Some(no_user)),
+            Settled(StartError),
+        ),
+        row(
+            "a full node",
+            followed(),
+            start_error(Some("too many open files in system")),
+            Settled(NodeCannotStart),
+        ),
+        row("no words", followed(), start_error(None), Settled(NodeCannotStart)),
+    ]);
+}
+
+#[test]
 fn an_agent_that_ends_alone_is_the_cause_after_a_while() {
     use EndReason::{BlamesSimulator, CannotStart, Exited, SilentDeath};
     let round_2 = || restarted("simulator-1", 2, "peerCrashed", 1, 40);

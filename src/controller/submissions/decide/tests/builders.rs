@@ -448,6 +448,7 @@ pub fn report(done: u32) -> Report {
         logs: None,
         results: "[]".into(),
         partial_results: None,
+        agents_fill_disk: false,
         files: std::collections::BTreeMap::new(),
     }
 }

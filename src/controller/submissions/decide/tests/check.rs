@@ -121,7 +121,7 @@ fn what_keeps_it_from_starting_ends_it_after_a_minute() {
         world.job_gone();
         let failure = world.pass_to(Failed, fails_as).status.failure.unwrap();
         assert!(
-            failure.message.contains("It was tried for 60 s."),
+            failure.message.contains("It was tried for 60 s on node node-a."),
             "{}",
             failure.message
         );

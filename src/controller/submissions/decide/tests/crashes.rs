@@ -1,13 +1,13 @@
 //! Crashes of a pair: whose they are, how many are forgiven.
 
 use super::builders::*;
-use crate::controller::submissions::decide::end;
+use crate::controller::submissions::decide::{Action, end};
 use crate::controller::submissions::view::{JobEnd, ObservedReport};
 use crate::pod::run::Stop;
 use leaderboard_api::FailureClass::{Infrastructure, Participant};
 use leaderboard_api::State::{Failed, Finished, Pending, Running};
 use leaderboard_api::reasons;
-use leaderboard_api::{Failure, MAX_NODES_WITHOUT_GPU, NodeWithoutGpu};
+use leaderboard_api::{FailedNode, Failure, MAX_FAILED_NODES};
 
 /// Each side of pair 1 ends like this until its retries are used up: what comes of it.
 fn used_up(agent: &str, simulator: &str) -> Failure {
@@ -362,7 +362,7 @@ fn a_simulator_without_a_gpu_ends_its_job_at_once_and_its_node_is_remembered() {
     see_without_graphics(&mut world, "noGpu");
     for jobs in [1, 2] {
         let plan = world.pass_to(Pending, reasons::STOPPING);
-        assert_eq!(annotated(&plan), Some(Stop::Retries));
+        assert!(has(&plan, |a| matches!(a, Action::DeleteJob { .. })));
         let failure = plan.status.failure.unwrap();
         assert_eq!(
             (failure.reason.as_str(), failure.class),
@@ -374,7 +374,7 @@ fn a_simulator_without_a_gpu_ends_its_job_at_once_and_its_node_is_remembered() {
         world.complete();
         let plan = world.pass_to(Pending, reasons::REPLACING);
         let node_name = "node-a".into();
-        assert_eq!(plan.status.nodes_without_gpu, [NodeWithoutGpu { node_name, jobs }]);
+        assert_eq!(plan.status.failed_nodes, [FailedNode { node_name, jobs }]);
         world.job_gone();
         world.wait(60);
         assert!(creates(&world.pass()));
@@ -411,12 +411,52 @@ fn a_node_whose_driver_cannot_draw_is_no_reason_for_another_job() {
 }
 
 #[test]
-fn of_nodes_without_a_gpu_the_newest_are_remembered() {
+fn of_nodes_that_have_failed_the_newest_are_remembered() {
     let mut nodes = Vec::new();
-    for node in 0..=MAX_NODES_WITHOUT_GPU {
-        end::note_without_gpu(&mut nodes, format!("node-{node}"));
+    for node in 0..=MAX_FAILED_NODES {
+        end::note_failed_node(&mut nodes, format!("node-{node}"));
     }
-    end::note_without_gpu(&mut nodes, "node-1".into());
+    end::note_failed_node(&mut nodes, "node-1".into());
     let found: Vec<(&str, i32)> = nodes.iter().map(|node| (node.node_name.as_str(), node.jobs)).collect();
-    assert_eq!((found.len(), found[0]), (MAX_NODES_WITHOUT_GPU, ("node-1", 2)));
+    assert_eq!((found.len(), found[0]), (MAX_FAILED_NODES, ("node-1", 2)));
+}
+
+/// Pair 1 of a running Pod whose agent the kubelet cannot start again.
+fn see_start_error(world: &mut World, restarts: i32, why: &str) {
+    let mut agent = ended("agent-1", restarts, "", 128, 100);
+    let end = agent.last.as_mut().unwrap();
+    (end.reason, end.why, end.verdict) = ("StartError".into(), Some(why.into()), None);
+    world.see_alone(agent);
+    world.see_alone(ended("simulator-1", restarts, "peerCrashed", 1, 100));
+}
+
+#[test]
+fn an_agent_that_its_node_cannot_start_is_tried_again_there_and_then_by_another_job() {
+    let mut world = World::local().running();
+    let why = "runc create failed: pipe2: too many open files in system: unknown";
+    see_start_error(&mut world, 2, why);
+    world.pass_to(Running, reasons::NODE_CANNOT_START);
+    see_start_error(&mut world, 3, why);
+    world.pass_to(Running, reasons::STOPPING);
+    world.complete();
+    let plan = world.pass_to(Pending, reasons::REPLACING);
+    let begin = "The container of agent 1 could not be started 4 times on node node-a;";
+    assert!(plan.status.message.unwrap().starts_with(begin));
+    let node_name = "node-a".into();
+    assert_eq!(plan.status.failed_nodes, [FailedNode { node_name, jobs: 1 }]);
+}
+
+#[test]
+fn an_agent_whose_image_lacks_its_program_fails_at_once() {
+    let mut world = World::local().running();
+    see_start_error(
+        &mut world,
+        0,
+        "unable to start container process: exec: \"/nope\": stat /nope: no such file or directory: unknown",
+    );
+    let failure = world.pass_to(Running, reasons::STOPPING).status.failure.unwrap();
+    assert_eq!(
+        (failure.reason.as_str(), failure.class),
+        (reasons::CANNOT_START, Participant)
+    );
 }

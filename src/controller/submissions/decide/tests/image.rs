@@ -258,17 +258,14 @@ fn pods_pull_by_digest_whatever_else_the_reference_names() {
 fn participants_read_nothing_of_what_a_registry_or_the_network_answers_to_a_pull() {
     for (words, wanted) in [
         (
-            "failed to resolve reference \"10.0.0.5:8080/x\": not found",
+            "failed to resolve reference \"10.0.0.5:8080/x:1\": 10.0.0.5:8080/x:1: not found",
             "is not in its registry",
         ),
-        (
-            "failed to authorize: 401 Unauthorized",
-            "does not let the challenge pull",
-        ),
+        ("failed to authorize: 401 Unauthorized", "could not be pulled"),
         ("no match for platform in manifest: not found", "is not for linux/amd64"),
         (
             "http: server gave HTTP response to HTTPS client 10.0.0.5:8080",
-            "cannot be pulled",
+            "could not be pulled",
         ),
         ("x509: certificate signed by unknown authority", "could not be pulled"),
         (

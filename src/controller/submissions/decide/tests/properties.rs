@@ -113,6 +113,7 @@ fn container() -> impl Strategy<Value = crate::controller::submissions::view::Co
         "CrashLoopBackOff",
         "CreateContainerConfigError",
         "RunContainerError",
+        "InvalidImageName",
         "Odd",
     ];
     let shape = (
@@ -143,6 +144,8 @@ fn pod_view() -> impl Strategy<Value = PodView> {
         None,
         None,
         evicted("Pod ephemeral local storage usage exceeds 1Gi"),
+        evicted("Container agent-1 exceeded its local ephemeral storage limit \"1Gi\". "),
+        Some(("UnexpectedAdmissionError".to_owned(), "Allocate failed".to_owned())),
         evicted("memory"),
     ];
     let times = (

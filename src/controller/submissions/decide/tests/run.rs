@@ -5,7 +5,7 @@ use crate::controller::submissions::decide::{Action, EvalaiUpdate};
 use crate::controller::submissions::view::{ObservedJob, ObservedReport, PodView, Stage};
 use crate::pod::report::{Logs, Report};
 use crate::pod::run::Stop;
-use leaderboard_api::FailureClass::{Infrastructure, Participant};
+use leaderboard_api::FailureClass::Infrastructure;
 use leaderboard_api::State::{Failed, Finished, Pending, Resumed, Running};
 use leaderboard_api::conditions::{self, LOGGED, PLAUSIBLE, RUNNING, STALLED};
 use leaderboard_api::reasons;
@@ -294,51 +294,6 @@ fn deadlines_and_retries_are_the_leaderboards_of_this_moment() {
     world.pass_to(Running, reasons::RUNNING);
     world.leaderboard().retries.per_pair = 3;
     world.pass_to(Running, reasons::STOPPING);
-}
-
-#[test]
-fn an_eviction_for_the_agents_disk_is_the_participants_and_stops_the_job() {
-    let cases = [
-        (
-            "Pod ephemeral local storage usage exceeds the total limit of containers 20Mi. ",
-            true,
-        ),
-        ("Usage of EmptyDir volume \"logs\" exceeds the limit \"10Mi\". ", true),
-        (
-            "Container agent-1 exceeded its local ephemeral storage limit \"1Gi\". ",
-            true,
-        ),
-        (
-            "Container simulator-1 exceeded its local ephemeral storage limit \"1Gi\". ",
-            false,
-        ),
-        (
-            "Usage of EmptyDir volume \"leaderboard\" exceeds the limit \"10Mi\". ",
-            false,
-        ),
-        (
-            "The node was low on resource: ephemeral-storage. Container agent-1 was using 1Gi.",
-            false,
-        ),
-        ("The node was low on resource: memory.", false),
-    ];
-    for (words, is_participants) in cases {
-        let mut world = World::local().running();
-        world.pod().ended_by_node = Some(("Evicted".into(), words.into()));
-        world.pod().logcopy_running = false;
-        if is_participants {
-            world.pass_to(Running, reasons::STOPPING);
-            world.job_gone();
-            let failure = world.pass_to(Failed, reasons::DISK_FULL).status.failure.unwrap();
-            assert_eq!(failure.class, Participant, "{words}");
-        } else {
-            assert_eq!(
-                world.pass_to(Running, reasons::REPLACING).status.failure,
-                None,
-                "{words}"
-            );
-        }
-    }
 }
 
 #[test]

@@ -4,14 +4,18 @@ use std::time::Duration;
 
 use super::builders::*;
 use crate::controller::submissions::decide::{Action, EvalaiUpdate};
-use crate::controller::submissions::view::ContainerView;
+use crate::controller::submissions::view::{ContainerView, ObservedReport};
 use crate::pod::run::Stop;
 use leaderboard_api::FailureClass::{self, Infrastructure, Participant};
 use leaderboard_api::State::{Failed, Pending, Running};
 use leaderboard_api::conditions::{RUNNING, STALLED};
-use leaderboard_api::reasons;
+use leaderboard_api::{FailedNode, reasons};
 
-const NOT_FOUND: &str = "rpc error: code = NotFound desc = failed to pull and unpack image \"r/x:1\": not found";
+const NOT_FOUND: &str = "rpc error: code = NotFound desc = failed to pull and unpack image \"r/x:1\": failed to resolve reference \
+                         \"r/x:1\": r/x:1: not found";
+const CDI: &str = "failed to generate spec: failed to inject CDI devices: unresolvable CDI devices nvidia.com/gpu=0";
+const NO_PROGRAM: &str = "OCI runtime create failed: runc create failed: unable to start container process: exec: \"/nope\": stat \
+                          /nope: no such file or directory: unknown";
 
 fn back_off() -> String {
     format!("Back-off pulling image \"r/x:1\": ErrImagePull: {NOT_FOUND}")
@@ -73,51 +77,213 @@ fn is_shown_then_fails(container: ContainerView, reason: &str, class: FailureCla
 }
 
 #[test]
-fn an_image_that_cannot_be_pulled_is_its_owners_failure() {
+fn an_image_that_cannot_be_pulled_is_its_owners_failure_only_where_its_registry_has_none_that_fits() {
     let status = |status: &str| format!("failed with status code [manifests 1]: {status}");
     let cases = [
-        ("agent-1", NOT_FOUND.to_owned(), Participant),
-        ("agent-1", back_off(), Participant),
-        ("agent-1", status("401 Unauthorized"), Participant),
+        ("agent-1", NOT_FOUND.to_owned(), Participant, reasons::IMAGE_NOT_FOUND),
+        ("agent-1", back_off(), Participant, reasons::IMAGE_NOT_FOUND),
         (
             "agent-1",
             "no match for platform in manifest: not found".into(),
             Participant,
+            reasons::IMAGE_PLATFORM,
+        ),
+        (
+            "agent-1",
+            "unsupported media type application/x".into(),
+            Participant,
+            reasons::IMAGE_INVALID,
+        ),
+        (
+            "agent-1",
+            status("401 Unauthorized"),
+            Infrastructure,
+            reasons::IMAGE_PULL,
         ),
         (
             "agent-1",
             "dial tcp 10.0.0.1:443: connect: connection refused".into(),
             Infrastructure,
+            reasons::IMAGE_PULL,
         ),
-        ("agent-1", status("503 Service Unavailable"), Infrastructure),
-        ("simulator-1", NOT_FOUND.to_owned(), Infrastructure),
-        ("contents", NOT_FOUND.to_owned(), Infrastructure),
+        ("agent-1", "unheard of".into(), Infrastructure, reasons::IMAGE_PULL),
+        ("simulator-1", NOT_FOUND.to_owned(), Infrastructure, reasons::IMAGE_PULL),
+        ("contents", NOT_FOUND.to_owned(), Infrastructure, reasons::IMAGE_PULL),
     ];
-    for (name, words, class) in cases {
+    for (name, words, class, fails_as) in cases {
         let container = waiting(name, "ImagePullBackOff", &words);
-        is_shown_then_fails(container, reasons::IMAGE_PULL, class, reasons::IMAGE_PULL);
+        is_shown_then_fails(container, reasons::IMAGE_PULL, class, fails_as);
     }
 }
 
 #[test]
-fn a_container_that_cannot_be_set_up_or_started_shows_why() {
+fn a_container_that_cannot_be_set_up_or_started_shows_why_and_only_a_proof_charges_the_participant() {
+    let config = "CreateContainerConfigError";
     let cases = [
         (
             "agent-1",
-            "CreateContainerConfigError",
+            config,
+            "secret \"s\" not found",
             reasons::CONTAINER_CONFIG,
             Infrastructure,
         ),
-        ("agent-1", "CreateContainerError", reasons::CANNOT_START, Participant),
+        (
+            "agent-1",
+            "CreateContainerError",
+            "no users found",
+            reasons::CANNOT_START,
+            Participant,
+        ),
+        (
+            "agent-1",
+            "RunContainerError",
+            NO_PROGRAM,
+            reasons::CANNOT_START,
+            Participant,
+        ),
+        (
+            "agent-1",
+            "CreateContainerError",
+            CDI,
+            reasons::NODE_CANNOT_START,
+            Infrastructure,
+        ),
+        (
+            "agent-1",
+            "RunContainerError",
+            "unheard of",
+            reasons::NODE_CANNOT_START,
+            Infrastructure,
+        ),
         (
             "simulator-1",
             "RunContainerError",
+            NO_PROGRAM,
             reasons::CANNOT_START,
             Infrastructure,
         ),
+        (
+            "simulator-1",
+            "CreateContainerError",
+            CDI,
+            reasons::NODE_CANNOT_START,
+            Infrastructure,
+        ),
+        (
+            "simulator-1",
+            config,
+            "container has runAsNonRoot and image will run as root",
+            reasons::CONTAINER_CONFIG,
+            Infrastructure,
+        ),
     ];
-    for (name, word, reason, class) in cases {
-        is_shown_then_fails(waiting(name, word, "it is missing"), reason, class, reason);
+    for (name, word, words, reason, class) in cases {
+        is_shown_then_fails(waiting(name, word, words), reason, class, reason);
+    }
+}
+
+#[test]
+fn an_image_whose_user_the_pod_forbids_is_refused_at_once_at_the_participants_cost() {
+    for words in [
+        "container has runAsNonRoot and image will run as root (pod: \"sub-1-x\", container: agent-1)",
+        "container has runAsNonRoot and image has non-numeric user (carla), cannot verify user is non-root (pod: \"sub-1-x\")",
+    ] {
+        let mut world = World::local().with_pod();
+        world.see(waiting("agent-1", "CreateContainerConfigError", words));
+        let plan = world.pass_to(Pending, reasons::STOPPING);
+        assert!(has(&plan, |a| matches!(a, Action::DeleteJob { .. })));
+        world.job_gone();
+        let status = world.pass_to(Failed, reasons::IMAGE_INVALID).status;
+        let failure = status.failure.unwrap();
+        assert_eq!(
+            (failure.class, failure.charged, failure.pair, status.retry),
+            (Participant, true, Some(1), 0)
+        );
+        assert!(failure.message.contains(words), "{}", failure.message);
+        let shown = failure.participant_message.unwrap();
+        assert!(
+            shown.contains("Set USER of the image to a number") && !shown.contains("sub-1-x"),
+            "{shown}"
+        );
+    }
+}
+
+#[test]
+fn the_hosts_containers_are_looked_at_before_the_agents() {
+    let mut world = World::local().with_pod();
+    world.leaderboard().retries.infrastructure = 0;
+    // As the kubelet sorts them.
+    world.see_alone(waiting("agent-1", "CreateContainerError", "no users found"));
+    world.see_alone(waiting("simulator-1", "CreateContainerError", CDI));
+    let plan = world.pass_to(Pending, reasons::NODE_CANNOT_START);
+    assert!(plan.status.message.unwrap().contains("simulator-1"));
+    world.go_to(1800);
+    world.pass_to(Pending, reasons::STOPPING);
+    world.job_gone();
+    let failure = world
+        .pass_to(Failed, reasons::NODE_CANNOT_START)
+        .status
+        .failure
+        .unwrap();
+    assert_eq!(
+        (failure.class, failure.charged, failure.pair),
+        (Infrastructure, false, None)
+    );
+}
+
+#[test]
+fn a_node_that_cannot_start_a_container_is_named_and_remembered() {
+    let mut world = World::local().with_pod();
+    world.see(waiting("agent-2", "CreateContainerError", CDI));
+    world.pass_to(Pending, reasons::NODE_CANNOT_START);
+    world.go_to(1800);
+    world.pass_to(Pending, reasons::STOPPING);
+    world.job_gone();
+    let plan = world.pass_to(Pending, reasons::REPLACING);
+    let message = plan.status.message.unwrap();
+    assert!(message.contains("It was tried for 1800 s on node node-a."), "{message}");
+    let node_name = "node-a".into();
+    assert_eq!(plan.status.failed_nodes, [FailedNode { node_name, jobs: 1 }]);
+}
+
+#[test]
+fn a_pod_that_its_node_does_not_admit_ends_its_job_with_the_kubelets_words() {
+    let words = "Pod was rejected: Allocate failed due to requested number of devices unavailable for nvidia.com/gpu. Requested: 1, \
+                 Available: 0, which is unexpected";
+    let mut world = World::local().with_pod();
+    for jobs in [1, 2] {
+        world.view.pod = Some(pod(0));
+        world.pod().ended_by_node = Some(("UnexpectedAdmissionError".into(), words.into()));
+        let plan = world.pass_to(Pending, reasons::STOPPING);
+        assert!(has(&plan, |a| matches!(a, Action::DeleteJob { .. })));
+        let failure = plan.status.failure.unwrap();
+        assert_eq!(failure.class, Infrastructure);
+        assert_eq!(
+            failure.message,
+            format!("On node node-a the kubelet did not admit the Pod (UnexpectedAdmissionError): {words}.")
+        );
+        world.job_gone();
+        let plan = world.pass_to(Pending, reasons::REPLACING);
+        let node_name = "node-a".into();
+        assert_eq!(plan.status.failed_nodes, [FailedNode { node_name, jobs }]);
+        world.wait(60);
+        assert!(creates(&world.pass()));
+        world.see_job();
+        world.view.report = ObservedReport::NotRead;
+    }
+}
+
+#[test]
+fn a_pod_that_its_kubelet_ended_shows_why_and_its_job_makes_another() {
+    for reason in ["OutOfcpu", "NodeShutdown"] {
+        let mut world = World::local().with_pod();
+        world.pod().ended_by_node = Some((reason.into(), "Pod was rejected: no more of it".into()));
+        let plan = world.pass_to(Pending, reasons::REPLACING);
+        let message = plan.status.message.unwrap();
+        let begin =
+            format!("On node node-a the kubelet ended the Pod ({reason}): Pod was rejected: no more of it. A new Pod");
+        assert!(message.starts_with(&begin), "{message}");
+        assert_eq!(plan.status.failure, None);
     }
 }
 
@@ -299,6 +465,24 @@ fn a_pull_that_fails_in_mid_run_is_shown_and_does_not_end_it() {
     world.see(agent);
     let plan = world.pass_to(Running, reasons::IMAGE_PULL);
     assert_eq!(plan.status.failure, None);
+}
+
+#[test]
+fn a_node_that_does_not_start_an_agent_again_in_mid_run_has_the_time_of_a_start() {
+    let mut world = World::local().running();
+    world.go_to(40_000);
+    let mut agent = ended("agent-1", 1, "exited", 1, 39_000);
+    agent.waiting = Some(("CreateContainerError".into(), CDI.into()));
+    world.see(agent);
+    world.pass_to(Running, reasons::NODE_CANNOT_START);
+    world.go_to(41_799);
+    world.pass_to(Running, reasons::NODE_CANNOT_START);
+    world.go_to(41_800);
+    let failure = world.pass_to(Running, reasons::STOPPING).status.failure.unwrap();
+    assert_eq!(
+        (failure.reason.as_str(), failure.class),
+        (reasons::NODE_CANNOT_START, Infrastructure)
+    );
 }
 
 #[test]

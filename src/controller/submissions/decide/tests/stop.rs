@@ -135,9 +135,12 @@ const STAGES: [Stage; 9] = [
         Done::Deleted,
     ),
     (
-        "an image is pulled",
+        "its agent's image cannot be pulled, while simulator and logcopy run",
         || {
             let mut world = World::evalai().with_pod();
+            world.pod().logcopy_running = true;
+            world.see(running("logcopy"));
+            world.see(running("simulator-1"));
             world.see(waiting("agent-1", "ErrImagePull", "not found"));
             world
         },
@@ -159,7 +162,7 @@ const STAGES: [Stage; 9] = [
             world.pod().logcopy_running = true;
             world
         },
-        Done::Told,
+        Done::Deleted,
     ),
     ("it runs", || World::evalai().running(), Done::Told),
     (
