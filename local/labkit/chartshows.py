@@ -206,7 +206,7 @@ IMAGE = [
     ),
     case(
         {"podSecurityContext": {"runAsNonRoot": True, "seccompProfile": {"type": "Unconfined"}}},
-        (BRIDGE, f"{POD}.securityContext", {"runAsUser": 65532, "seccompProfile": {"type": "Unconfined"}}),
+        (BRIDGE, f"{POD}.securityContext", {"runAsUser": 60973, "seccompProfile": {"type": "Unconfined"}}),
     ),
     case(
         {

@@ -9,6 +9,7 @@ mod display;
 mod gpu;
 mod gpu_count;
 mod init;
+mod own_uid;
 mod pairs;
 mod security;
 mod volumes;
