@@ -8,12 +8,15 @@ use std::time::Duration;
 
 use aws_config::retry::RetryConfig;
 use aws_config::{AppName, BehaviorVersion, Region, SdkConfig};
+use aws_sdk_s3::config::{RequestChecksumCalculation, ResponseChecksumValidation};
 use aws_smithy_http_client::tls::{Provider, rustls_provider::CryptoMode};
 
 use super::meter::Meter;
 use super::names::{Addresses, Given, Names};
 use leaderboard_api::names::OPERATOR;
 
+/// Variable of the SDK that says when S3 is sent a checksum: `when_supported`, or `when_required` for stores that know none.
+pub const ENV_CHECKSUMS: &str = "AWS_REQUEST_CHECKSUM_CALCULATION";
 /// Where nothing sets the region.
 pub const USUAL_REGION: &str = "us-east-1";
 /// Time an AWS call may take, with its retries.
@@ -121,7 +124,12 @@ impl Aws {
 
     /// A client of S3. An endpoint of one's own gets path-style addresses: its buckets have no host names.
     pub fn s3(&self, region: Option<&str>, endpoint: Option<&str>) -> aws_sdk_s3::Client {
-        let config = own!(aws_sdk_s3, self.config(region), endpoint).force_path_style(endpoint.is_some());
+        let shared = self.config(region);
+        let mut config = own!(aws_sdk_s3, shared, endpoint).force_path_style(endpoint.is_some());
+        if shared.request_checksum_calculation() == Some(RequestChecksumCalculation::WhenRequired) {
+            // A store that takes no checksum is not asked for one either.
+            config = config.response_checksum_validation(ResponseChecksumValidation::WhenRequired);
+        }
         aws_sdk_s3::Client::from_conf(config.build())
     }
 

@@ -158,6 +158,7 @@ pub fn settings() -> Settings {
         image: "operator:1".into(),
         image_pull_policy: None,
         region: None,
+        checksums: None,
         operator: OPERATOR.into(),
         namespaces: Namespaces::All,
         has_cluster_rights: true,

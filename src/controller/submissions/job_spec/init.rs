@@ -11,6 +11,7 @@ use super::{JobInput, commands, own_uid, resume, run_document, variable, volumes
 use crate::controller::submissions::pod_layout::CONTENTS_LOG_FOLDER;
 use crate::pod::ownlog::CONTENTS_LOG;
 use crate::pod::run::{ENV_POD_UID, ENV_ROLE_ARN, ENV_RUN, RUNNER, TOOLS};
+use crate::services::aws::ENV_CHECKSUMS;
 use leaderboard_api::names;
 
 /// Copying prints little; what floods must not fill the disk. In bytes.
@@ -116,6 +117,8 @@ fn own_env(input: &JobInput<'_>) -> Vec<EnvVar> {
     ];
     let region = input.settings.region.as_ref().or(input.plan.storage.region.as_ref());
     env.extend(region.map(|region| variable("AWS_REGION", region)));
+    let checksums = input.settings.checksums.as_deref();
+    env.extend(checksums.map(|when| variable(ENV_CHECKSUMS, when)));
     if let Some(identity) = &input.spec().pod_identity {
         env.extend(identity.role_arn.as_deref().map(|role| variable(ENV_ROLE_ARN, role)));
         env.extend(identity.secret_name.iter().flat_map(|secret| {
