@@ -185,7 +185,8 @@ fn stores(cluster: Cluster) -> Stores {
 fn external(aws: &Aws, tasks: &Tasks) -> ExternalSystems {
     let hub = Hub::new(Options::unheard(tasks, || true));
     let rows = mpsc::unbounded_channel().0;
-    ExternalSystems::new(hub, Recorder::new(aws.clone(), || true, rows, tasks.clone()))
+    let recorder = Recorder::new(aws.clone(), || true, rows, tasks.clone());
+    ExternalSystems::new(hub, recorder, Allowed::default())
 }
 
 async fn serve(
