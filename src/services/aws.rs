@@ -3,6 +3,7 @@
 //! Called by everything that talks to AWS. An endpoint that a Leaderboard names goes before one of the environment.
 //! Endpoints with a bare host name get path-style buckets.
 
+use std::ffi::OsString;
 use std::sync::Arc;
 use std::time::Duration;
 
@@ -23,6 +24,27 @@ pub const USUAL_REGION: &str = "us-east-1";
 const OPERATION_TIMEOUT: Duration = Duration::from_mins(1);
 /// Time one try may take.
 const ATTEMPT_TIMEOUT: Duration = Duration::from_secs(20);
+
+/// A variable with an endpoint that no log may show.
+#[derive(thiserror::Error, Debug, PartialEq, Eq)]
+#[error(
+    "{0} may hold neither a query nor credentials, since logs show it: AWS_ACCESS_KEY_ID and AWS_SECRET_ACCESS_KEY, or a role, sign what is \
+     asked there"
+)]
+pub struct UnfitEndpoint(String);
+
+/// Refuses an endpoint of the environment that is no plain one, as the API does one of a Leaderboard.
+pub fn check_endpoints(variables: impl IntoIterator<Item = (OsString, OsString)>) -> Result<(), UnfitEndpoint> {
+    let texts = variables.into_iter().map(|(name, value)| {
+        let text = |part: OsString| part.to_string_lossy().into_owned();
+        (text(name), text(value))
+    });
+    let mut endpoints = texts.filter(|(name, _)| name.starts_with("AWS_ENDPOINT_URL"));
+    match endpoints.find(|(_, value)| value.contains(['?', '#', '@'])) {
+        Some((name, _)) => Err(UnfitEndpoint(name)),
+        None => Ok(()),
+    }
+}
 
 /// The configuration of one service with an endpoint, where one is given. It is set here and not in the shared
 /// configuration, because of that one the SDK prefers `AWS_ENDPOINT_URL` and the profile's `endpoint_url`.
