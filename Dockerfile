@@ -1,4 +1,3 @@
-# syntax=docker/dockerfile:1
 # The operator's image, for those who have a container engine: `docker build -t leaderboard-operator:dev .`
 # `make image` makes the same one without an engine; local/operator-image.toml is its list of files.
 
@@ -24,10 +23,13 @@ RUN --mount=type=cache,target=/usr/local/cargo/registry --mount=type=cache,targe
        cargo build --locked --release --target "$triple" -p leaderboard-runner \
     && install -D -t /out "target/$PROFILE/leaderboard-operator" "target/$triple/release/leaderboard-runner"
 
-# Has the C library, the authorities for TLS, the user 65532, and no shell.
+# Has the C library, the authorities for TLS, and no shell.
 FROM ${BASE_IMAGE}
 COPY --from=build /out/leaderboard-operator /out/leaderboard-runner /usr/local/bin/
 # One heap for all threads, given back early: next to 1,000 submissions a restart leaves 19 MB in it instead of 24.
 ENV MALLOC_ARENA_MAX=1 MALLOC_TRIM_THRESHOLD_=131072
-USER 65532:65532
+# Not the 65532 of the base: the kernel counts what a user holds over all containers of a node, and many images run as that one.
+USER 60973:60973
+# The base's own folder belongs to its user.
+WORKDIR /
 ENTRYPOINT ["leaderboard-operator"]

@@ -1,9 +1,12 @@
-//! What Leaderboards may name where the operator acts with an AWS identity of its own: entries of Secrets Manager, and queues. Pure.
+//! What Leaderboards may name where the operator acts with an AWS identity of its own: entries of Secrets Manager, queues, buckets, tables
+//! and log groups. Pure.
 //!
-//! Who may edit Leaderboards in one namespace could otherwise have any entry sent to a server of their own, and any queue emptied. The
-//! chart hands in what `leaderboards[]` of its values has; without it, as on a person's machine, everything is allowed. Asked by the
-//! controller, which then reads no token and shows `NotAllowed`, and by the bridge, which then reads no queue.
+//! Who may edit Leaderboards in one namespace could otherwise have any entry sent to a server of their own, any queue emptied, and the
+//! results and rows of another namespace read and replaced. The chart hands in what `leaderboards[]` of its values has; without it, as on a
+//! person's machine, everything is allowed. Asked by the controller, which then reads no token, starts and records no run, and shows
+//! `NotAllowed`, and by the bridge, which then reads no queue.
 
+use std::borrow::Cow;
 use std::collections::BTreeMap;
 use std::fmt;
 use std::str::FromStr;
@@ -27,6 +30,12 @@ struct Patterns {
     secrets_manager: Vec<String>,
     #[serde(default)]
     queues: Vec<String>,
+    #[serde(default)]
+    buckets: Vec<String>,
+    #[serde(default)]
+    tables: Vec<String>,
+    #[serde(default)]
+    log_groups: Vec<String>,
 }
 
 /// What a Leaderboard names and may not.
@@ -42,6 +51,9 @@ enum Kind {
     Entry,
     Queue,
     DeadLetterQueue,
+    Bucket,
+    Table,
+    LogGroup,
 }
 
 impl fmt::Display for NotAllowed {
@@ -50,6 +62,9 @@ impl fmt::Display for NotAllowed {
             Kind::Entry => ("entry of Secrets Manager", "secretsManager"),
             Kind::Queue => ("queue", "queues"),
             Kind::DeadLetterQueue => ("dead-letter queue", "queues"),
+            Kind::Bucket => ("bucket", "buckets"),
+            Kind::Table => ("table", "tables"),
+            Kind::LogGroup => ("log group", "logGroups"),
         };
         let Self { name, namespace, .. } = self;
         write!(
@@ -94,7 +109,7 @@ impl Allowed {
         let refused = named(leaderboard).find(|(kind, name)| !patterns.allow(*kind, name));
         refused.map(|(kind, name)| NotAllowed {
             kind,
-            name: name.to_owned(),
+            name: name.into_owned(),
             namespace: namespace.to_owned(),
         })
     }
@@ -103,14 +118,17 @@ impl Allowed {
 impl Patterns {
     fn allow(&self, kind: Kind, name: &str) -> bool {
         match kind {
-            Kind::Entry => self.secrets_manager.iter().any(|pattern| matches(pattern, name)),
+            Kind::Entry => any(&self.secrets_manager, name),
             Kind::Queue | Kind::DeadLetterQueue => self.queues.iter().any(|pattern| is_queue(pattern, name)),
+            Kind::Bucket => self.buckets.iter().any(|pattern| is_bucket(pattern, name)),
+            Kind::Table => any(&self.tables, name),
+            Kind::LogGroup => any(&self.log_groups, name),
         }
     }
 }
 
 /// Everything that a Leaderboard names of what is allowed by name.
-fn named(leaderboard: &Leaderboard) -> impl Iterator<Item = (Kind, &str)> {
+fn named(leaderboard: &Leaderboard) -> impl Iterator<Item = (Kind, Cow<'_, str>)> {
     let spec = &leaderboard.spec;
     let entry = spec
         .evalai
@@ -121,7 +139,25 @@ fn named(leaderboard: &Leaderboard) -> impl Iterator<Item = (Kind, &str)> {
         let dead = queue.dead_letter_url.as_deref().map(|url| (Kind::DeadLetterQueue, url));
         [(Kind::Queue, queue.url.as_str())].into_iter().chain(dead)
     });
-    entries.chain(queues)
+    let table = spec.table.iter().map(|table| (Kind::Table, table.name.as_str()));
+    let group = spec.log_group.iter().map(|group| (Kind::LogGroup, group.name.as_str()));
+    let by_name = entries.chain(queues).chain(table).chain(group);
+    let prefix = spec.storage.prefix.as_deref().unwrap_or_default();
+    let bucket = format!("{}/{prefix}", spec.storage.bucket);
+    let by_name = by_name.map(|(kind, name)| (kind, Cow::Borrowed(name)));
+    by_name.chain([(Kind::Bucket, Cow::Owned(bucket))])
+}
+
+fn any(patterns: &[String], name: &str) -> bool {
+    patterns.iter().any(|pattern| matches(pattern, name))
+}
+
+/// A pattern with a slash is about bucket and prefix, any other one about the bucket with all that is in it.
+fn is_bucket(pattern: &str, place: &str) -> bool {
+    if pattern.contains('/') {
+        return matches(pattern, place);
+    }
+    matches(pattern, place.split('/').next().unwrap_or_default())
 }
 
 /// A pattern with a slash is about the whole URL, any other one about the queue's name, which is its end.
@@ -154,166 +190,5 @@ fn matches(pattern: &str, text: &str) -> bool {
 }
 
 #[cfg(test)]
-mod tests {
-    use serde_json::{Value, json};
-
-    use super::*;
-
-    fn leaderboard(namespace: &str, entry: Option<&str>, queue: Option<&str>, dead: Option<&str>) -> Leaderboard {
-        let token = match entry {
-            Some(id) => json!({"secretsManager": {"id": id}}),
-            None => json!({"secretKeyRef": {"name": "evalai", "key": "token"}}),
-        };
-        let mut spec = json!({
-            "leaderboardVersion": "V2", "tracks": [{"name": "sensors", "codename": "SENSORS", "phase": 1}],
-            "contents": {"image": "contents"}, "simulator": {"image": "simulator"}, "storage": {"bucket": "bucket"},
-            "evalai": {"apiServer": "https://eval.ai", "challenge": 1, "token": token},
-        });
-        if let Some(url) = queue {
-            spec["queue"] = json!({"url": url});
-            spec["queue"]["deadLetterURL"] = dead.map_or(Value::Null, Value::from);
-        }
-        let object = json!({
-            "apiVersion": "leaderboard.carla.org/v1alpha1", "kind": "Leaderboard",
-            "metadata": {"name": "lb", "namespace": namespace}, "spec": spec,
-        });
-        serde_json::from_value(object).unwrap()
-    }
-
-    fn kind(allowed: &str, leaderboard: &Leaderboard) -> Option<Kind> {
-        let allowed: Allowed = allowed.parse().unwrap();
-        allowed.refusal(leaderboard).map(|refused| refused.kind)
-    }
-
-    const QUEUE: &str = "https://sqs.us-east-1.amazonaws.com/123456789012/submissions";
-    const DEAD: &str = "https://sqs.us-east-1.amazonaws.com/123456789012/submissions-dead";
-
-    #[test]
-    fn what_a_leaderboard_names_must_be_allowed_in_its_own_namespace() {
-        let ours = r#"{"ours": {"secretsManager": ["evalai/*"], "queues": ["submissions", "*-dead"]}, "theirs": {"queues": ["*"]}}"#;
-        let (queue_2, dead_2) = (format!("{QUEUE}-2"), format!("{DEAD}-2"));
-        let entry = Some("evalai/token");
-        let cases = [
-            (("ours", None, None, None), None),
-            (("ours", entry, Some(QUEUE), Some(DEAD)), None),
-            (("ours", Some("payroll"), Some(QUEUE), None), Some(Kind::Entry)),
-            (("ours", None, Some(queue_2.as_str()), None), Some(Kind::Queue)),
-            (
-                ("ours", None, Some(QUEUE), Some(dead_2.as_str())),
-                Some(Kind::DeadLetterQueue),
-            ),
-            (("theirs", entry, None, None), Some(Kind::Entry)),
-            (("theirs", None, Some(QUEUE), Some(DEAD)), None),
-            (("nobodys", None, None, None), None),
-            (("nobodys", None, Some(QUEUE), None), Some(Kind::Queue)),
-            (("nobodys", entry, None, None), Some(Kind::Entry)),
-        ];
-        for ((namespace, entry, queue, dead), expected) in cases {
-            let found = kind(ours, &leaderboard(namespace, entry, queue, dead));
-            assert_eq!(found, expected, "{namespace} {entry:?} {queue:?} {dead:?}");
-        }
-    }
-
-    #[test]
-    fn without_a_setting_everything_is_allowed_and_with_an_empty_one_nothing() {
-        let leaderboard = leaderboard("ours", Some("payroll"), Some(QUEUE), Some(DEAD));
-        assert_eq!(kind("", &leaderboard), None);
-        assert_eq!(Allowed::default().refusal(&leaderboard), None);
-        assert_eq!(kind("{}", &leaderboard), Some(Kind::Entry));
-    }
-
-    #[test]
-    fn the_star_is_for_namespaces_without_an_entry() {
-        let allowed = r#"{"*": {"queues": ["shared-*"]}, "ours": {"queues": ["submissions"]}}"#;
-        let shared = "https://sqs.us-east-1.amazonaws.com/123456789012/shared-1";
-        assert_eq!(kind(allowed, &leaderboard("any", None, Some(shared), None)), None);
-        assert_eq!(
-            kind(allowed, &leaderboard("ours", None, Some(shared), None)),
-            Some(Kind::Queue)
-        );
-        assert_eq!(
-            kind(allowed, &leaderboard("any", None, Some(QUEUE), None)),
-            Some(Kind::Queue)
-        );
-    }
-
-    #[test]
-    fn patterns_match_whole_texts() {
-        let cases = [
-            ("evalai", "evalai", true),
-            ("evalai", "evalai2", false),
-            ("evalai", "my-evalai", false),
-            ("*", "", true),
-            ("*", "anything/at:all", true),
-            ("evalai/*", "evalai/token", true),
-            ("evalai/*", "evalai/", true),
-            ("evalai/*", "other/evalai/token", false),
-            ("*-dead", "submissions-dead", true),
-            ("*-dead", "submissions-dead-2", false),
-            ("a*b*c", "abc", true),
-            ("a*b*c", "a-b-b-c", true),
-            ("a*b*c", "acb", false),
-            ("ab*ba", "aba", false),
-            ("a**c", "abc", true),
-            ("", "", true),
-            ("", "a", false),
-        ];
-        for (pattern, text, expected) in cases {
-            assert_eq!(matches(pattern, text), expected, "{pattern} {text}");
-        }
-    }
-
-    #[test]
-    fn a_queue_is_known_by_its_name_or_by_its_url() {
-        let account = "https://sqs.us-east-1.amazonaws.com/123456789012/*";
-        let cases = [
-            ("submissions", QUEUE, true),
-            (account, QUEUE, true),
-            (
-                account,
-                "https://sqs.us-east-1.amazonaws.com/999999999999/submissions",
-                false,
-            ),
-            (
-                "submissions",
-                "https://sqs.us-east-1.amazonaws.com/123456789012/payroll?/submissions",
-                false,
-            ),
-            (
-                "submissions",
-                "https://sqs.us-east-1.amazonaws.com/123456789012/payroll#/submissions",
-                false,
-            ),
-            ("123456789012", QUEUE, false),
-        ];
-        for (pattern, url, expected) in cases {
-            assert_eq!(is_queue(pattern, url), expected, "{pattern} {url}");
-        }
-    }
-
-    #[test]
-    fn a_refusal_names_what_is_refused_and_the_next_step() {
-        let allowed: Allowed = r#"{"ours": {}}"#.parse().unwrap();
-        let refused = allowed
-            .refusal(&leaderboard("ours", Some("payroll"), None, None))
-            .unwrap();
-        assert_eq!(
-            refused.to_string(),
-            "Leaderboards of the namespace ours may not name the entry of Secrets Manager payroll: the operator's administrator allows it \
-             in the chart's values, under leaderboards[] of this namespace in secretsManager."
-        );
-    }
-
-    #[test]
-    fn a_setting_that_cannot_be_read_is_an_error_and_allows_nothing() {
-        for text in [
-            "nonsense",
-            "[]",
-            r#"{"ours": {"queue": []}}"#,
-            r#"{"ours": {"queues": "submissions"}}"#,
-        ] {
-            let error = text.parse::<Allowed>().unwrap_err();
-            assert!(error.to_string().contains("\"queues\": []"), "{error}");
-        }
-    }
-}
+#[path = "allowed_tests.rs"]
+mod tests;

@@ -17,7 +17,7 @@ ACTIONS: Mapping[str, tuple[str, ...]] = {
     "head_object": ("s3:GetObject",),
     "list_objects_v2": ("s3:ListBucket",),
     "put_object": ("s3:PutObject",),
-    "delete_objects": ("s3:DeleteObject",),
+    "delete_object": ("s3:DeleteObject",),
     "create_multipart_upload": ("s3:PutObject",),
     "upload_part": ("s3:PutObject",),
     "upload_part_copy": ("s3:GetObject", "s3:PutObject"),

@@ -37,10 +37,10 @@ S3: Mapping[tuple[str, str], str] = {
     ("PUT", ""): "put_object",
     ("POST", "uploads"): "create_multipart_upload",
     ("POST", "uploadId"): "complete_multipart_upload",
-    ("POST", "delete"): "delete_objects",
+    ("DELETE", ""): "delete_object",
     ("DELETE", "uploadId"): "abort_multipart_upload",
 }
-QUERIES = ("list-type", "partNumber", "uploads", "uploadId", "delete")
+QUERIES = ("list-type", "partNumber", "uploads", "uploadId")
 # Allowed and maybe not called in a run of the cluster's tests, and why it is allowed all the same.
 RARE: Mapping[tuple[str, str], str] = {
     (
@@ -87,8 +87,7 @@ def call_of(method: str, path: str, query: str, headers: Mapping[str, str], body
     if operation == "upload_part" and "x-amz-copy-source" in headers:
         operation = "upload_part_copy"
     key = unquote(path).lstrip("/").partition("/")[2]
-    # Which objects are deleted together is in the body; the bucket's name alone stands in the path.
-    about = "object/" if operation == "delete_objects" else f"object/{key}" if key else "bucket"
+    about = f"object/{key}" if key else "bucket"
     return Call(agent[1], operation, about)
 
 

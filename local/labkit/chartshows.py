@@ -206,7 +206,7 @@ IMAGE = [
     ),
     case(
         {"podSecurityContext": {"runAsNonRoot": True, "seccompProfile": {"type": "Unconfined"}}},
-        (BRIDGE, f"{POD}.securityContext", {"runAsUser": 65532, "seccompProfile": {"type": "Unconfined"}}),
+        (BRIDGE, f"{POD}.securityContext", {"runAsUser": 60973, "seccompProfile": {"type": "Unconfined"}}),
     ),
     case(
         {
@@ -231,7 +231,7 @@ PROGRAMS = [
         (
             BRIDGE,
             f"{CONTAINER}.env",
-            [env("LEADERBOARD_ALLOWED", '{"*":{"queues":["shared-*"],"secretsManager":[]}}')],
+            [env("LEADERBOARD_ALLOWED", '{"*":{"queues":["shared-*"]}}')],
         ),
         (f"ClusterRoleBinding/{RELEASE}-bridge", "roleRef.kind", "ClusterRole"),
         (f"Role/{RELEASE}-controller", "", ABSENT),
@@ -257,6 +257,9 @@ PROGRAMS = [
                     "secrets": ["evalai"],
                     "secretsManager": ["evalai/*"],
                     "queues": ["submissions*"],
+                    "buckets": ["results/boards/*"],
+                    "tables": ["rows"],
+                    "logGroups": ["logs"],
                 }
             ]
         },
@@ -266,7 +269,11 @@ PROGRAMS = [
             [
                 env("LEADERBOARD_NAMESPACES", "boards"),
                 env("LEADERBOARD_CLUSTER_RIGHTS", "true"),
-                env("LEADERBOARD_ALLOWED", '{"boards":{"queues":["submissions*"],"secretsManager":["evalai/*"]}}'),
+                env(
+                    "LEADERBOARD_ALLOWED",
+                    '{"boards":{"buckets":["results/boards/*"],"logGroups":["logs"],"queues":["submissions*"],'
+                    '"secretsManager":["evalai/*"],"tables":["rows"]}}',
+                ),
             ],
         ),
         (f"Role/{RELEASE}-controller", "metadata.namespace", "boards"),

@@ -153,10 +153,10 @@ class Policies(unittest.TestCase):
         for program, calls in (
             ("controller", {"get_object", "put_object", "list_objects_v2", "update_item", "get_authorization_token"}),
             ("bridge", {"receive_message", "send_message"}),
-            ("submission-worker", {"upload_part_copy", "delete_objects", "put_log_events"}),
+            ("submission-worker", {"upload_part_copy", "delete_object", "put_log_events"}),
         ):
             self.assertLessEqual(calls, source().of_program(program), program)
-        self.assertNotIn("delete_objects", source().of_program("controller"))
+        self.assertNotIn("delete_object", source().of_program("controller"))
         self.assertNotIn("put_object", source().of_program("bridge"))
 
     def test_every_reason_of_an_indirect_action_is_used(self) -> None:

@@ -71,8 +71,8 @@ class Requests(unittest.TestCase):
             ("POST", "/b/k", "uploads", "create_multipart_upload", "object/k"),
             ("POST", "/b/k", "uploadId=u", "complete_multipart_upload", "object/k"),
             ("DELETE", "/b/k", "uploadId=u", "abort_multipart_upload", "object/k"),
-            ("POST", "/b", "delete", "delete_objects", "object/"),
-            ("DELETE", "/b/k", "", "DELETE", "object/k"),
+            ("DELETE", "/b/k", "", "delete_object", "object/k"),
+            ("POST", "/b", "delete", "POST", "bucket"),
         ):
             self.assertEqual(s3(method, path, query), Call("logcopy", operation, resource), (method, path, query))
         copy = s3("PUT", "/b/k", "partNumber=2&uploadId=u", x_amz_copy_source="b/k")

@@ -39,7 +39,7 @@ def layer_of(*entries: Entry) -> enginecheck.Layer:
 
 BASE = layer_of(Entry("/lib64/ld.so", 0o755, b"loader"), Entry("/etc/passwd", 0o644, b"root"))
 PROGRAMS = (Entry(OPERATOR, 0o755, program("/lib64/ld.so")), Entry(RUNNER, 0o755, program(None)))
-CONFIG = {"Entrypoint": ["leaderboard-operator"], "User": "65532:65532", "Env": ["A=b", "PATH=/bin:/usr/local/bin"]}
+CONFIG = {"Entrypoint": ["leaderboard-operator"], "User": "60973:60973", "Env": ["A=b", "PATH=/bin:/usr/local/bin"]}
 
 
 def faults(*entries: Entry, **config: object) -> list[str]:

@@ -100,6 +100,10 @@ class Workflows(unittest.TestCase):
             self.assertRegex(dockerfile, rf"(?m)^ARG {name}=\S+:\S+$")
             self.assertIn(f'--build-arg "{name}=${name}"', self.release)
 
+    def test_no_dockerfile_of_a_release_takes_its_frontend_by_a_tag(self) -> None:
+        for name in ("Dockerfile", "local/quickstart/Dockerfile"):
+            self.assertNotRegex((REPOSITORY / name).read_text(), r"(?m)^# *syntax=", name)
+
     def test_advisories_are_asked_for_every_week_and_before_a_release(self) -> None:
         weekly = (WORKFLOWS / "advisories.yml").read_text()
         self.assertIn("- cron:", weekly)
@@ -107,8 +111,24 @@ class Workflows(unittest.TestCase):
         self.assertIn("cargo deny --locked check\n", self.release)
 
     def test_images_and_chart_and_checksums_are_signed(self) -> None:
-        for signed in ('"$IMAGE@$digest"', '"$CHARTS/leaderboard-operator@$digest"', "checksums.txt"):
+        for signed in ('"$IMAGE@$digest"', '"$made"', "checksums.txt"):
             self.assertRegex(self.release, rf"cosign sign(-blob)? --yes .*{re.escape(signed)}")
+        # Images and charts that are pushed elsewhere are handed to the job that signs it.
+        for pushed in ('"$IMAGE@$digest" > "made/${IMAGE##*/}"', '"$CHARTS/leaderboard-operator@$digest" > made/chart'):
+            self.assertIn(f"echo {pushed}\n", self.release)
+
+    def test_no_job_that_builds_may_sign_or_publish(self) -> None:
+        powers = ("id-token: write", "attestations: write", "contents: write")
+        jobs = dict(
+            re.findall(r"^  (\w+):\n((?:(?:    .*)?\n|  #.*\n)+)", self.release.split("\njobs:\n")[1], re.MULTILINE)
+        )
+        self.assertIn("draft", jobs)
+        mighty = {name for name, text in jobs.items() if any(power in text for power in powers)}
+        self.assertEqual(mighty, {"index", "sign", "draft"})
+        for name in mighty:
+            # Neither the repository's programs nor those of a registry of packages.
+            for word in ("checkout", "cargo", "rustup", "make ", "local/", "buildx build", "npm", "pip"):
+                self.assertNotIn(word, jobs[name], f"{name}: {word}")
 
 
 class Crates(unittest.TestCase):

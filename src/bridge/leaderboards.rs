@@ -71,7 +71,8 @@ mod tests {
             desired(&served).into_keys().collect()
         };
         assert_eq!(urls(""), ["https://q/ours", "https://q/theirs"]);
-        assert_eq!(urls(r#"{"*": {"queues": ["ours"]}}"#), ["https://q/ours"]);
+        let ours = r#"{"*": {"queues": ["ours"], "buckets": ["*"]}}"#;
+        assert_eq!(urls(ours), ["https://q/ours"]);
         assert_eq!(urls("{}"), Vec::<String>::new());
     }
 }

@@ -19,6 +19,7 @@ use crate::allowed::Allowed;
 use crate::controller::runtime::leader::{self, Identity};
 use crate::observability::REVISION;
 use crate::observability::logging::Format;
+use crate::services::aws;
 
 /// The port that `--dashboard` alone stands for.
 const PAGE_PORT: &str = "8081";
@@ -59,6 +60,15 @@ enum Command {
     Import(Box<import::Import>),
     /// Print the schema of a phase's leaderboard in EvalAI.
     Labels(labels::Labels),
+}
+
+impl Command {
+    fn asks_aws(&self) -> bool {
+        match self {
+            Self::Controller(_) | Self::Bridge(_) | Self::Workspace(_) | Self::Logcopy(_) | Self::Import(_) => true,
+            Self::Preflight(_) | Self::Crd | Self::Results(_) | Self::Labels(_) => false,
+        }
+    }
 }
 
 /// What the servers have in common.
@@ -150,6 +160,12 @@ fn version_of(revision: &str) -> String {
 /// Runs what the command line asks for.
 pub fn run() -> ExitCode {
     let cli = Cli::parse();
+    if cli.command.asks_aws()
+        && let Err(fault) = aws::check_endpoints(std::env::vars_os())
+    {
+        eprintln!("leaderboard-operator: {fault}");
+        return ExitCode::FAILURE;
+    }
     match cli.command {
         Command::Crd => offline::print_crds(),
         Command::Results(results) => results.run(),

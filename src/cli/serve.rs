@@ -24,7 +24,7 @@ use crate::observability::{Observability, REVISION};
 use crate::page::Page;
 use crate::pod::places::{Pace, Places, Setting};
 use crate::pod::{logcopy as logcopy_program, ownlog, workspace as workspace_program};
-use crate::services::aws::Aws;
+use crate::services::aws::{Aws, ENV_CHECKSUMS};
 use leaderboard_api::client_errors;
 use leaderboard_api::names::OPERATOR;
 
@@ -138,6 +138,7 @@ async fn lead(options: Controller) -> Result<(), String> {
         image: options.image,
         image_pull_policy: options.image_pull_policy,
         region: aws.region(),
+        checksums: std::env::var(ENV_CHECKSUMS).ok(),
         operator: lease.installation(),
         namespaces: Namespaces::of(options.server.namespaces),
         has_cluster_rights: options.scope.cluster_rights,

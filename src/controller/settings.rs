@@ -12,6 +12,8 @@ pub struct Settings {
     pub image_pull_policy: Option<String>,
     /// AWS region of the operator, handed on to Pods.
     pub region: Option<String>,
+    /// When S3 is sent checksums, as the operator's environment has it; handed on to Pods.
+    pub checksums: Option<String>,
     /// Name of this installation, `<namespace>/<name>` of its Lease.
     pub operator: String,
     /// Which namespaces are served.

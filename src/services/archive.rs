@@ -11,7 +11,7 @@ mod upload;
 
 use aws_sdk_s3::error::{ProvideErrorMetadata, SdkError};
 use aws_sdk_s3::primitives::ByteStream;
-use aws_sdk_s3::types::{Delete, ObjectIdentifier};
+use futures::stream::{self, StreamExt, TryStreamExt};
 use hyper::body::Bytes;
 use tokio::io::AsyncWriteExt;
 
@@ -26,8 +26,8 @@ pub(crate) use upload::read_range;
 
 use keeping::Keeping;
 
-/// Keys one DeleteObjects takes.
-const DELETE_PAGE: usize = 1000;
+/// Objects that are removed side by side.
+const DELETIONS_AT_ONCE: usize = 8;
 /// Times that an object is sent which another one gets ahead of.
 const REPLACE_TRIES: u32 = 5;
 type HttpResponse = aws_sdk_s3::config::http::HttpResponse;
@@ -286,27 +286,22 @@ impl Archive {
         Ok(self.list("", 1).await?.objects.is_empty())
     }
 
-    /// Removes objects; ones that are not there are fine.
+    /// Removes objects; ones that are not there are fine. One by one, because the request that removes many is one that cannot go without
+    /// a checksum, which some stores refuse.
     pub async fn delete(&self, keys: &[String]) -> Result<(), ArchiveError> {
-        const OP: &str = "deleting";
-        for page in keys.chunks(DELETE_PAGE) {
-            let first = page.first().map_or("", String::as_str);
-            let refused = |text: String| self.error(OP, first, Cause::Refused(text));
-            let objects: Result<Vec<_>, _> = page
-                .iter()
-                .map(|key| ObjectIdentifier::builder().key(self.full(key)).build())
-                .collect();
-            let objects = objects.map_err(|e| refused(e.to_string()))?;
-            let delete = Delete::builder().set_objects(Some(objects)).quiet(true).build();
-            let delete = delete.map_err(|e| refused(e.to_string()))?;
-            let request = self.client.delete_objects().bucket(&self.bucket).delete(delete);
-            let output = request.send().await.map_err(|e| self.failed(OP, first, &e))?;
-            if let Some(error) = output.errors().first() {
-                let text = error.message().or(error.code()).unwrap_or("no reason given");
-                return Err(refused(text.to_owned()));
-            }
+        let removals = keys.iter().map(|key| self.remove(key));
+        stream::iter(removals)
+            .buffer_unordered(DELETIONS_AT_ONCE)
+            .try_collect()
+            .await
+    }
+
+    async fn remove(&self, key: &str) -> Result<(), ArchiveError> {
+        let request = self.client.delete_object().bucket(&self.bucket).key(self.full(key));
+        match request.send().await {
+            Err(error) if !is_absent(&error) => Err(self.failed("deleting", key, &error)),
+            Ok(_) | Err(_) => Ok(()),
         }
-        Ok(())
     }
 
     /// S3 answers 403 for a missing object to whom may list one prefix only. The list of that prefix distinguishes the two.

@@ -3,23 +3,48 @@
 //! Called by everything that talks to AWS. An endpoint that a Leaderboard names goes before one of the environment.
 //! Endpoints with a bare host name get path-style buckets.
 
+use std::ffi::OsString;
 use std::sync::Arc;
 use std::time::Duration;
 
 use aws_config::retry::RetryConfig;
 use aws_config::{AppName, BehaviorVersion, Region, SdkConfig};
+use aws_sdk_s3::config::{RequestChecksumCalculation, ResponseChecksumValidation};
 use aws_smithy_http_client::tls::{Provider, rustls_provider::CryptoMode};
 
 use super::meter::Meter;
 use super::names::{Addresses, Given, Names};
 use leaderboard_api::names::OPERATOR;
 
+/// Variable of the SDK that says when S3 is sent a checksum: `when_supported`, or `when_required` for stores that know none.
+pub const ENV_CHECKSUMS: &str = "AWS_REQUEST_CHECKSUM_CALCULATION";
 /// Where nothing sets the region.
 pub const USUAL_REGION: &str = "us-east-1";
 /// Time an AWS call may take, with its retries.
 const OPERATION_TIMEOUT: Duration = Duration::from_mins(1);
 /// Time one try may take.
 const ATTEMPT_TIMEOUT: Duration = Duration::from_secs(20);
+
+/// A variable with an endpoint that no log may show.
+#[derive(thiserror::Error, Debug, PartialEq, Eq)]
+#[error(
+    "{0} may hold neither a query nor credentials, since logs show it: AWS_ACCESS_KEY_ID and AWS_SECRET_ACCESS_KEY, or a role, sign what is \
+     asked there"
+)]
+pub struct UnfitEndpoint(String);
+
+/// Refuses an endpoint of the environment that is no plain one, as the API does one of a Leaderboard.
+pub fn check_endpoints(variables: impl IntoIterator<Item = (OsString, OsString)>) -> Result<(), UnfitEndpoint> {
+    let texts = variables.into_iter().map(|(name, value)| {
+        let text = |part: OsString| part.to_string_lossy().into_owned();
+        (text(name), text(value))
+    });
+    let mut endpoints = texts.filter(|(name, _)| name.starts_with("AWS_ENDPOINT_URL"));
+    match endpoints.find(|(_, value)| value.contains(['?', '#', '@'])) {
+        Some((name, _)) => Err(UnfitEndpoint(name)),
+        None => Ok(()),
+    }
+}
 
 /// The configuration of one service with an endpoint, where one is given. It is set here and not in the shared
 /// configuration, because of that one the SDK prefers `AWS_ENDPOINT_URL` and the profile's `endpoint_url`.
@@ -121,7 +146,12 @@ impl Aws {
 
     /// A client of S3. An endpoint of one's own gets path-style addresses: its buckets have no host names.
     pub fn s3(&self, region: Option<&str>, endpoint: Option<&str>) -> aws_sdk_s3::Client {
-        let config = own!(aws_sdk_s3, self.config(region), endpoint).force_path_style(endpoint.is_some());
+        let shared = self.config(region);
+        let mut config = own!(aws_sdk_s3, shared, endpoint).force_path_style(endpoint.is_some());
+        if shared.request_checksum_calculation() == Some(RequestChecksumCalculation::WhenRequired) {
+            // A store that takes no checksum is not asked for one either.
+            config = config.response_checksum_validation(ResponseChecksumValidation::WhenRequired);
+        }
         aws_sdk_s3::Client::from_conf(config.build())
     }
 

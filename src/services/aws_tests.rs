@@ -101,3 +101,22 @@ async fn without_an_endpoint_of_ones_own_the_machines_counts() {
     let _ = aws.sts(None).get_caller_identity().send().await;
     assert_eq!(machine.take(), 1, "STS has no endpoint in the API");
 }
+
+#[test]
+fn an_endpoint_of_the_environment_holds_no_credentials() {
+    let checked = |name: &str, value: &str| check_endpoints([(name.into(), value.into())]);
+    for plain in ["http://10.77.0.1:4566", "https://s3.example.org/path", ""] {
+        assert_eq!(checked("AWS_ENDPOINT_URL", plain), Ok(()), "{plain}");
+    }
+    for unfit in [
+        "http://user:secret@s3:9000",
+        "https://s3.example.org/?key=secret",
+        "https://s3.example.org/#secret",
+    ] {
+        assert_eq!(checked("AWS_CONTAINER_CREDENTIALS_FULL_URI", unfit), Ok(()));
+        for name in ["AWS_ENDPOINT_URL", "AWS_ENDPOINT_URL_S3"] {
+            let fault = checked(name, unfit).unwrap_err().to_string();
+            assert!(fault.starts_with(name) && !fault.contains("secret@"), "{fault}");
+        }
+    }
+}

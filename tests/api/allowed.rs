@@ -46,7 +46,7 @@ async fn until_says(world: &World, reason: &str, part: &str) -> String {
 async fn a_leaderboard_that_names_what_it_may_not_is_not_ready_until_it_does_not() {
     let world = World::new().await;
     let namespace = &world.namespace;
-    let allowed = json!({ namespace: {"queues": ["submissions"], "secretsManager": []} });
+    let allowed = json!({ namespace: {"queues": ["submissions"], "buckets": [world.bucket]} });
     let settings = Settings {
         allowed: allowed.to_string().parse().unwrap(),
         ..operator::settings(namespace)
@@ -67,7 +67,16 @@ async fn a_leaderboard_that_names_what_it_may_not_is_not_ready_until_it_does_not
     until_says(&world, reasons::NOT_ALLOWED, "Secrets Manager payroll").await;
 
     let secret = json!({"secretsManager": null, "secretKeyRef": {"name": "evalai", "key": "token"}});
-    change(&world, &json!({"evalai": {"token": secret}})).await;
+    change(
+        &world,
+        &json!({"evalai": {"token": secret}, "table": {"name": "theirs"}}),
+    )
+    .await;
+    until_says(&world, reasons::NOT_ALLOWED, "the table theirs").await;
+    change(&world, &json!({"table": null, "logGroup": {"name": "theirs"}})).await;
+    until_says(&world, reasons::NOT_ALLOWED, "the log group theirs").await;
+
+    change(&world, &json!({"logGroup": null})).await;
     until_says(&world, reasons::READY, "").await;
     world.job(&name, 0).await;
     operator.end().await;

@@ -124,6 +124,7 @@ pub fn settings(namespace: &str) -> Settings {
         image: "operator:1".into(),
         image_pull_policy: None,
         region: Some("us-east-1".into()),
+        checksums: None,
         operator: format!("{namespace}/{LEASE_NAME}"),
         namespaces: Namespaces::of([namespace.to_owned()]),
         has_cluster_rights: false,

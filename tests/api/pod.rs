@@ -2,6 +2,7 @@
 //! or another Pod has taken over.
 
 mod archives;
+mod checksums;
 mod cloudwatch;
 mod endpoints;
 mod hostile;
@@ -35,7 +36,7 @@ use leaderboard_operator::pod::upload::wanted::Wanted;
 use leaderboard_operator::pod::upload::{Haste, Object};
 use leaderboard_operator::pod::workspace::{self, WorkspaceError, WorkspaceReason, WorkspaceVerdict};
 use leaderboard_operator::pod::{identity, ship};
-use leaderboard_operator::services::archive::{Archive, Cause, Fetched};
+use leaderboard_operator::services::archive::{Archive, Cause, Fetched, Kept};
 use leaderboard_operator::services::aws::Aws;
 use leaderboard_operator::services::logs::LogClient;
 use leaderboard_runner::protocol::{Mark, Member, Pair, Side, StatusFile};

@@ -68,6 +68,7 @@ pub fn all() -> Vec<Case> {
         networks(),
         identities_and_tables(),
         sizes_and_images(),
+        endpoints(),
         gpu::all(),
         submissions::all(),
     ]
@@ -299,16 +300,16 @@ fn server() -> Vec<Case> {
         case("without /api", &under_path, &at("https://eval.ai/api/")),
         case("without /api", &root, &at("https://eval.ai/evalai/api/jobs")),
         case(
-            "neither a query nor credentials",
+            "evalai.apiServer may hold neither",
             &root,
             &at("https://host:secret@eval.ai"),
         ),
         case(
-            "neither a query nor credentials",
+            "evalai.apiServer may hold neither",
             &root,
             &at("https://eval.ai/?token=x"),
         ),
-        case("neither a query nor credentials", &root, &at("https://eval.ai/#x")),
+        case("evalai.apiServer may hold neither", &root, &at("https://eval.ai/#x")),
         case(one_place, &served(&json!({})), &in_manager),
         case(one_place, &served(&json!({})), &nowhere),
     ]
@@ -390,6 +391,43 @@ fn identities_and_tables() -> Vec<Case> {
         case("are set together", &both, &table(&Value::Null)),
         case("are the same key", &both, &table(&json!("team_id"))),
     ]
+}
+
+/// A password in any of these would be shown by conditions and logs.
+fn endpoints() -> Vec<Case> {
+    let storage = |endpoint: &str| json!({"storage": {"endpoint": endpoint}});
+    let table = |endpoint: &str| json!({"table": {"name": "rows", "endpoint": endpoint}});
+    let group = |endpoint: &str| json!({"logGroup": {"name": "logs", "endpoint": endpoint}});
+    let entry = |endpoint: &str| {
+        let manager = json!({"id": "evalai", "endpoint": endpoint});
+        served(&json!({"evalai": {"token": {"secretsManager": manager, "secretKeyRef": null}}}))
+    };
+    let queue = |field: &str, url: &str| {
+        let mut queue = json!({"url": "https://sqs.example.org/1/a", "deadLetterURL": "https://sqs.example.org/1/b"});
+        queue[field] = url.into();
+        served(&json!({ "queue": queue }))
+    };
+    let mut cases = Vec::new();
+    for bad in [
+        "http://user:secret@aws:4566",
+        "http://aws:4566/?key=secret",
+        "http://aws:4566/#secret",
+    ] {
+        let good = "http://aws:4566/path";
+        let mut case = |message, good: Value, bad: Value| cases.push(create(Leaderboard, message, &good, &bad));
+        case("storage.endpoint may hold neither", storage(good), storage(bad));
+        case("table.endpoint may hold neither", table(good), table(bad));
+        case("logGroup.endpoint may hold neither", group(good), group(bad));
+        case("secretsManager.endpoint may hold neither", entry(good), entry(bad));
+        for (field, message) in [
+            ("url", "queue.url may hold neither"),
+            ("deadLetterURL", "queue.deadLetterURL may hold neither"),
+            ("endpoint", "queue.endpoint may hold neither"),
+        ] {
+            case(message, queue(field, good), queue(field, bad));
+        }
+    }
+    cases
 }
 
 fn sizes_and_images() -> Vec<Case> {

@@ -130,6 +130,7 @@ impl World {
             image: image.into(),
             image_pull_policy: None,
             region: None,
+            checksums: None,
             operator: lease.installation(),
             namespaces: Namespaces::of([self.namespace.clone()]),
             has_cluster_rights: false,

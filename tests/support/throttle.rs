@@ -96,7 +96,8 @@ fn too_many(code: &str) -> Response<Body> {
     answer.body(Body::from(body)).unwrap()
 }
 
-async fn hand_on(http: &reqwest::Client, to: &str, request: Request) -> Response<Body> {
+/// Asks the server itself, and hands its answer back.
+pub async fn hand_on(http: &reqwest::Client, to: &str, request: Request) -> Response<Body> {
     let (parts, body) = request.into_parts();
     let body = axum::body::to_bytes(body, LARGEST).await.unwrap();
     let url = format!("{to}{}", parts.uri);

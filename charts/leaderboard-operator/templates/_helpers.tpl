@@ -79,8 +79,7 @@ annotations:
 {{- if and (eq .namespace "*") .secrets -}}
 {{- fail "leaderboards: Secrets are read in a namespace that has a name, and * is none: list the namespace" -}}
 {{- end -}}
-{{- $names := dict "secretsManager" (.secretsManager | default list) "queues" (.queues | default list) -}}
-{{- $allowed = set $allowed .namespace $names -}}
+{{- $allowed = set $allowed .namespace (omit . "namespace" "secrets") -}}
 {{- end -}}
 {{- toJson $allowed -}}
 {{- end -}}

@@ -14,6 +14,9 @@ use super::evalai_mode::EvalaiMode;
 use super::evalai_queue::EvalaiQueue;
 use super::keeping::StorageClass;
 
+/// Holds of an endpoint without a query and without credentials: it is shown in conditions, logs and reports.
+const PLAIN_ENDPOINT: &str = "!has(self.endpoint) || !(self.endpoint.contains('?') || self.endpoint.contains('#') || self.endpoint.contains('@'))";
+
 /// Who may read the tail of a failed submission's log in EvalAI.
 #[derive(Serialize, Deserialize, JsonSchema, Clone, Copy, Debug, Default, PartialEq, Eq)]
 pub enum LogTail {
@@ -98,7 +101,8 @@ pub struct SecretKey {
 }
 
 /// A key of a JSON object in AWS Secrets Manager.
-#[derive(Serialize, Deserialize, JsonSchema, Clone, Debug, PartialEq, Eq)]
+#[derive(Serialize, Deserialize, KubeSchema, Clone, Debug, PartialEq, Eq)]
+#[x_kube(validation = Rule::new(PLAIN_ENDPOINT).message("secretsManager.endpoint may hold neither a query nor credentials: the operator's own identity signs what it asks there"))]
 pub struct SecretsManagerKey {
     /// Name or ARN of the entry.
     #[schemars(length(min = 1, max = 2048))]
@@ -132,6 +136,9 @@ pub enum Foreign {
 #[serde(rename_all = "camelCase")]
 #[x_kube(
     validation = Rule::new("!has(self.deadLetterURL) || self.deadLetterURL != self.url").message("queue.deadLetterURL is the queue itself: a bad message would come back endlessly"),
+    validation = Rule::new("!(self.url.contains('?') || self.url.contains('#') || self.url.contains('@'))").message("queue.url may hold neither a query nor credentials: the operator's own identity signs what it asks there"),
+    validation = Rule::new("!has(self.deadLetterURL) || !(self.deadLetterURL.contains('?') || self.deadLetterURL.contains('#') || self.deadLetterURL.contains('@'))").message("queue.deadLetterURL may hold neither a query nor credentials: the operator's own identity signs what it sends there"),
+    validation = Rule::new(PLAIN_ENDPOINT).message("queue.endpoint may hold neither a query nor credentials: the operator's own identity signs what it asks there"),
     validation = Rule::new("!has(self.deadLetterURL) || self.url.endsWith('.fifo') == self.deadLetterURL.endsWith('.fifo')").message("a FIFO queue needs a FIFO dead-letter queue, a standard queue a standard one")
 )]
 pub struct Queue {
@@ -162,7 +169,10 @@ pub struct Queue {
 /// The S3 bucket of results and logs.
 #[derive(Serialize, Deserialize, KubeSchema, Clone, Debug, PartialEq, Eq)]
 #[serde(rename_all = "camelCase")]
-#[x_kube(validation = Rule::new("!has(self.sizeLimit) || (quantity(self.sizeLimit).compareTo(quantity('16Mi')) >= 0 && quantity(self.sizeLimit).compareTo(quantity('1Ti')) <= 0)").message("storage.sizeLimit must be 16Mi to 1Ti"))]
+#[x_kube(
+    validation = Rule::new("!has(self.sizeLimit) || (quantity(self.sizeLimit).compareTo(quantity('16Mi')) >= 0 && quantity(self.sizeLimit).compareTo(quantity('1Ti')) <= 0)").message("storage.sizeLimit must be 16Mi to 1Ti"),
+    validation = Rule::new(PLAIN_ENDPOINT).message("storage.endpoint may hold neither a query nor credentials: podIdentity and the operator's own identity sign what is asked there")
+)]
 pub struct Storage {
     /// Name of the bucket.
     #[schemars(length(min = 3, max = 63), regex(pattern = r"^[a-z0-9][a-z0-9.-]*[a-z0-9]$"))]
@@ -205,6 +215,7 @@ pub struct Storage {
 #[derive(Serialize, Deserialize, KubeSchema, Clone, Debug, PartialEq)]
 #[serde(rename_all = "camelCase")]
 #[x_kube(
+    validation = Rule::new(PLAIN_ENDPOINT).message("table.endpoint may hold neither a query nor credentials: the operator's own identity signs what it asks there"),
     validation = Rule::new("has(self.partitionKey) == has(self.sortKey)").message("table.partitionKey and table.sortKey are set together, or both are read from the table"),
     validation = Rule::new("!has(self.partitionKey) || !has(self.sortKey) || self.partitionKey != self.sortKey").message("table.partitionKey and table.sortKey are the same key")
 )]
@@ -235,6 +246,7 @@ pub struct Table {
 #[serde(rename_all = "camelCase")]
 #[x_kube(
     validation = Rule::new("!has(self.retentionDays) || self.retentionDays in [1, 3, 5, 7, 14, 30, 60, 90, 120, 150, 180, 365, 400, 545, 731, 1096, 1827, 2192, 2557, 2922, 3288, 3653]").message("logGroup.retentionDays must be a number of days that CloudWatch Logs knows: 1, 3, 5, 7, 14, 30, 60, 90, 120, 150, 180, 365, 400, 545, 731, 1096, 1827, 2192, 2557, 2922, 3288 or 3653"),
+    validation = Rule::new(PLAIN_ENDPOINT).message("logGroup.endpoint may hold neither a query nor credentials: podIdentity and the operator's own identity sign what is asked there"),
     validation = Rule::new("!has(self.tags) || has(self.retentionDays)").message("logGroup.tags are for a group that the controller makes: set logGroup.retentionDays too, or tag the group yourself")
 )]
 pub struct LogGroup {

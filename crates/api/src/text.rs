@@ -46,7 +46,7 @@ fn shortened(mut line: String) -> String {
 
 /// Control characters, ESC and line breaks among them, and invisible characters: they end a line, command a terminal, or turn the
 /// text around it. The joiners U+200C and U+200D are none of them: Persian, Hindi and emoji need them.
-fn is_harmful(c: char) -> bool {
+pub fn is_harmful(c: char) -> bool {
     c.is_control()
         || matches!(c,
             '\u{ad}' | '\u{61c}' | '\u{180e}'

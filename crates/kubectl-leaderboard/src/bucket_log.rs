@@ -5,9 +5,10 @@
 use std::process::Stdio;
 
 use leaderboard_api::Storage;
-use tokio::io::{AsyncBufReadExt as _, AsyncReadExt as _, BufReader};
+use tokio::io::AsyncReadExt as _;
 use tokio::process::Command;
 
+use crate::lines::{Lines, PIECE};
 use crate::text::clean;
 
 /// Bytes of the program's errors that are read.
@@ -57,15 +58,21 @@ pub async fn read(object: &str, storage: Option<&Storage>, mut show: impl FnMut(
     let failed = |error: std::io::Error| Unread::Failed(format!("aws was interrupted: {error}"));
     let (out, errors) = (child.stdout.take(), child.stderr.take());
     let lines = async {
-        let Some(out) = out else { return Ok(()) };
-        let mut out = BufReader::new(out);
-        let mut line = Vec::new();
-        // A log is bytes: one that is no UTF-8 is shown all the same.
-        while out.read_until(b'\n', &mut line).await.map_err(failed)? > 0 {
-            show(&String::from_utf8_lossy(&line));
-            line.clear();
+        let Some(mut out) = out else { return Ok(()) };
+        let (mut lines, mut piece) = (Lines::default(), vec![0; PIECE]);
+        loop {
+            let read = out.read(&mut piece).await.map_err(failed)?;
+            let ended = match read {
+                0 => lines.end().into_iter().collect(),
+                read => lines.take(piece.get(..read).unwrap_or_default()),
+            };
+            for line in &ended {
+                show(line);
+            }
+            if read == 0 {
+                return Ok(());
+            }
         }
-        Ok(())
     };
     let complaint = async {
         let mut text = Vec::new();

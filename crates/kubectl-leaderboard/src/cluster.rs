@@ -22,7 +22,7 @@ use serde_json::Value;
 
 use super::board::Observed;
 use super::error::{Error, of_kubeconfig, of_log};
-use super::near;
+use super::{lines, near};
 use leaderboard_api::names::LABEL_SUBMISSION;
 use leaderboard_api::{Leaderboard, Submission};
 
@@ -177,8 +177,7 @@ impl Cluster {
         let opened = self
             .in_time(api.log_stream(pod, &of_container(container, false)))
             .await?;
-        let reader = opened.map_err(of_log)?;
-        Ok(futures::io::AsyncBufReadExt::lines(Box::pin(reader)))
+        Ok(lines::of(opened.map_err(of_log)?).boxed())
     }
 
     /// The log of a container from its beginning until it ends. One that prints nothing may not be answered before it does.
@@ -186,8 +185,7 @@ impl Cluster {
         let (api, pod, params) = (self.api::<Pod>(), pod.to_owned(), of_container(container, true));
         let opened = async move {
             let reader = api.log_stream(&pod, &params).await.map_err(of_log)?;
-            let lines = futures::io::AsyncBufReadExt::lines(Box::pin(reader));
-            Ok(lines.map_err(|error| Error::Api(error.to_string())))
+            Ok(lines::of(reader).map_err(|error| Error::Api(error.to_string())))
         };
         opened.try_flatten_stream()
     }

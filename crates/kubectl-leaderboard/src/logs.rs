@@ -14,9 +14,9 @@ use crate::bucket_log::{Unread, read};
 use crate::cluster::Cluster;
 use crate::commands::frame;
 use crate::error::Error;
-use crate::output::{note, print, print_labelled};
+use crate::output::{ask, note, print, print_labelled};
 use crate::text::{Frame, log_line};
-use crate::{bucket, facts};
+use crate::{bucket, facts, foreign};
 
 /// Which logs.
 #[derive(Args, Debug)]
@@ -32,6 +32,9 @@ pub struct Logs {
     /// Whose log.
     #[arg(long, value_enum, default_value_t, value_name = "CONTAINERS")]
     of: Whose,
+    /// Endpoint of the bucket, if it is not AWS's, that may get your AWS credentials once the Pod is gone.
+    #[arg(long, value_name = "URL")]
+    endpoint: Option<String>,
 }
 
 /// Whose log is shown.
@@ -201,6 +204,10 @@ async fn from_bucket(submission: &Submission, wanted: &Logs, pairs: usize) -> Re
         .and_then(|status| status.results_url.as_deref())
         .unwrap_or_default();
     let storage = status.and_then(|status| status.plan.as_ref()).map(|plan| &plan.storage);
+    let named = storage.and_then(|storage| storage.endpoint.as_ref());
+    if let Some(endpoint) = foreign::endpoint(named).filter(|endpoint| wanted.endpoint.as_deref() != Some(*endpoint)) {
+        confirm(&submission.name_any(), endpoint, ask)?;
+    }
     let mut is_unread = false;
     for (stream, (label, key)) in keys.iter().enumerate() {
         let stream = label.parse().unwrap_or(stream);
@@ -223,6 +230,22 @@ async fn from_bucket(submission: &Submission, wanted: &Logs, pairs: usize) -> Re
     } else {
         ExitCode::SUCCESS
     })
+}
+
+/// Goes on only if the person trusts an endpoint that is not AWS's.
+fn confirm(name: &str, endpoint: &str, ask: impl FnOnce(&str) -> Option<bool>) -> Result<(), Error> {
+    let what = format!(
+        "{name} has its logs at {endpoint}, which is no endpoint of AWS: `aws` would send it a request that your credentials sign"
+    );
+    match ask(&format!("{what}. Do you trust that server?")) {
+        Some(true) => Ok(()),
+        Some(false) => Err(Error::Unfit(format!(
+            "nothing was sent to {endpoint}. Nothing was read"
+        ))),
+        None => Err(Error::Unfit(format!(
+            "{what}. If you trust that server, add --endpoint={endpoint}"
+        ))),
+    }
 }
 
 /// The commands that read the logs once the Pod is gone, or why there is none, with the next step.
@@ -358,6 +381,19 @@ mod tests {
         ] {
             let why = in_bucket(submission, of).unwrap_err();
             assert!(why.starts_with(expected), "{why}");
+        }
+    }
+
+    #[test]
+    fn a_server_that_is_not_awss_gets_no_credentials_unless_a_person_trusts_it() {
+        let confirmed = |answer| confirm("mine", "https://minio.example", |_| answer);
+        assert!(confirmed(Some(true)).is_ok());
+        for (answer, expected) in [
+            (Some(false), "nothing was sent to https://minio.example"),
+            (None, "add --endpoint=https://minio.example"),
+        ] {
+            let why = confirmed(answer).unwrap_err().to_string();
+            assert!(why.contains(expected), "{why}");
         }
     }
 

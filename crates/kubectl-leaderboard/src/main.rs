@@ -17,6 +17,8 @@ mod complete;
 mod dashboard;
 mod error;
 mod facts;
+mod foreign;
+mod lines;
 mod logs;
 mod manual;
 mod near;

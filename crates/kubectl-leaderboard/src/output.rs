@@ -6,6 +6,7 @@ use std::io::{ErrorKind, IsTerminal as _, Write as _};
 use std::sync::OnceLock;
 
 use clap::{Args, ValueEnum};
+use leaderboard_api::text::is_harmful;
 use serde_json::Value;
 
 use super::table::{DONE, OPEN};
@@ -64,13 +65,34 @@ impl Colour {
 pub fn document(format: Format, value: &Value) -> Option<Vec<String>> {
     match format {
         Format::Text | Format::Wide => None,
-        Format::Json => Some(vec![format!("{value:#}")]),
+        Format::Json => Some(vec![escaped(&format!("{value:#}"), |c| {
+            let mut units = [0; 2];
+            let units = c.encode_utf16(&mut units);
+            let units: Vec<String> = units.iter().map(|unit| format!("\\u{unit:04x}")).collect();
+            units.concat()
+        })]),
         Format::Yaml => {
             let mut lines = Vec::new();
             yaml(value, 0, &mut lines);
-            Some(lines)
+            // YAML has no pairs for what is beyond 16 bits.
+            let escape = |c: char| format!("\\U{:08x}", u32::from(c));
+            Some(lines.iter().map(|line| escaped(line, escape)).collect())
         }
     }
+}
+
+/// A document in which nothing commands a terminal or turns a text around: only texts of strangers hold such characters, and they stand in
+/// quotes. Line breaks are the document's own.
+fn escaped(document: &str, escape: impl Fn(char) -> String) -> String {
+    let mut harmless = String::with_capacity(document.len());
+    for c in document.chars() {
+        if c != '\n' && is_harmful(c) {
+            harmless.push_str(&escape(c));
+        } else {
+            harmless.push(c);
+        }
+    }
+    harmless
 }
 
 /// YAML in blocks. Strings are quoted as in JSON, which YAML reads alike.
@@ -219,17 +241,24 @@ pub(super) fn labelled(stream: usize, label: &str, line: &str, is_coloured: bool
 
 /// Asks a person at a terminal; elsewhere there is nobody to ask, and the command is the answer.
 pub fn is_confirmed(question: &str) -> bool {
-    let is_asked = std::io::stdin().is_terminal() && std::io::stdout().is_terminal();
-    if !is_asked {
-        return true;
+    ask(question).unwrap_or(true)
+}
+
+/// Asks a person at a terminal; none elsewhere, where no person could answer.
+pub fn ask(question: &str) -> Option<bool> {
+    if !std::io::stdin().is_terminal() || !std::io::stdout().is_terminal() {
+        return None;
     }
     let mut out = std::io::stdout().lock();
-    if write!(out, "{question} [y/N] ").and_then(|()| out.flush()).is_err() {
-        return false;
+    if write!(out, "{} [y/N] ", clean(question))
+        .and_then(|()| out.flush())
+        .is_err()
+    {
+        return Some(false);
     }
     let mut answer = String::new();
     let is_read = std::io::stdin().read_line(&mut answer).is_ok();
-    is_read && ["y", "yes"].contains(&answer.trim().to_lowercase().as_str())
+    Some(is_read && ["y", "yes"].contains(&answer.trim().to_lowercase().as_str()))
 }
 
 fn has_colours() -> bool {
@@ -324,6 +353,22 @@ fn painted_bar(bar: &str) -> String {
 mod tests {
     use super::*;
     use serde_json::json;
+
+    #[test]
+    fn no_document_commands_a_terminal() {
+        let hostile = "a\u{9b}31m\u{202e}b\u{7f}\u{e0041}\tc\n";
+        let value = json!({ hostile: [hostile] });
+        for (format, expected) in [
+            (Format::Json, r"a\u009b31m\u202eb\u007f\udb40\udc41\tc\n"),
+            (Format::Yaml, r"a\U0000009b31m\U0000202eb\U0000007f\U000e0041\tc\n"),
+        ] {
+            let text = document(format, &value).unwrap().join("\n");
+            assert_eq!(text.matches(expected).count(), 2, "{text}");
+            assert!(text.chars().all(|c| c == '\n' || !is_harmful(c)), "{text}");
+        }
+        let json = document(Format::Json, &value).unwrap().join("\n");
+        assert_eq!(serde_json::from_str::<Value>(&json).unwrap(), value);
+    }
 
     #[test]
     fn documents_are_json_or_yaml_in_blocks() {

@@ -272,10 +272,13 @@ fn the_charts_values_allow_what_the_decisions_name() {
     let own = values("all: {evalai: {challenge: 1}}");
     assert_eq!(
         own,
-        json!({"namespace": "leaderboards", "secretsManager": ["evalai"], "queues": [URL]})
+        json!({"namespace": "leaderboards", "secretsManager": ["evalai"], "queues": [URL],
+               "buckets": ["leaderboard-10", "leaderboard-20"], "tables": ["leaderboard-10", "leaderboard-20"],
+               "logGroups": ["leaderboard-10", "leaderboard-20"]})
     );
     let other = values(
-        "all:\n  evalai: {challenge: 1, token: {secretsManager: null, secretKeyRef: {name: evalai, key: token}}}\n  \
+        "all:\n  table: null\n  logGroup: null\n  storage: {bucket: results, prefix: carla/}\n  \
+         evalai: {challenge: 1, token: {secretsManager: null, secretKeyRef: {name: evalai, key: token}}}\n  \
          queue: {url: https://sqs.eu-west-1.amazonaws.com/123456789012/b, deadLetterURL: https://sqs.eu-west-1.amazonaws.com/123456789012/a}",
     );
     let queues = [
@@ -284,6 +287,7 @@ fn the_charts_values_allow_what_the_decisions_name() {
     ];
     assert_eq!(
         other,
-        json!({"namespace": "leaderboards", "secretsManager": [], "secrets": ["evalai"], "queues": queues})
+        json!({"namespace": "leaderboards", "secretsManager": [], "secrets": ["evalai"], "queues": queues,
+               "buckets": ["results/carla/"], "tables": [], "logGroups": []})
     );
 }

@@ -3,7 +3,7 @@
 use std::collections::{BTreeMap, BTreeSet};
 
 use jiff::Timestamp;
-use leaderboard_api::{GROUP, LeaderboardSpec, LeaderboardVersion, VERSION};
+use leaderboard_api::{GROUP, LeaderboardSpec, LeaderboardVersion, Storage, VERSION};
 use serde_json::{Map, Value, json};
 
 use super::decisions::{DecisionError, Decisions};
@@ -128,7 +128,21 @@ fn values(options: &Options, specs: &[LeaderboardSpec]) -> Value {
     if !secrets.is_empty() {
         values["secrets"] = json!(secrets);
     }
+    let tables = specs.iter().filter_map(|spec| Some(&spec.table.as_ref()?.name));
+    let groups = specs.iter().filter_map(|spec| Some(&spec.log_group.as_ref()?.name));
+    values["buckets"] = json!(specs.iter().map(|spec| bucket(&spec.storage)).collect::<BTreeSet<_>>());
+    values["tables"] = json!(tables.collect::<BTreeSet<_>>());
+    values["logGroups"] = json!(groups.collect::<BTreeSet<_>>());
     json!({"leaderboards": [values]})
+}
+
+/// A bucket with its prefix, or all of it.
+fn bucket(storage: &Storage) -> String {
+    let prefix = storage.prefix.as_deref().filter(|prefix| !prefix.is_empty());
+    prefix.map_or_else(
+        || storage.bucket.clone(),
+        |prefix| format!("{}/{prefix}", storage.bucket),
+    )
 }
 
 fn queue_of(spec: &LeaderboardSpec) -> Option<(String, Option<String>)> {

@@ -110,7 +110,8 @@ fn what_is_printed_reads_back_as_it_was_planned() {
         "# - leaderboard-20: endpoint (the Step Function reached the cluster by it",
         "# - leaderboard-10: logcopy_image (logcopy is part of the operator's own image)",
         "# - queue.deadLetterURL: a queue for messages",
-        "#   leaderboards:\n#   - namespace: leaderboards\n",
+        "#   leaderboards:\n#   - buckets:\n#     - leaderboard-10\n",
+        "\n#     namespace: leaderboards\n",
         "  # As in the original: privileged",
         "\nspec:\n  evalai:\n",
     ] {

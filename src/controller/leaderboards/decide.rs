@@ -215,11 +215,12 @@ fn of_spec(view: &LeaderboardView) -> Option<(Truth, &'static str, String)> {
             format!("Leaderboard {older} is older and serves a phase of this one; give each phase to one Leaderboard."),
         );
     }
-    if let Some(other) = prefix_conflict(view) {
+    if let Some(older) = prefix_conflict(view) {
         return no(
             reasons::PREFIX_CONFLICT,
             format!(
-                "Leaderboard {other} of another EvalAI server stores below the same bucket and prefix; set storage.prefix."
+                "Leaderboard {older} is older, of another namespace or another EvalAI server, and stores below the same bucket and prefix: \
+                 the runs of one could replace those of the other. Make this one anew with a storage.prefix of its own."
             ),
         );
     }
@@ -278,6 +279,8 @@ fn phase_conflict(view: &LeaderboardView) -> Option<String> {
         .next()
 }
 
+/// An older Leaderboard below whose prefix ours could come upon runs that it takes for its own: ids of runs are unique in one namespace
+/// for one server.
 fn prefix_conflict(view: &LeaderboardView) -> Option<String> {
     let mine = &view.leaderboard;
     let place = |l: &Leaderboard| {
@@ -288,7 +291,10 @@ fn prefix_conflict(view: &LeaderboardView) -> Option<String> {
         )
     };
     let others = others(view).filter(|l| place(l) == place(mine) && is_older(l, mine));
-    let foreign = |l: &&Arc<Leaderboard>| matches!((server(l), server(mine)), (Some(a), Some(b)) if a != b);
+    let foreign = |l: &&Arc<Leaderboard>| {
+        let is_of_other_server = matches!((server(l), server(mine)), (Some(a), Some(b)) if a != b);
+        is_of_other_server || l.namespace() != mine.namespace()
+    };
     others.filter(|l| foreign(l)).map(|l| qualified(l)).next()
 }
 

@@ -115,6 +115,34 @@ fn two_servers_may_not_share_a_prefix() {
 }
 
 #[test]
+fn two_namespaces_may_not_share_a_prefix_with_or_without_evalai() {
+    let of = |name, namespace: &str, second, server: Option<&str>, prefix| {
+        let mut object = leaderboard(name, second, second, server.unwrap_or("https://e"), prefix)
+            .as_ref()
+            .clone();
+        object.metadata.namespace = Some(namespace.into());
+        object.spec.evalai = object.spec.evalai.filter(|_| server.is_some());
+        Arc::new(object)
+    };
+    let one = Some("https://one");
+    let conflict = ("False".to_owned(), reasons::PREFIX_CONFLICT.to_owned());
+    let cases = [
+        (of("new", "other", 2, one, "a/"), true),
+        (of("new", "other", 2, None, "a/"), true),
+        (of("new", "other", 2, one, "b/"), false),
+        (of("new", "ns", 2, one, "a/"), false),
+        (of("new", "ns", 2, None, "a/"), false),
+        (of("older", "other", 0, one, "a/"), false),
+    ];
+    for (mine, expected) in cases {
+        let all = [of("old", "ns", 1, one, "a/"), Arc::clone(&mine)];
+        let found = reason(&decide(&view(&mine, &all)));
+        let (name, namespace) = (mine.name_any(), mine.namespace());
+        assert_eq!(found == conflict, expected, "{name} {namespace:?} {found:?}");
+    }
+}
+
+#[test]
 fn it_stays_while_submissions_need_it() {
     let mut one = leaderboard("one", 1, 7, "https://e", "a/").as_ref().clone();
     one.metadata.finalizers = Some(vec![names::FINALIZER_LEADERBOARD.into()]);

@@ -243,7 +243,7 @@ impl Parts {
             telemetry.clone(),
         );
         telemetry.tasks.stay("gauges", gauges);
-        ExternalSystems::new(hub, recorder)
+        ExternalSystems::new(hub, recorder, self.settings.allowed.clone())
     }
 
     /// What all reconciles share.

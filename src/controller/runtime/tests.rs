@@ -92,6 +92,7 @@ async fn leader() -> Process {
         image: "operator:1".into(),
         image_pull_policy: None,
         region: None,
+        checksums: None,
         operator: lease.installation(),
         namespaces: Namespaces::All,
         has_cluster_rights: true,

@@ -12,6 +12,7 @@ use super::memory::Memory;
 use super::reruns;
 use super::result_texts;
 use super::view::{EvalaiEnd, EvalaiInfo, EvalaiView, RecordView, Standing, View};
+use crate::allowed::Allowed;
 use crate::controller::objects::{key_of, log_span_of, uid};
 use crate::lock::lock;
 use crate::services::ObjectKey;
@@ -25,16 +26,23 @@ use leaderboard_api::{Ingested, JobNumber, Leaderboard, Rerun, Submission, Submi
 pub struct ExternalSystems {
     pub hub: Hub,
     pub recorder: Recorder,
+    allowed: Allowed,
     targets: Mutex<HashMap<String, Arc<Target>>>,
 }
 
 impl ExternalSystems {
-    pub fn new(hub: Hub, recorder: Recorder) -> Self {
+    pub fn new(hub: Hub, recorder: Recorder, allowed: Allowed) -> Self {
         Self {
             hub,
             recorder,
+            allowed,
             targets: Mutex::default(),
         }
+    }
+
+    /// The first name that a Leaderboard may not use, in words; nothing of it is started or recorded then.
+    pub fn refusal(&self, leaderboard: &Leaderboard) -> Option<String> {
+        self.allowed.refusal(leaderboard).map(|refused| refused.to_string())
     }
 
     /// A Leaderboard's way to EvalAI, renewed whenever its spec or token changes.
@@ -88,6 +96,12 @@ impl ExternalSystems {
     /// What is known of a submission's row. None without a table.
     pub fn record_view(&self, leaderboard: &Leaderboard, submission: &Submission) -> Option<RecordView> {
         leaderboard.spec.table.as_ref()?;
+        if let Some(refusal) = self.refusal(leaderboard) {
+            return Some(RecordView {
+                error: Some(refusal),
+                ..RecordView::default()
+            });
+        }
         let attempt = submission.status.as_ref().map(result_texts::attempt_of_run);
         let seen = self
             .recorder
@@ -145,8 +159,10 @@ impl ExternalSystems {
 
     /// Writes the row, or lets the next write carry it.
     pub fn record(&self, view: &View, status: &SubmissionStatus, update: TableUpdate) {
-        let table = view.leaderboard.as_ref().and_then(|l| l.spec.table.as_ref());
-        let Some(table) = table else { return };
+        let leaderboard = view.leaderboard.as_ref().filter(|_| view.not_allowed.is_none());
+        let Some(table) = leaderboard.and_then(|l| l.spec.table.as_ref()) else {
+            return;
+        };
         let submission = view.submission.as_ref();
         let row = match update {
             TableUpdate::Trial => Some(result_texts::trial(status)),

@@ -95,6 +95,7 @@ async fn bench(state: State) -> Bench {
         now,
         submission: Arc::new(submission),
         leaderboard: Some(Arc::new(board)),
+        not_allowed: None,
         is_policy_in_place: true,
         image: ObservedImage::NotAsked,
         traces: ObservedTraces::NotAsked,
@@ -176,6 +177,24 @@ async fn the_row_of_an_end_without_results_that_count_has_no_metrics() {
             (status, None)
         );
     }
+}
+
+#[tokio::test]
+async fn nothing_is_recorded_for_a_leaderboard_that_may_not_name_its_table() {
+    let mut bench = bench(State::Finished).await;
+    bench.view.report = last();
+    bench.view.not_allowed = Some("It may not name the table theirs.".to_owned());
+    bench.records_the_end();
+    let known = &bench.around.context.external;
+    let key = key_of(bench.view.submission.as_ref());
+    assert!(known.recorder.view(&key).is_none());
+    let strict = ExternalSystems::new(known.hub.clone(), known.recorder.clone(), "{}".parse().unwrap());
+    let board = bench.view.leaderboard.clone().unwrap();
+    let shown = strict.record_view(&board, &bench.view.submission).unwrap();
+    assert!(!shown.end_written && shown.error.is_some_and(|why| why.contains("may not name")));
+    bench.view.not_allowed = None;
+    bench.records_the_end();
+    assert_eq!(bench.row().await["submission_status"], "FINISHED");
 }
 
 #[test]

@@ -23,6 +23,8 @@ pub struct View {
     pub now: Timestamp,
     pub submission: Arc<Submission>,
     pub leaderboard: Option<Arc<Leaderboard>>,
+    /// The first name that the Leaderboard may not use, in words.
+    pub not_allowed: Option<String>,
     /// Whether the NetworkPolicy that the Leaderboard's present spec asks for is in place; only meaningful while it has no Job.
     pub is_policy_in_place: bool,
     /// What its registry has reported of its image.

@@ -158,6 +158,7 @@ pub fn settings() -> Settings {
         image: "operator:1".into(),
         image_pull_policy: None,
         region: None,
+        checksums: None,
         operator: OPERATOR.into(),
         namespaces: Namespaces::All,
         has_cluster_rights: true,
@@ -184,7 +185,8 @@ fn stores(cluster: Cluster) -> Stores {
 fn external(aws: &Aws, tasks: &Tasks) -> ExternalSystems {
     let hub = Hub::new(Options::unheard(tasks, || true));
     let rows = mpsc::unbounded_channel().0;
-    ExternalSystems::new(hub, Recorder::new(aws.clone(), || true, rows, tasks.clone()))
+    let recorder = Recorder::new(aws.clone(), || true, rows, tasks.clone());
+    ExternalSystems::new(hub, recorder, Allowed::default())
 }
 
 async fn serve(

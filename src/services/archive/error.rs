@@ -38,6 +38,9 @@ pub enum Cause {
     /// No answer, or one that asks to try again.
     #[error("S3 does not answer ({0})")]
     Away(String),
+    /// The store knows no such request, or nothing of a header that it has.
+    #[error("the store does not know how to do this ({0})")]
+    Unknown(String),
     /// Any other refusal.
     #[error("S3 refuses the request ({0})")]
     Refused(String),
@@ -71,7 +74,14 @@ impl Cause {
             Self::Changed => "Let nobody else write below this prefix.",
             Self::TooLarge(_) => "Look at the object: nothing of ours is that large.",
             Self::Away(_) => "It is tried again; check storage.endpoint and the network rules if this stays.",
-            Self::Refused(_) => "Check storage.bucket, storage.region and storage.endpoint of the leaderboard.",
+            Self::Unknown(_) => {
+                "If it is for a checksum (CRC32), set AWS_REQUEST_CHECKSUM_CALCULATION=when_required in controller.extraEnv of the chart: \
+                 the controller and its Pods then send none."
+            }
+            Self::Refused(_) => {
+                "Check storage.bucket, storage.region and storage.endpoint of the leaderboard; docs/storage.md has the stores that refuse \
+                 checksums."
+            }
             Self::Slow => "It is tried again later.",
             Self::Local(_) => "Check the volume of the Pod.",
             Self::Parts(_) => "The file is stored whole instead.",
@@ -102,6 +112,7 @@ impl Cause {
             (_, "NoSuchBucket") => Self::NoBucket,
             (404 | 412, _) | (_, "PreconditionFailed" | "ConditionalRequestConflict") => Self::Changed,
             (401 | 403, _) => Self::Denied(text),
+            (501, _) | (_, "NotImplemented") => Self::Unknown(text),
             (408 | 429 | 500..=599, _) | (_, "SlowDown" | "RequestTimeout" | "RequestTimeTooSkewed") => {
                 Self::Away(text)
             }

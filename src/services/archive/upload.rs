@@ -7,6 +7,7 @@ use std::os::unix::fs::FileExt;
 use std::sync::Arc;
 use std::time::{Duration, Instant};
 
+use aws_sdk_s3::config::RequestChecksumCalculation;
 use aws_sdk_s3::primitives::ByteStream;
 use aws_sdk_s3::types::{ChecksumAlgorithm, CompletedMultipartUpload, CompletedPart};
 use percent_encoding::{AsciiSet, NON_ALPHANUMERIC, utf8_percent_encode};
@@ -38,8 +39,7 @@ impl Archive {
         let parts = parts::plan(kept.map_or(0, |kept| kept.size), size);
         let parts = parts.map_err(|e| self.error(OP, key, e.into()))?;
         let request = self.client.create_multipart_upload().bucket(&self.bucket);
-        // The SDK adds a checksum to each part, which S3 takes only if the upload announced it.
-        let request = request.key(self.full(key)).checksum_algorithm(ChecksumAlgorithm::Crc32);
+        let request = request.key(self.full(key)).set_checksum_algorithm(self.announced());
         let output = self
             .keeping
             .of_upload(request)
@@ -62,6 +62,15 @@ impl Archive {
             let _ = abort.key(self.full(key)).upload_id(&id).send().await;
         }
         stored
+    }
+
+    /// The SDK adds this checksum to each part, which S3 takes only if the upload has announced it. Without it where the SDK is not to add
+    /// any: some stores refuse what they don't know.
+    fn announced(&self) -> Option<ChecksumAlgorithm> {
+        match self.client.config().request_checksum_calculation() {
+            Some(RequestChecksumCalculation::WhenRequired) => None,
+            _ => Some(ChecksumAlgorithm::Crc32),
+        }
     }
 
     async fn send_parts(
@@ -104,7 +113,6 @@ impl Archive {
             .map_err(|e| self.error(OP, key, e.into()))?;
         let request = self.client.upload_part().bucket(&self.bucket).key(self.full(key));
         let request = request.upload_id(id).part_number(number);
-        let request = request.checksum_algorithm(ChecksumAlgorithm::Crc32);
         let output = request.body(ByteStream::from(bytes)).send().await;
         let output = output.map_err(|e| self.failed(OP, key, &e))?;
         let part = CompletedPart::builder().set_e_tag(output.e_tag);

@@ -3,16 +3,20 @@
 use std::os::unix::fs::PermissionsExt as _;
 use std::path::Path;
 
-use serde_json::json;
+use serde_json::{Value, json};
 
 use super::terminal::{Printed, Terminal, assert_has, ended, finished};
 
 /// A finished submission `mine` of two pairs.
 async fn stored() -> Terminal {
+    stored_at(&json!({"bucket": "results", "region": "eu-west-1"})).await
+}
+
+async fn stored_at(storage: &Value) -> Terminal {
     let terminal = Terminal::new().await;
     let plan = json!({"runId": "mine", "leaderboardVersion": "V2", "track": "sensors", "codename": "S",
                       "slices": [{"first": 0, "last": 0}, {"first": 1, "last": 1}], "routes": 2, "repetitions": 1,
-                      "storage": {"bucket": "results", "region": "eu-west-1"}, "image": "a", "contentsImage": "c",
+                      "storage": storage, "image": "a", "contentsImage": "c",
                       "simulatorImage": "s"});
     let mut status = finished();
     status["plan"] = plan;
@@ -73,4 +77,32 @@ async fn the_program_reads_each_log_and_one_that_cannot_be_read_does_not_hold_up
         text.out.starts_with("\u{1b}[33m[1]\u{1b}[0m s3 cp "),
         "a pair has its colour, also alone"
     );
+}
+
+/// A program `aws` that prints what it was called with.
+fn echoing(folder: &Path) {
+    let program = folder.join("aws");
+    std::fs::write(&program, "#!/bin/sh\necho \"$*\"\n").unwrap();
+    std::fs::set_permissions(&program, std::fs::Permissions::from_mode(0o755)).unwrap();
+}
+
+#[tokio::test]
+async fn a_server_that_is_not_awss_gets_a_persons_credentials_only_by_a_flag_that_names_it() {
+    const ENDPOINT: &str = "https://minio.example";
+    let terminal = stored_at(&json!({"bucket": "results", "endpoint": ENDPOINT})).await;
+    let folder = tempfile::tempdir().unwrap();
+    echoing(folder.path());
+    let call = "s3 cp --only-show-errors --endpoint-url=https://minio.example";
+    for arguments in [
+        &["logs", "mine", "--pair", "1"][..],
+        &["logs", "mine", "--pair", "1", "--endpoint=https://other.example"],
+    ] {
+        let printed = with_path(&terminal, folder.path(), arguments).await;
+        assert!(!printed.out.contains(call), "{printed:?}");
+        assert_has(&printed.refused(), &[ENDPOINT, "add --endpoint=https://minio.example"]);
+    }
+    let trusted = ["logs", "mine", "--pair", "1", "--endpoint=https://minio.example"];
+    let printed = with_path(&terminal, folder.path(), &trusted).await;
+    assert_eq!(printed.code, Some(0), "{printed:?}");
+    assert_has(&printed.out, &[call]);
 }

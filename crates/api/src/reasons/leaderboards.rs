@@ -29,8 +29,8 @@ reasons! {
             "EvalAI refuses the token, or its user is no host of the challenge.",
             "Renew the token; or store a host's token, make the user a host, or correct `evalai.challenge`, as the message asks.";
         NOT_ALLOWED = "NotAllowed",
-            "The Leaderboard names an entry of Secrets Manager or a queue that Leaderboards of its namespace may not name. Its token is \
-             not read, its queue is left alone, and EvalAI is not asked.",
+            "The Leaderboard names an entry of Secrets Manager, a queue, a bucket, a table or a log group that Leaderboards of its namespace \
+             may not name. Its token is not read, its queue is left alone, EvalAI is not asked, and no submission starts or is recorded.",
             "Name another one, or let the operator's administrator allow it under `leaderboards` of the chart's values.";
         INSECURE_SERVER = "InsecureServer",
             "`evalai.apiServer` begins with http and is on the internet: everyone on the way could read the host's token.",
@@ -39,8 +39,8 @@ reasons! {
             "An older Leaderboard has the same phase and serves it.",
             "Remove the phase from one of them.";
         PREFIX_CONFLICT = "PrefixConflict",
-            "A Leaderboard of another EvalAI server has the same bucket and prefix.",
-            "Give one of them another `storage.prefix`.";
+            "An older Leaderboard of another namespace or another EvalAI server has the same bucket and prefix.",
+            "Make one of them anew with another `storage.prefix`.";
         LABELS_DIFFER = "LabelsDiffer",
             "The challenge's phases, splits or metric labels are not those of the Leaderboard.",
             "Compare `evalai.challenge`, `evalai.split` and the tracks' phases with the challenge; the message names the difference.";

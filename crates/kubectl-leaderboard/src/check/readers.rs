@@ -9,6 +9,7 @@ use serde_json::Value;
 use tokio::process::Command;
 
 use super::finding::{Finding, Mark, Part, finding_of};
+use crate::foreign;
 use crate::text::clean;
 
 /// How long one command may take.
@@ -108,6 +109,11 @@ pub async fn ask(queue: Option<&Queue>) -> Readers {
 }
 
 async fn try_ask(queue: &Queue) -> Result<Vec<Reader>, String> {
+    if let Some(endpoint) = foreign::endpoint(queue.endpoint.as_ref()) {
+        return Err(format!(
+            "{endpoint} is no endpoint of AWS, and aws would send it requests that your credentials sign"
+        ));
+    }
     let attributes = run(&arn_command(queue)).await?;
     let arn = attributes.pointer("/Attributes/QueueArn").and_then(Value::as_str);
     let arn = arn.ok_or("aws sqs named no ARN of the queue")?.to_owned();

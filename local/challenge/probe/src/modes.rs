@@ -5,7 +5,7 @@ use std::env;
 use std::fs::{self, File, Permissions};
 use std::io::{self, Write as _};
 use std::net::{Ipv4Addr, SocketAddr, TcpStream};
-use std::os::unix::fs::PermissionsExt as _;
+use std::os::unix::fs::{MetadataExt as _, PermissionsExt as _};
 use std::os::unix::process::CommandExt as _;
 use std::path::Path;
 use std::process::{Command, exit};
@@ -28,8 +28,9 @@ const LOG: &str = "/tmp/agent/leaderboard.log";
 const CHECKPOINT: &str = "/tmp/agent/agent_results.json";
 /// What a runner takes for complete results, and nobody else.
 const COMPLETE: &str = r#"{"_checkpoint": {"global_record": {"index": -1}}}"#;
-/// The users of the operator's image, and of the challenge's simulator.
-const LOGCOPY: u32 = 65532;
+/// A file that `workspace` has copied, as the user of `logcopy`.
+const RUNNER: &str = "/leaderboard-tools/leaderboard-runner";
+/// The user of the challenge's simulator.
 const SIMULATOR: u32 = 1000;
 /// Outlives the container.
 const MARKER: &str = "/tmp/agent/probe-was-here";
@@ -87,7 +88,10 @@ pub fn run(id: &str, arguments: &[String]) -> io::Result<()> {
         "status-sparse" => first_life(|| sparse(Path::new(&status("start1")))),
         "status-pipe" => first_life(|| Ok(mkfifo(Path::new(&status("start1")), Mode::S_IRWXU)?)),
         "folder-shut" => shut(),
-        "folder-listed" => folders::forbid(&folders::of_agent(pair()), &[LOGCOPY, SIMULATOR]).and_then(|()| exit(1)),
+        "folder-listed" => {
+            let logcopy = fs::metadata(RUNNER)?.uid();
+            folders::forbid(&folders::of_agent(pair()), &[logcopy, SIMULATOR]).and_then(|()| exit(1))
+        }
         // One that can be deleted would be seen: the honest agent's run ends well.
         "folder-deleted" => match folders::delete(&folders::of_agent(pair())) {
             Ok(()) => Ok(()),

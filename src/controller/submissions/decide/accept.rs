@@ -29,6 +29,11 @@ pub(super) fn decide(draft: &mut PlanBuilder<'_>) -> bool {
         let message = no_leaderboard(draft);
         return refuse(draft, reasons::LEADERBOARD_NOT_FOUND, &message);
     };
+    // Before anything of it is looked at: the bucket and the table may be somebody else's.
+    if let Some(why) = &draft.view.not_allowed {
+        let message = leaderboard_not_ready(draft, reasons::NOT_ALLOWED, why);
+        return refuse(draft, reasons::LEADERBOARD_NOT_READY, &message);
+    }
     let info = match ask_evalai(draft) {
         Answer::NotNeeded => None,
         Answer::Waiting => return false,
@@ -98,7 +103,8 @@ fn take(draft: &mut PlanBuilder<'_>, unpinned: Option<String>) {
 
 /// Whether EvalAI's own end is ours, of an object that has lost its status, or that is still being found out.
 pub(super) fn had_ended(draft: &mut PlanBuilder<'_>) -> bool {
-    let Some((leaderboard, info)) = draft.leaderboard().zip(draft.evalai_info()) else {
+    let leaderboard = draft.leaderboard().filter(|_| draft.view.not_allowed.is_none());
+    let Some((leaderboard, info)) = leaderboard.zip(draft.evalai_info()) else {
         return false;
     };
     let track = find_track(draft, leaderboard).filter(|_| stored::may_have_ended(draft, info));
@@ -202,14 +208,15 @@ fn not_ready(draft: &PlanBuilder<'_>) -> Option<String> {
         reasons::PREFIX_CONFLICT,
     ]
     .contains(&ready.reason.as_str());
-    blocks.then(|| {
-        format!(
-            "Leaderboard {} is not ready ({}): {} Fix it, and the submission goes on.",
-            draft.spec().leaderboard_name,
-            ready.reason,
-            sentence(&ready.message)
-        )
-    })
+    blocks.then(|| leaderboard_not_ready(draft, &ready.reason, &ready.message))
+}
+
+fn leaderboard_not_ready(draft: &PlanBuilder<'_>, reason: &str, why: &str) -> String {
+    format!(
+        "Leaderboard {} is not ready ({reason}): {} Fix it, and the submission goes on.",
+        draft.spec().leaderboard_name,
+        sentence(why)
+    )
 }
 
 /// What is known of the participant's image.

@@ -207,6 +207,25 @@ fn only_our_own_containers_have_an_identity() {
 }
 
 #[test]
+fn the_controllers_setting_of_checksums_is_that_of_its_pods() {
+    const NAME: &str = "AWS_REQUEST_CHECKSUM_CALCULATION";
+    let mut case = Case::new("V2", json!({}));
+    for setting in [None, Some("when_required")] {
+        case.settings.checksums = setting.map(str::to_owned);
+        for container in containers(&case.json()) {
+            assert_eq!(value(container, NAME), setting.filter(|_| is_own(container)));
+        }
+    }
+    // A Leaderboard with another store has its own.
+    let env = json!([{"name": NAME, "value": "when_supported"}]);
+    let pod = json!({"spec": {"initContainers": [{"name": "logcopy", "env": env}]}});
+    case.leaderboard.spec.pod_overrides = Some(pod);
+    let job = case.json();
+    let found = ["workspace", "logcopy"].map(|name| value(container(&job, name), NAME));
+    assert_eq!(found, [Some("when_required"), Some("when_supported")]);
+}
+
+#[test]
 fn eks_skips_every_container_of_a_stranger() {
     let pod = json!({"spec": {"initContainers": [{"name": "metrics", "image": "m", "restartPolicy": "Always"}]}});
     let job = Case::new("V2", json!({"pairs": 2, "podOverrides": pod})).json();

@@ -1,6 +1,10 @@
 //! What keeps a stranger's container from the node and from its neighbors: security contexts, disk, name files.
 
+use std::collections::BTreeSet;
+
 use serde_json::{Value, json};
+
+use leaderboard_api::Attempt;
 
 use super::tests::{Case, container, containers};
 
@@ -17,6 +21,56 @@ fn every_container_is_confined_by_default() {
         assert_eq!(context["seccompProfile"], json!({"type": "RuntimeDefault"}));
         assert_eq!(context.get("runAsUser").is_some(), is_own(container));
         assert_eq!(context.get("readOnlyRootFilesystem").is_some(), is_own(container));
+    }
+}
+
+fn users(job: &Value) -> [i64; 2] {
+    ["workspace", "logcopy"].map(|name| {
+        let context = &container(job, name)["securityContext"];
+        assert_eq!(context["runAsNonRoot"], true);
+        assert_eq!(context["runAsUser"], context["runAsGroup"]);
+        context["runAsUser"].as_i64().unwrap()
+    })
+}
+
+#[test]
+fn our_own_containers_run_as_a_user_of_their_job_that_no_image_can_know() {
+    let of = |uid: &str, attempt: i64, retry: i32, more: Value| {
+        let mut case = Case::new("V2", more);
+        case.submission.metadata.uid = Some(uid.to_owned());
+        case.number.attempt = Attempt(attempt);
+        case.number.retry = retry;
+        let [workspace, logcopy] = users(&case.json());
+        // The one restores files that the other replaces.
+        assert_eq!(workspace, logcopy);
+        workspace
+    };
+    let jobs = [("a", 1, 0), ("b", 1, 0), ("a", 2, 0), ("a", 1, 1)];
+    let all = jobs.map(|(uid, attempt, retry)| of(uid, attempt, retry, json!({})));
+    assert!(
+        all.iter().all(|user| (2_001_000_000..2_147_000_000).contains(user)),
+        "{all:?}"
+    );
+    assert_eq!(BTreeSet::from(all).len(), jobs.len(), "{all:?}");
+    assert_eq!(of("a", 1, 0, json!({})), all[0], "a Job is built the same each time");
+    // A user namespace has 65,536 of them.
+    let namespace = of("a", 1, 0, json!({"podOverrides": {"spec": {"hostUsers": false}}}));
+    assert!((33_000..65_000).contains(&namespace), "{namespace}");
+    let shared = of("a", 1, 0, json!({"podOverrides": {"spec": {"hostUsers": true}}}));
+    assert_eq!(shared, all[0]);
+}
+
+#[test]
+fn a_platform_or_a_host_may_choose_the_user_of_our_own_containers() {
+    for (hosts, expected) in [(json!(1_000_660_000), Some(1_000_660_000)), (Value::Null, None)] {
+        let context = json!({"runAsUser": hosts, "runAsGroup": hosts});
+        let own = ["workspace", "logcopy"].map(|name| json!({"name": name, "securityContext": context}));
+        let job = Case::new("V2", json!({"podOverrides": {"spec": {"initContainers": own}}})).json();
+        for name in ["workspace", "logcopy"] {
+            let context = &container(&job, name)["securityContext"];
+            assert_eq!(context["runAsUser"].as_i64(), expected, "{name}");
+            assert_eq!(context["runAsNonRoot"], true, "{name}");
+        }
     }
 }
 

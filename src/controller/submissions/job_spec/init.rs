@@ -7,16 +7,12 @@ use k8s_openapi::api::core::v1::{
 };
 
 use super::security::{confined, context, resources};
-use super::{JobInput, commands, resume, run_document, variable, volumes};
+use super::{JobInput, commands, own_uid, resume, run_document, variable, volumes};
 use crate::controller::submissions::pod_layout::CONTENTS_LOG_FOLDER;
 use crate::pod::ownlog::CONTENTS_LOG;
 use crate::pod::run::{ENV_POD_UID, ENV_ROLE_ARN, ENV_RUN, RUNNER, TOOLS};
+use crate::services::aws::ENV_CHECKSUMS;
 use leaderboard_api::names;
-
-/// `workspace` and `logcopy` run as nobody in particular: with every capability dropped root could read no more than any
-/// other uid, and all that they write to is a volume (0777) or a folder that the kubelet or they themselves made there.
-/// Files they restore are 0666 in folders of 0777, so that the agents' uids, whatever they are, can go on with them.
-const OWN_UID: i64 = 65532;
 
 /// Copying prints little; what floods must not fill the disk. In bytes.
 const CONTENTS_LOG_LIMIT: u64 = 16 << 20;
@@ -83,6 +79,7 @@ pub(super) fn logcopy(input: &JobInput<'_>) -> Container {
 }
 
 fn own(input: &JobInput<'_>, name: &str) -> Container {
+    let uid = own_uid::of(input);
     Container {
         name: name.into(),
         image: Some(input.settings.image.clone()),
@@ -92,8 +89,8 @@ fn own(input: &JobInput<'_>, name: &str) -> Container {
         security_context: Some(SecurityContext {
             read_only_root_filesystem: Some(true),
             run_as_non_root: Some(true),
-            run_as_user: Some(OWN_UID),
-            run_as_group: Some(OWN_UID),
+            run_as_user: Some(uid),
+            run_as_group: Some(uid),
             ..confined()
         }),
         ..Container::default()
@@ -120,6 +117,8 @@ fn own_env(input: &JobInput<'_>) -> Vec<EnvVar> {
     ];
     let region = input.settings.region.as_ref().or(input.plan.storage.region.as_ref());
     env.extend(region.map(|region| variable("AWS_REGION", region)));
+    let checksums = input.settings.checksums.as_deref();
+    env.extend(checksums.map(|when| variable(ENV_CHECKSUMS, when)));
     if let Some(identity) = &input.spec().pod_identity {
         env.extend(identity.role_arn.as_deref().map(|role| variable(ENV_ROLE_ARN, role)));
         env.extend(identity.secret_name.iter().flat_map(|secret| {

@@ -10,6 +10,7 @@ mod failed_nodes;
 mod gpu;
 mod gpu_count;
 mod init;
+mod own_uid;
 mod pairs;
 mod security;
 mod volumes;

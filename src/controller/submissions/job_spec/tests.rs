@@ -67,6 +67,7 @@ impl Case {
                 image: OPERATOR_IMAGE.into(),
                 image_pull_policy: None,
                 region: None,
+                checksums: None,
                 operator: "system/operator".into(),
                 namespaces: Namespaces::All,
                 has_cluster_rights: true,

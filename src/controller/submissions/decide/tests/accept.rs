@@ -195,6 +195,25 @@ fn a_leaderboard_that_cannot_make_jobs_is_waited_for() {
     assert!(creates(&world.pass()), "a blocked queue is the bridge's affair");
 }
 
+/// Whatever its status shows: that may be of an earlier spec.
+#[test]
+fn a_leaderboard_that_names_what_it_may_not_starts_nothing_and_has_nothing_looked_at() {
+    for world in [World::local, World::evalai] {
+        let mut world = world();
+        world.view.not_allowed = Some("It may not name the bucket theirs.".to_owned());
+        let plan = world.pass_to(Pending, reasons::LEADERBOARD_NOT_READY);
+        let message = plan.status.message.as_ref().unwrap();
+        assert!(
+            message.contains("(NotAllowed): It may not name the bucket theirs."),
+            "{message}"
+        );
+        assert!(!creates(&plan), "{:?}", plan.actions);
+        assert!(!has(&plan, |action| matches!(action, Action::LookForForeignRun(_))));
+        world.view.not_allowed = None;
+        assert!(creates(&world.pass()));
+    }
+}
+
 #[test]
 fn an_image_that_can_never_be_pulled_fails_at_once_without_a_job() {
     let long = "x".repeat(513);

@@ -113,6 +113,7 @@ impl World {
                 now: at(0),
                 submission: Arc::new(submission(evalai)),
                 leaderboard: Some(Arc::new(leaderboard(evalai))),
+                not_allowed: None,
                 is_policy_in_place: true,
                 image: ObservedImage::NotAsked,
                 // Nobody else runs it; the tests of foreign runs set it otherwise.

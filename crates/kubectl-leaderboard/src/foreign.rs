@@ -1,0 +1,68 @@
+//! Endpoints that are not AWS's. A Leaderboard names them, and a person's own program `aws` would sign its request with the person's
+//! credentials, session token included: the owner of that server gets the token.
+//!
+//! Called by what starts that program. Pure, but for the person's own variables.
+
+use std::env;
+
+/// The ends of the names of AWS's own endpoints.
+const OF_AWS: [&str; 4] = [
+    ".amazonaws.com",
+    ".amazonaws.com.cn",
+    ".api.aws",
+    ".api.amazonwebservices.com.cn",
+];
+/// Variables by which a person names the endpoint that the own program asks.
+const OWN: [&str; 3] = ["AWS_ENDPOINT_URL", "AWS_ENDPOINT_URL_S3", "AWS_ENDPOINT_URL_SQS"];
+
+/// The endpoint, if it is neither AWS's nor one that the person's own variables name.
+pub fn endpoint(named: Option<&String>) -> Option<&str> {
+    let own: Vec<String> = OWN.into_iter().filter_map(|name| env::var(name).ok()).collect();
+    named.map(String::as_str).filter(|named| is_foreign(named, &own))
+}
+
+fn is_foreign(endpoint: &str, own: &[String]) -> bool {
+    let same = |other: &String| other.trim_end_matches('/') == endpoint.trim_end_matches('/');
+    !is_of_aws(endpoint) && !own.iter().any(same)
+}
+
+fn is_of_aws(endpoint: &str) -> bool {
+    let Some(rest) = endpoint.strip_prefix("https://") else {
+        return false;
+    };
+    let authority = rest.trim_end_matches('/');
+    let host = authority.split(':').next().unwrap_or_default();
+    // More than a name and a port could lead elsewhere.
+    let is_plain = authority
+        .chars()
+        .all(|c| c.is_ascii_alphanumeric() || ".-:".contains(c));
+    is_plain && OF_AWS.iter().any(|end| host.to_ascii_lowercase().ends_with(end))
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn an_endpoint_is_awss_by_its_name_or_the_persons_by_a_variable() {
+        let own = ["http://10.77.0.1:4566/".to_owned()];
+        for (endpoint, expected) in [
+            ("https://s3.eu-west-1.amazonaws.com", false),
+            ("https://bucket.vpce-0a1b-2c.s3.us-east-1.vpce.amazonaws.com/", false),
+            ("https://s3.cn-north-1.amazonaws.com.cn:443", false),
+            ("https://s3.dualstack.us-east-1.api.aws", false),
+            ("http://10.77.0.1:4566", false),
+            ("http://s3.eu-west-1.amazonaws.com", true),
+            ("https://minio.example", true),
+            ("https://amazonaws.com.evil.example", true),
+            ("https://evilamazonaws.com", true),
+            ("https://s3.amazonaws.com@evil.example", true),
+            ("https://evil.example/s3.amazonaws.com", true),
+            ("https://evil.example#.amazonaws.com", true),
+            ("https://evil.example\\.amazonaws.com", true),
+            ("http://10.77.0.1:4567", true),
+        ] {
+            assert_eq!(is_foreign(endpoint, &own), expected, "{endpoint}");
+        }
+    }
+}
