@@ -1,7 +1,7 @@
 //! What the pairs have so far: their checkpoints read, merged and rendered, and their status files.
 //!
 //! Called by `logcopy` once a round. Reads the `logs` volume through [`Tree`] and writes nothing; knows no S3. A checkpoint that
-//! is torn, gone or refused leaves the last good one in place. What is to be stored is handed out from memory, so that no torn
+//! is torn, gone, refused or poorer leaves the last good one in place. What is to be stored is handed out from memory, so that no torn
 //! file and no full disk comes between the results and S3. [`Plan::limits_of`] bounds the memory of all pairs together.
 
 use std::collections::BTreeMap;
@@ -266,11 +266,17 @@ impl Gatherer {
             Ok(None) => ReadOutcome::Unusable,
             Ok(Some(checkpoint)) => {
                 worker.seen = Some(stamp);
-                worker.good = Some(checkpoint);
-                self.objects.insert(path, Object::new(bytes));
                 if let Some(why) = worker.refused.take() {
                     tracing::info!(pair = pair.get(), "the checkpoint is good again; before: {why}");
                 }
+                if !worker.take(checkpoint) {
+                    tracing::info!(
+                        pair = pair.get(),
+                        "the new checkpoint has less than the one before, which stays"
+                    );
+                    return ReadOutcome::Same;
+                }
+                self.objects.insert(path, Object::new(bytes));
                 ReadOutcome::New
             }
             Err(refusal) => {
@@ -299,14 +305,11 @@ impl Gatherer {
         let Ok(Some(kept)) = leaderboard_results::read_worker(&self.plan, index, &bytes) else {
             return false;
         };
-        // Where the evaluator resumes counts, too: V1 has a file with a route's record that does not count it yet.
-        let reached = |checkpoint: &Checkpoint| (checkpoint.done(), checkpoint.counted(), checkpoint.ended());
-        if worker.good.as_ref().is_some_and(|good| reached(good) >= reached(&kept)) {
-            return false;
+        let is_taken = worker.take(kept);
+        if is_taken {
+            self.objects.insert(checkpoint_path(pair), Object::new(bytes));
         }
-        worker.good = Some(kept);
-        self.objects.insert(checkpoint_path(pair), Object::new(bytes));
-        true
+        is_taken
     }
 
     fn merge(&mut self) {
@@ -355,6 +358,17 @@ impl Gatherer {
 }
 
 impl Worker {
+    /// Takes a checkpoint, unless it has less than the last good one. Returns whether it did.
+    fn take(&mut self, found: Checkpoint) -> bool {
+        let next = match &self.good {
+            Some(good) => found.after(good),
+            None => Some(found),
+        };
+        let is_taken = next.is_some();
+        self.good = next.or(self.good.take());
+        is_taken
+    }
+
     fn refuse(&mut self, pair: Pair, error: &TreeError) -> ReadOutcome {
         self.refuse_with(format!(
             "pair {pair}: the checkpoint can't be read: {error}. Leave it to the evaluator."

@@ -168,5 +168,8 @@ fn spoiled(gathered: &Gathered) -> Option<String> {
 }
 
 #[cfg(test)]
+#[path = "judge_file_tests.rs"]
+mod file_tests;
+#[cfg(test)]
 #[path = "judge_tests.rs"]
 mod tests;
