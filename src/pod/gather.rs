@@ -97,6 +97,8 @@ struct Worker {
     /// The runner's copy as it was read last.
     kept: Option<Stamp>,
     refused: Option<String>,
+    /// Why this node can't read it at present, which says nothing about its content.
+    unreadable: Option<String>,
 }
 
 /// What reading a checkpoint gave.
@@ -128,6 +130,8 @@ pub struct Gathered {
     pub pairs: Vec<ReportPair>,
     /// Why each pair's checkpoint is refused, if it is.
     pub refused: Vec<Option<String>>,
+    /// Each pair whose checkpoint this node can't read at present.
+    pub unreadable: Vec<bool>,
     /// Why the checkpoints can't be merged, if they can't.
     pub unmerged: Option<String>,
 }
@@ -236,6 +240,7 @@ impl Gatherer {
             pairs,
             seen,
             refused: self.workers.iter().map(|worker| worker.refused.clone()).collect(),
+            unreadable: self.workers.iter().map(|worker| worker.unreadable.is_some()).collect(),
             unmerged: self.unmerged.clone(),
         }
     }
@@ -249,10 +254,14 @@ impl Gatherer {
         };
         let (file, stamp) = match self.tree.file(&path) {
             Ok(Some(found)) => found,
-            Ok(None) => return ReadOutcome::Unusable,
-            Err(error) => return worker.refuse(pair, &error),
+            Ok(None) => {
+                worker.unreadable = None;
+                return ReadOutcome::Unusable;
+            }
+            Err(error) => return worker.cannot_read(pair, &error),
         };
         if worker.seen == Some(stamp) {
+            worker.unreadable = None;
             return ReadOutcome::Same;
         }
         drop(file);
@@ -260,8 +269,9 @@ impl Gatherer {
             Ok(Some(read)) => read,
             // The next round finds it whole.
             Ok(None) | Err(TreeError::Changed) => return ReadOutcome::Unusable,
-            Err(error) => return worker.refuse(pair, &error),
+            Err(error) => return worker.cannot_read(pair, &error),
         };
+        worker.unreadable = None;
         match leaderboard_results::read_worker(&self.plan, index, &bytes) {
             Ok(None) => ReadOutcome::Unusable,
             Ok(Some(checkpoint)) => {
@@ -369,10 +379,19 @@ impl Worker {
         is_taken
     }
 
-    fn refuse(&mut self, pair: Pair, error: &TreeError) -> ReadOutcome {
-        self.refuse_with(format!(
-            "pair {pair}: the checkpoint can't be read: {error}. Leave it to the evaluator."
-        ))
+    fn cannot_read(&mut self, pair: Pair, error: &TreeError) -> ReadOutcome {
+        if error.is_the_writers() {
+            self.unreadable = None;
+            return self.refuse_with(format!(
+                "pair {pair}: the checkpoint can't be read: {error}. Leave it to the evaluator."
+            ));
+        }
+        let reason = format!("pair {pair}: the checkpoint can't be read on this node: {error}");
+        if self.unreadable.as_ref() != Some(&reason) {
+            tracing::warn!("{reason}. It is tried again in each round.");
+        }
+        self.unreadable = Some(reason);
+        ReadOutcome::Unusable
     }
 
     fn refuse_with(&mut self, reason: String) -> ReadOutcome {

@@ -1,10 +1,13 @@
-//! Checkpoints of an evaluator that was started again.
+//! Checkpoints of an evaluator that was started again, and checkpoints that the node can't read.
 
 use std::sync::Arc;
 
+use leaderboard_runner::protocol::{Mark, Side};
+use nix::errno::Errno;
+
 use super::tests::seen_on_a_volume::{Volume, text};
 use super::*;
-use crate::pod::fixtures::{checkpoint, put_checkpoint, run};
+use crate::pod::fixtures::{checkpoint, put_checkpoint, put_status, run};
 use crate::pod::gather::{Gatherer, results_plan};
 use crate::pod::keys::MERGED;
 use crate::pod::tree::Tree;
@@ -141,4 +144,44 @@ fn a_later_checkpoint_with_fewer_routes_does_not_replace_the_one_before() {
         .replacen("100.0", "90.0", 1);
     put_checkpoint(volume.folder.path(), 1, &other);
     assert_eq!(text(&volume.round().0, "agent/agent1/agent_results.json"), other);
+}
+
+#[test]
+fn a_checkpoint_that_the_node_cannot_read_is_tried_again_and_spoils_nothing() {
+    for trouble in [Errno::EMFILE, Errno::ENFILE, Errno::EIO, Errno::ENOMEM] {
+        let mut volume = Volume::new();
+        let tree = Arc::new(Tree::open(volume.folder.path()).unwrap());
+        volume.gatherer = Gatherer::new(results_plan(&run()).unwrap(), Arc::clone(&tree)).unwrap();
+        put_checkpoint(volume.folder.path(), 1, &checkpoint(0, 2, 2));
+        put_checkpoint(volume.folder.path(), 2, &checkpoint(2, 1, 2));
+        volume.round();
+        put_checkpoint(volume.folder.path(), 2, &checkpoint(2, 2, 2));
+        for pair in [1, 2] {
+            put_status(volume.folder.path(), Side::Agent, pair, Mark::Done);
+        }
+        *tree.disk.lock().unwrap() = Some(trouble);
+        for _ in 0..2 {
+            let (gathered, seen) = volume.round();
+            assert_eq!((gathered.why(), seen.spoiled), (None, None), "{trouble}");
+            assert_eq!(gathered.pairs[1].done, 1);
+        }
+        *tree.disk.lock().unwrap() = None;
+        assert!(volume.round().0.is_complete(), "{trouble}");
+    }
+}
+
+#[test]
+fn a_checkpoint_that_its_agent_has_shut_is_the_agents() {
+    // A lease on the file, too: its holder can take one again and again.
+    for trouble in [Errno::EACCES, Errno::EPERM, Errno::EAGAIN, Errno::ELOOP] {
+        let mut volume = Volume::new();
+        let tree = Arc::new(Tree::open(volume.folder.path()).unwrap());
+        volume.gatherer = Gatherer::new(results_plan(&run()).unwrap(), Arc::clone(&tree)).unwrap();
+        put_status(volume.folder.path(), Side::Agent, 1, Mark::Done);
+        *tree.disk.lock().unwrap() = Some(trouble);
+        let (gathered, seen) = volume.round();
+        let why = gathered.why().unwrap();
+        assert!(why.starts_with("pair 1: the checkpoint can't be read: "), "{why}");
+        assert_eq!(seen.spoiled, Some((why, Duration::ZERO)), "{trouble}");
+    }
 }
