@@ -254,6 +254,13 @@ impl Tree {
         Ok(file.into())
     }
 
+    /// Removes a file.
+    pub fn remove(&self, relative: &str) -> Result<(), TreeError> {
+        let (folder, name) = relative.rsplit_once('/').ok_or(TreeError::Path)?;
+        let folder = self.at(folder, OFlag::O_RDONLY | OFlag::O_DIRECTORY)?;
+        Ok(unlinkat(&folder, name, UnlinkatFlags::NoRemoveDir)?)
+    }
+
     /// Writes one of our own files under another name first, so that no reader gets half of it.
     pub fn write(&self, relative: &str, bytes: &[u8]) -> Result<(), TreeError> {
         use std::io::Write;
