@@ -154,12 +154,53 @@ fn workers_and_routes_make_a_missing_worker_not_final() {
     let flags = ["--workers", "4", "--routes", "8"];
     let output = results("v2", folder.path(), &flags, &three);
     assert_eq!(stdout(&output), "6 of 8 routes, Started, not final\n");
+    let absent = three[3].display();
+    let why = format!("not final: worker 4 ({absent}) has 0 of its 2 route runs");
+    assert_eq!(stderr(&output).lines().last(), Some(why.as_str()));
     let summary = fs::read_to_string(folder.path().join("stdout.txt")).unwrap();
     assert!(summary.contains("- Completed 6 out of the 8 routes\n"), "{summary}");
 
     let flags = ["--workers", "4", "--routes", "8", "--as-original"];
     let output = results("v2", folder.path(), &flags, &three);
     assert!(stdout(&output).contains(", final\n"), "the original believes the files");
+}
+
+#[test]
+fn slices_of_a_hosts_own_are_final_and_the_operators_show_which_worker_differs() {
+    let folder = tempfile::tempdir().unwrap();
+    let three = &inputs("v2/case05")[..3];
+    // Two routes each, and the plan of another split.
+    let flags = ["--slices", "0-1,2-3,4-5"];
+    let output = results("v2", folder.path(), &flags, three);
+    assert!(
+        stdout(&output).ends_with(", final\n"),
+        "{}{}",
+        stdout(&output),
+        stderr(&output)
+    );
+    assert_eq!(stderr(&output), "");
+
+    let output = results("v2", folder.path(), &["--slices", "0-2,3-4,5-5"], three);
+    assert_eq!(stdout(&output), "6 of 6 routes, Started, not final\n");
+    let [first, _, last] = [0, 1, 2].map(|place| three[place].display());
+    let why = format!(
+        "not final: worker 1 ({first}) has 2 of its 3 route runs\n\
+         not final: worker 3 ({last}) has 2 route runs, more than its 1; --slices gives the routes of each\n"
+    );
+    assert_eq!(stderr(&output), why);
+}
+
+#[test]
+fn files_that_lost_their_sensors_are_the_originals_and_count() {
+    let folder = tempfile::tempdir().unwrap();
+    let real = cases().join("../restarted/done");
+    let files: Vec<PathBuf> = (1..=4).map(|i| real.join(format!("in{i}.json"))).collect();
+    let output = results("v2", folder.path(), &["--workers", "4", "--routes", "16"], &files);
+    assert_eq!(stdout(&output), "16 of 16 routes, Finished, final\n");
+    let note = "the merged file says Invalid, as the original's; this run counts as Finished\n";
+    assert_eq!(stderr(&output), note);
+    let merged = fs::read(folder.path().join("agent_results.json")).unwrap();
+    assert!(merged == fs::read(real.join("merged.json")).unwrap(), "it differs");
 }
 
 #[test]
@@ -205,6 +246,13 @@ fn arguments_that_can_not_be_meant_are_refused() {
         ),
         (vec!["--workers", "4"], "--routes"),
         (vec!["--repetitions", "2"], "--workers"),
+        (vec!["--slices", "0-4,5-9"], "--slices has 2, but 4 files are named"),
+        (vec!["--slices", "0-4,5,6-7,8-9"], "write first-last, for example 5-9"),
+        (
+            vec!["--slices", "0-4,4-9,10-14,15-19"],
+            "the slices 0-4 and 4-9 overlap",
+        ),
+        (vec!["--slices", "0-4,5-9,10-14,15-19", "--workers", "4"], "--workers"),
         (vec!["--verify", "maybe"], "possible values: off, warn, refuse"),
     ] {
         let said = leaves_all("v2", &flags, &four, 2);

@@ -18,6 +18,7 @@ mod files;
 mod ministack;
 
 mod resume {
+    mod driven;
     mod kills;
     mod kubelet;
     mod largest;

@@ -8,10 +8,10 @@ use std::process::ExitCode;
 use std::thread;
 
 use clap::{Args, ValueEnum};
-use leaderboard_results::{Files, Format, Plan, Refusal, Verify, offline};
+use leaderboard_results::{Files, Format, Merged, PairProgress, Plan, Refusal, Slice, Verify, offline};
 
 use crate::crds;
-use leaderboard_api::effective;
+use leaderboard_api::{RouteSlice, effective};
 
 /// Exit code of a refusal: nothing that had been good is overwritten.
 const REFUSED: u8 = 2;
@@ -76,8 +76,12 @@ pub(super) struct Results {
     /// Routes of the whole run, not counting repetitions.
     #[arg(long, requires = "workers")]
     routes: Option<u32>,
+    /// The routes of each worker, if they were not shared out as the operator does: 0-10,11-21,22-31,32-41. In place of --workers and
+    /// --routes.
+    #[arg(long, value_delimiter = ',', conflicts_with_all = ["workers", "routes"])]
+    slices: Vec<RouteSlice>,
     /// How often each route was driven; default 5 in V1, 1 in V2.
-    #[arg(long, requires = "workers")]
+    #[arg(long)]
     repetitions: Option<u32>,
     /// Decide as the original does, its mistakes included.
     #[arg(long)]
@@ -141,9 +145,41 @@ impl Results {
         for warning in &merged.warnings {
             eprintln!("warning: {warning}");
         }
+        if merged.ended_as() != merged.entry_status {
+            let (file, run) = (&merged.entry_status, merged.ended_as());
+            eprintln!("the merged file says {file}, as the original's; this run counts as {run}");
+        }
+        for reason in self.why_not_final(&merged) {
+            eprintln!("not final: {reason}");
+        }
         let state = if merged.is_final { "final" } else { "not final" };
-        let (done, total, status) = (merged.done, merged.total, &merged.entry_status);
+        let (done, total, status) = (merged.done, merged.total, merged.ended_as());
         Ok(format!("{done} of {total} routes, {status}, {state}"))
+    }
+
+    /// Each worker that has another number of route runs than it should, in a sentence.
+    fn why_not_final(&self, merged: &Merged) -> Vec<String> {
+        if merged.is_final {
+            return Vec::new();
+        }
+        let workers = (1..).zip(self.inputs.iter().zip(&merged.pairs));
+        let differing = workers.filter(|(_, (_, pair))| pair.done != pair.total);
+        let sentence = |(number, (path, pair)): (u32, (&PathBuf, &PairProgress))| {
+            let PairProgress { done, total, .. } = *pair;
+            let file = path.display();
+            if done < total {
+                format!("worker {number} ({file}) has {done} of its {total} route runs")
+            } else {
+                format!(
+                    "worker {number} ({file}) has {done} route runs, more than its {total}; --slices gives the routes of each"
+                )
+            }
+        };
+        let reasons: Vec<String> = differing.map(sentence).collect();
+        if reasons.is_empty() {
+            return vec!["the files promise no route".to_owned()];
+        }
+        reasons
     }
 
     fn plan(&self) -> Result<Plan, Failure> {
@@ -158,11 +194,41 @@ impl Results {
             verify,
             ..Plan::lenient(format)
         };
-        let (Some(workers), Some(routes)) = (self.workers, self.routes) else {
-            return Ok(plan);
+        let pairs: Vec<Slice> = self.slices()?.into_iter().map(of_plan).collect();
+        if pairs.is_empty() {
+            return match self.repetitions {
+                None => Ok(plan),
+                Some(_) => Err(Failure::Arguments(
+                    "--repetitions needs --workers and --routes, or --slices".to_owned(),
+                )),
+            };
+        }
+        let usual = match format {
+            Format::V1 => 5,
+            Format::V2 => 1,
         };
-        if workers != self.inputs.len() {
-            let files = self.inputs.len();
+        let plan = Plan {
+            routes: pairs.iter().map(|slice| slice.routes()).fold(0, u32::saturating_add),
+            pairs,
+            repetitions: self.repetitions.unwrap_or(usual),
+            ..plan
+        };
+        plan.check()?;
+        Ok(plan)
+    }
+
+    /// The routes of each worker; none where the files are to decide.
+    fn slices(&self) -> Result<Vec<RouteSlice>, Failure> {
+        let files = self.inputs.len();
+        let (Some(workers), Some(routes)) = (self.workers, self.routes) else {
+            let slices = self.slices.len();
+            if slices != 0 && slices != files {
+                let words = format!("--slices has {slices}, but {files} files are named; name absent ones too");
+                return Err(Failure::Arguments(words));
+            }
+            return Ok(self.slices.clone());
+        };
+        if workers != files {
             let words = format!("--workers {workers}, but {files} files are named; name absent ones too");
             return Err(Failure::Arguments(words));
         }
@@ -171,25 +237,12 @@ impl Results {
             let words = format!("--routes {routes} can't be shared out over {workers} workers: some would have none");
             return Err(Failure::Arguments(words));
         }
-        let usual = match format {
-            Format::V1 => 5,
-            Format::V2 => 1,
-        };
-        let plan = Plan {
-            pairs: effective::slices(routes_in_all, workers)
-                .into_iter()
-                .map(|slice| leaderboard_results::Slice {
-                    first: slice.first,
-                    last: slice.last,
-                })
-                .collect(),
-            routes,
-            repetitions: self.repetitions.unwrap_or(usual),
-            ..plan
-        };
-        plan.check()?;
-        Ok(plan)
+        Ok(effective::slices(routes_in_all, workers))
     }
+}
+
+fn of_plan(RouteSlice { first, last }: RouteSlice) -> Slice {
+    Slice { first, last }
 }
 
 fn read(path: &Path) -> Result<Option<Vec<u8>>, Failure> {

@@ -1,7 +1,7 @@
 //! What the pairs have so far: their checkpoints read, merged and rendered, and their status files.
 //!
 //! Called by `logcopy` once a round. Reads the `logs` volume through [`Tree`] and writes nothing; knows no S3. A checkpoint that
-//! is torn, gone or refused leaves the last good one in place. What is to be stored is handed out from memory, so that no torn
+//! is torn, gone, refused or poorer leaves the last good one in place. What is to be stored is handed out from memory, so that no torn
 //! file and no full disk comes between the results and S3. [`Plan::limits_of`] bounds the memory of all pairs together.
 
 use std::collections::BTreeMap;
@@ -97,6 +97,8 @@ struct Worker {
     /// The runner's copy as it was read last.
     kept: Option<Stamp>,
     refused: Option<String>,
+    /// Why this node can't read it at present, which says nothing about its content.
+    unreadable: Option<String>,
 }
 
 /// What reading a checkpoint gave.
@@ -128,6 +130,8 @@ pub struct Gathered {
     pub pairs: Vec<ReportPair>,
     /// Why each pair's checkpoint is refused, if it is.
     pub refused: Vec<Option<String>>,
+    /// Each pair whose checkpoint this node can't read at present.
+    pub unreadable: Vec<bool>,
     /// Why the checkpoints can't be merged, if they can't.
     pub unmerged: Option<String>,
 }
@@ -236,6 +240,7 @@ impl Gatherer {
             pairs,
             seen,
             refused: self.workers.iter().map(|worker| worker.refused.clone()).collect(),
+            unreadable: self.workers.iter().map(|worker| worker.unreadable.is_some()).collect(),
             unmerged: self.unmerged.clone(),
         }
     }
@@ -249,10 +254,14 @@ impl Gatherer {
         };
         let (file, stamp) = match self.tree.file(&path) {
             Ok(Some(found)) => found,
-            Ok(None) => return ReadOutcome::Unusable,
-            Err(error) => return worker.refuse(pair, &error),
+            Ok(None) => {
+                worker.unreadable = None;
+                return ReadOutcome::Unusable;
+            }
+            Err(error) => return worker.cannot_read(pair, &error),
         };
         if worker.seen == Some(stamp) {
+            worker.unreadable = None;
             return ReadOutcome::Same;
         }
         drop(file);
@@ -260,17 +269,24 @@ impl Gatherer {
             Ok(Some(read)) => read,
             // The next round finds it whole.
             Ok(None) | Err(TreeError::Changed) => return ReadOutcome::Unusable,
-            Err(error) => return worker.refuse(pair, &error),
+            Err(error) => return worker.cannot_read(pair, &error),
         };
+        worker.unreadable = None;
         match leaderboard_results::read_worker(&self.plan, index, &bytes) {
             Ok(None) => ReadOutcome::Unusable,
             Ok(Some(checkpoint)) => {
                 worker.seen = Some(stamp);
-                worker.good = Some(checkpoint);
-                self.objects.insert(path, Object::new(bytes));
                 if let Some(why) = worker.refused.take() {
                     tracing::info!(pair = pair.get(), "the checkpoint is good again; before: {why}");
                 }
+                if !worker.take(checkpoint) {
+                    tracing::info!(
+                        pair = pair.get(),
+                        "the new checkpoint has less than the one before, which stays"
+                    );
+                    return ReadOutcome::Same;
+                }
+                self.objects.insert(path, Object::new(bytes));
                 ReadOutcome::New
             }
             Err(refusal) => {
@@ -299,14 +315,11 @@ impl Gatherer {
         let Ok(Some(kept)) = leaderboard_results::read_worker(&self.plan, index, &bytes) else {
             return false;
         };
-        // Where the evaluator resumes counts, too: V1 has a file with a route's record that does not count it yet.
-        let reached = |checkpoint: &Checkpoint| (checkpoint.done(), checkpoint.counted(), checkpoint.ended());
-        if worker.good.as_ref().is_some_and(|good| reached(good) >= reached(&kept)) {
-            return false;
+        let is_taken = worker.take(kept);
+        if is_taken {
+            self.objects.insert(checkpoint_path(pair), Object::new(bytes));
         }
-        worker.good = Some(kept);
-        self.objects.insert(checkpoint_path(pair), Object::new(bytes));
-        true
+        is_taken
     }
 
     fn merge(&mut self) {
@@ -355,10 +368,30 @@ impl Gatherer {
 }
 
 impl Worker {
-    fn refuse(&mut self, pair: Pair, error: &TreeError) -> ReadOutcome {
-        self.refuse_with(format!(
-            "pair {pair}: the checkpoint can't be read: {error}. Leave it to the evaluator."
-        ))
+    /// Takes a checkpoint, unless it has less than the last good one. Returns whether it did.
+    fn take(&mut self, found: Checkpoint) -> bool {
+        let next = match &self.good {
+            Some(good) => found.after(good),
+            None => Some(found),
+        };
+        let is_taken = next.is_some();
+        self.good = next.or(self.good.take());
+        is_taken
+    }
+
+    fn cannot_read(&mut self, pair: Pair, error: &TreeError) -> ReadOutcome {
+        if error.is_the_writers() {
+            self.unreadable = None;
+            return self.refuse_with(format!(
+                "pair {pair}: the checkpoint can't be read: {error}. Leave it to the evaluator."
+            ));
+        }
+        let reason = format!("pair {pair}: the checkpoint can't be read on this node: {error}");
+        if self.unreadable.as_ref() != Some(&reason) {
+            tracing::warn!("{reason}. It is tried again in each round.");
+        }
+        self.unreadable = Some(reason);
+        ReadOutcome::Unusable
     }
 
     fn refuse_with(&mut self, reason: String) -> ReadOutcome {

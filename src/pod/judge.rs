@@ -147,14 +147,16 @@ impl Judge {
 }
 
 /// A pair that reports it is done without complete results will not get them any more. An agent's report alone ends
-/// nothing well: it can only end its own run badly.
+/// nothing well: it can only end its own run badly. Nothing is known of a checkpoint that this node can't read: if that lasts, the run
+/// ends without final results, which is the infrastructure's failure.
 fn spoiled(gathered: &Gathered) -> Option<String> {
     if gathered.is_complete() {
         return None;
     }
     let ended = gathered.seen.iter().zip(&gathered.pairs).zip(&gathered.refused);
-    let mut short = ended.filter(|((seen, pair), _)| seen.agent.done && pair.done < pair.total);
-    if let Some(((_, pair), refused)) = short.next() {
+    let readable = ended.zip(&gathered.unreadable).filter(|(_, unreadable)| !**unreadable);
+    let mut short = readable.filter(|(((seen, pair), _), _)| seen.agent.done && pair.done < pair.total);
+    if let Some((((_, pair), refused), _)) = short.next() {
         let incomplete = || {
             format!(
                 "pair {} ended with {} of its {} route runs. Leave the checkpoint to the evaluator.",
@@ -167,6 +169,9 @@ fn spoiled(gathered: &Gathered) -> Option<String> {
     gathered.unmerged.clone().filter(|_| all_done)
 }
 
+#[cfg(test)]
+#[path = "judge_file_tests.rs"]
+mod file_tests;
 #[cfg(test)]
 #[path = "judge_tests.rs"]
 mod tests;

@@ -119,7 +119,7 @@ fn a_pair_that_ended_badly_ends_the_run() {
     }
 }
 
-mod seen_on_a_volume {
+pub(super) mod seen_on_a_volume {
     use std::fs;
     use std::sync::Arc;
 
@@ -132,15 +132,15 @@ mod seen_on_a_volume {
     use crate::pod::tree::Tree;
     use leaderboard_api::{PairState, RouteSlice};
 
-    struct Volume {
-        folder: tempfile::TempDir,
-        gatherer: Gatherer,
+    pub(crate) struct Volume {
+        pub(crate) folder: tempfile::TempDir,
+        pub(crate) gatherer: Gatherer,
         judge: Judge,
         now: u64,
     }
 
     impl Volume {
-        fn new() -> Self {
+        pub(crate) fn new() -> Self {
             let folder = tempfile::tempdir().unwrap();
             let tree = Arc::new(Tree::open(folder.path()).unwrap());
             Self {
@@ -151,7 +151,7 @@ mod seen_on_a_volume {
             }
         }
 
-        fn round(&mut self) -> (Gathered, Situation) {
+        pub(crate) fn round(&mut self) -> (Gathered, Situation) {
             self.now += 10;
             let gathered = self.gatherer.round();
             let outside = Outside {
@@ -165,7 +165,7 @@ mod seen_on_a_volume {
         }
     }
 
-    fn text<'a>(gathered: &'a Gathered, key: &str) -> &'a str {
+    pub(crate) fn text<'a>(gathered: &'a Gathered, key: &str) -> &'a str {
         std::str::from_utf8(&gathered.objects[key].bytes).unwrap()
     }
 

@@ -58,6 +58,20 @@ pub enum TreeError {
     Io(#[from] io::Error),
 }
 
+impl TreeError {
+    /// True if the file is the reason, which its writer can change. A write lease on it, too (EWOULDBLOCK). Everything else is the trouble
+    /// of this process or its node: no descriptors, no memory, a disk that fails.
+    pub fn is_the_writers(&self) -> bool {
+        match self {
+            Self::NotRegular | Self::TooLarge { .. } | Self::Path | Self::Changed => true,
+            Self::Io(error) => matches!(
+                error.kind(),
+                io::ErrorKind::PermissionDenied | io::ErrorKind::WouldBlock
+            ),
+        }
+    }
+}
+
 impl From<Errno> for TreeError {
     fn from(errno: Errno) -> Self {
         match errno {
@@ -88,9 +102,9 @@ impl Walk {
 pub struct Tree {
     root: OwnedFd,
     path: PathBuf,
-    /// A disk that hangs, while a test holds it.
+    /// A disk that hangs, while a test holds it, or fails.
     #[cfg(test)]
-    pub(super) disk: std::sync::Mutex<()>,
+    pub(super) disk: std::sync::Mutex<Option<Errno>>,
 }
 
 impl Tree {
@@ -104,7 +118,7 @@ impl Tree {
             root: root.into(),
             path: path.to_owned(),
             #[cfg(test)]
-            disk: std::sync::Mutex::new(()),
+            disk: std::sync::Mutex::new(None),
         })
     }
 
@@ -116,7 +130,9 @@ impl Tree {
     /// Opens a regular file for reading; `None` if there is none.
     pub fn file(&self, relative: &str) -> Result<Option<(File, Stamp)>, TreeError> {
         #[cfg(test)]
-        drop(self.disk.lock());
+        if let Some(trouble) = self.disk.lock().ok().and_then(|disk| *disk) {
+            return Err(trouble.into());
+        }
         let opened = self
             .look(relative)
             .and_then(|()| self.at(relative, OFlag::O_RDONLY | OFlag::O_NONBLOCK));
@@ -236,6 +252,13 @@ impl Tree {
         let file = openat(&folder, name, flags, mode)?;
         fchmod(&file, mode)?;
         Ok(file.into())
+    }
+
+    /// Removes a file.
+    pub fn remove(&self, relative: &str) -> Result<(), TreeError> {
+        let (folder, name) = relative.rsplit_once('/').ok_or(TreeError::Path)?;
+        let folder = self.at(folder, OFlag::O_RDONLY | OFlag::O_DIRECTORY)?;
+        Ok(unlinkat(&folder, name, UnlinkatFlags::NoRemoveDir)?)
     }
 
     /// Writes one of our own files under another name first, so that no reader gets half of it.

@@ -9,6 +9,7 @@ mod hostile;
 mod limits;
 mod measure;
 mod preparing;
+mod restarted;
 mod role;
 mod shelf;
 mod sidecar;

@@ -152,6 +152,10 @@ impl Submission {
             .arg(format!("--work={}", work.display()))
             .arg(format!("--checkpoint={}", checkpoint.display()))
             .args(["--idle-seconds=60", "--python-path", path.to_str().unwrap()])
+            .arg(format!(
+                "--route-runs={}",
+                slice.routes() * u32::try_from(self.run.plan.repetitions).unwrap()
+            ))
             .arg("--")
             .arg(&programs().agent)
             .arg("-u")

@@ -31,7 +31,7 @@ pub struct Merged {
     pub total: u32,
     /// Whether nothing is missing, so that there is a global record.
     pub is_final: bool,
-    /// Whether the results count.
+    /// Whether the results count. In V2 the merged file may deny it, as the original does where no worker's file names sensors any more.
     pub eligible: bool,
     /// The `entry_status` of the merged file.
     pub entry_status: String,
@@ -85,11 +85,13 @@ pub(crate) struct Line {
 }
 
 impl Merged {
-    /// The `entry_status`, or what V1 has no entry status for: `Crashed` and `Rejected` runs that do not count.
+    /// The `entry_status`, or how the run ended where the merged file has another: V1 has none for `Crashed` and `Rejected`, and V2 calls
+    /// files without sensors invalid.
     pub fn ended_as(&self) -> &str {
         match self.outcome {
             Outcome::Crashed => names::CRASHED,
             Outcome::Rejected => names::REJECTED,
+            Outcome::Finished if self.entry_status == names::INVALID => names::FINISHED,
             Outcome::Running | Outcome::Finished | Outcome::Invalid => &self.entry_status,
         }
     }
@@ -116,7 +118,7 @@ pub fn merge(plan: &Plan, workers: &[Option<&Checkpoint>]) -> Result<Merged, Ref
         global_so_far(plan, &done_unsorted, &done_sorted)
     };
     let global = is_final.then(|| global(plan, &unsorted, &sorted)).transpose()?;
-    let verdict = Verdict::of(plan, &sorted, &sensors, is_final);
+    let verdict = Verdict::of(plan, workers, (&sorted, &sensors), is_final);
     let text = text(plan.format, &sorted, [done, total], &sensors, global.as_ref(), &verdict)
         .map_err(|limit| Refusal::Output { limit })?;
     Ok(Merged {
@@ -124,7 +126,7 @@ pub fn merge(plan: &Plan, workers: &[Option<&Checkpoint>]) -> Result<Merged, Ref
         done,
         total,
         is_final,
-        eligible: verdict.eligible,
+        eligible: verdict.outcome == Outcome::Finished,
         entry_status: verdict.entry_status.to_owned(),
         outcome: verdict.outcome,
         score: global.as_ref().map(|global| global.mean(Score::Composed).as_f64()),
@@ -295,10 +297,7 @@ fn by_route<'a>(records: &[&'a Record]) -> Vec<&'a Record> {
 /// The records of the routes that are done, in the order of the files: a route that its evaluator is going to repeat is not.
 fn done_records<'a>(workers: &[Option<&'a Checkpoint>]) -> Vec<&'a Record> {
     let workers = workers.iter().flatten();
-    let done = workers.flat_map(|worker| {
-        let count = usize::try_from(worker.done()).unwrap_or(usize::MAX);
-        worker.records.iter().take(count)
-    });
+    let done = workers.flat_map(|worker| worker.done_records());
     done.collect()
 }
 

@@ -198,12 +198,18 @@ pub fn metrics(format: Format) -> &'static [Metric] {
 
 /// The entry status of a file whose last route ended with a crashed simulator.
 pub(crate) const CRASHED: &str = "Crashed";
+/// The entry status of an evaluator that came to its end with results that count.
+pub(crate) const FINISHED: &str = "Finished";
+/// The entry status of a file that contradicts itself. An evaluator of V2 does not resume from it.
+pub(crate) const INVALID: &str = "Invalid";
 /// The entry status of a run whose agent asked for sensors it may not have.
 pub(crate) const REJECTED: &str = "Rejected";
 /// Part of the status of a route with a crashed simulator.
 pub(crate) const SIMULATION_CRASHED: &str = "Simulation crashed";
 /// Part of the status of a route with forbidden sensors.
 pub(crate) const SENSORS_INVALID: &str = "Agent's sensors were invalid";
+/// Part of the status of a route whose agent could not be set up.
+pub(crate) const NOT_SET_UP: &str = "Agent couldn't be set up";
 /// The status of a record that was never computed.
 pub(crate) const STARTED: &str = "Started";
 /// The status of a route whose end was reached, with infractions in V2.

@@ -130,6 +130,17 @@ fn ordinal(index: usize) -> usize {
 }
 
 impl Refusal {
+    /// True if the file has a route that is none of the pair's: it is of another run, or of this one before its plan was changed.
+    pub fn is_of_other_routes(&self) -> bool {
+        let Self::Record { problem, .. } = self else {
+            return false;
+        };
+        matches!(
+            problem,
+            RecordProblem::OutsideSlice { .. } | RecordProblem::Repetition { .. }
+        )
+    }
+
     /// What the reader can do about it, as one sentence.
     pub fn next_step(&self) -> &'static str {
         match self {

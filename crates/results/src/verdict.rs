@@ -3,8 +3,8 @@
 
 use crate::checkpoint::Record;
 use crate::json::Text;
-use crate::names::{CRASHED, REJECTED, SENSORS_INVALID, SIMULATION_CRASHED, STARTED};
-use crate::{Format, Plan};
+use crate::names::{CRASHED, FINISHED, INVALID, REJECTED, SENSORS_INVALID, SIMULATION_CRASHED, STARTED};
+use crate::{Checkpoint, Format, Plan};
 
 /// How a run ended, whatever the format calls it.
 #[derive(Clone, Copy, Debug, PartialEq, Eq, Hash)]
@@ -33,15 +33,21 @@ impl Outcome {
     }
 }
 
-/// The outcome of the whole run, as the merged file has it.
+/// The outcome of the whole run, and what the merged file has of it.
 pub(crate) struct Verdict {
     pub(crate) entry_status: &'static str,
     pub(crate) eligible: bool,
+    /// The original calls every file without sensors invalid, whatever its workers had.
     pub(crate) outcome: Outcome,
 }
 
 impl Verdict {
-    pub(crate) fn of(plan: &Plan, sorted: &[&Record], sensors: &[Text], is_final: bool) -> Self {
+    pub(crate) fn of(
+        plan: &Plan,
+        workers: &[Option<&Checkpoint>],
+        (sorted, sensors): (&[&Record], &[Text]),
+        is_final: bool,
+    ) -> Self {
         if !is_final {
             return Self {
                 entry_status: STARTED,
@@ -51,7 +57,20 @@ impl Verdict {
         }
         match plan.format {
             Format::V1 => Self::v1(sorted, plan.as_original),
-            Format::V2 => Self::v2(sorted, sensors),
+            Format::V2 if sensors.is_empty() => {
+                let has_named = |worker: &&Checkpoint| worker.counts_without_sensors();
+                let counts = !plan.as_original && workers.iter().flatten().all(has_named);
+                Self {
+                    entry_status: INVALID,
+                    eligible: false,
+                    outcome: if counts {
+                        Self::v2(sorted).outcome
+                    } else {
+                        Outcome::Invalid
+                    },
+                }
+            }
+            Format::V2 => Self::v2(sorted),
         }
     }
 
@@ -65,25 +84,25 @@ impl Verdict {
             entry_status: if has_agent_errors {
                 "Finished with agent errors"
             } else {
-                "Finished"
+                FINISHED
             },
             eligible: outcome == Outcome::Finished,
             outcome,
         }
     }
 
-    fn v2(sorted: &[&Record], sensors: &[Text]) -> Self {
-        let is_invalid = sensors.is_empty() || sorted.iter().any(|record| record.status == STARTED);
+    fn v2(sorted: &[&Record]) -> Self {
+        let is_invalid = sorted.iter().any(|record| record.status == STARTED);
         let outcome = if is_invalid {
             Outcome::Invalid
         } else {
             telling(sorted).unwrap_or(Outcome::Finished)
         };
         let entry_status = match outcome {
-            Outcome::Invalid => "Invalid",
+            Outcome::Invalid => INVALID,
             Outcome::Crashed => CRASHED,
             Outcome::Rejected => REJECTED,
-            Outcome::Running | Outcome::Finished => "Finished",
+            Outcome::Running | Outcome::Finished => FINISHED,
         };
         Self {
             entry_status,

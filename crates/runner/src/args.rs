@@ -36,6 +36,7 @@ agent:      --work /tmp/agent      where leaderboard.log is written
             --idle-seconds 800     no output for so long ends the command
             --python-path A:B:C    put in front of the image's own PYTHONPATH
             --report-gpu false     true: looks for a GPU before anything else, and reports it to the simulator
+            --route-runs N         the pair's routes times repetitions: CMD is not started on a checkpoint that has all of them
 ";
 
 /// Where agents keep their results, as everywhere in the CARLA Leaderboard's cloud.
@@ -87,6 +88,8 @@ pub enum Role {
         python_path: Option<OsString>,
         /// Whether it reports that it sees a GPU.
         report_gpu: bool,
+        /// How many route runs its evaluator is to drive, if that is known.
+        route_runs: Option<u32>,
     },
 }
 
@@ -218,6 +221,7 @@ fn role(side: Side, options: &mut Options) -> Result<Role, UsageError> {
             idle: options.seconds("--idle-seconds", 800)?,
             python_path: options.take("--python-path")?.filter(|value| !value.is_empty()),
             report_gpu: options.optional("--report-gpu", "true or false")?.unwrap_or(false),
+            route_runs: options.optional("--route-runs", "a number of routes")?,
         },
     })
 }
@@ -382,18 +386,23 @@ mod tests {
                 idle,
                 python_path,
                 report_gpu,
+                route_runs,
                 ..
-            } => (work, idle.as_secs(), job.log_limit, python_path, report_gpu),
+            } => (
+                (work, idle.as_secs(), job.log_limit),
+                python_path,
+                (report_gpu, route_runs),
+            ),
             Role::Simulator { .. } => panic!("an agent's line"),
         };
         assert_eq!(
             role(job(&format!("{line} -- a"))),
-            (WORK.into(), 800, 2 << 30, None, false)
+            ((WORK.into(), 800, 2 << 30), None, (false, None))
         );
         let more = job(&format!(
-            "{line} --work /w --idle-seconds 3 --log-limit 9 --python-path=/a:/b --report-gpu=true -- a"
+            "{line} --work /w --idle-seconds 3 --log-limit 9 --python-path=/a:/b --report-gpu=true --route-runs 5 -- a"
         ));
-        assert_eq!(role(more), ("/w".into(), 3, 9, Some("/a:/b".into()), true));
+        assert_eq!(role(more), (("/w".into(), 3, 9), Some("/a:/b".into()), (true, Some(5))));
     }
 
     #[test]

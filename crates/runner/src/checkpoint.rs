@@ -11,7 +11,7 @@ use std::path::Path;
 
 use nix::fcntl::OFlag;
 use serde::Deserialize;
-use serde::de::{Deserializer, IgnoredAny, MapAccess, SeqAccess, Visitor};
+use serde::de::{DeserializeSeed, Deserializer, IgnoredAny, MapAccess, SeqAccess, Visitor};
 use thiserror::Error;
 
 /// No larger checkpoint is read, in bytes.
@@ -24,6 +24,9 @@ pub(crate) struct Checkpoint {
     pub(crate) complete: bool,
     /// `_checkpoint.progress` is a list with something in it: there is something to resume.
     pub(crate) partial: bool,
+    /// So many route runs are all that the file promises, and its evaluator has driven and counted each of them: started again, it would
+    /// drive none.
+    pub(crate) driven: Option<u32>,
 }
 
 /// Why there is no checkpoint to read.
@@ -59,10 +62,19 @@ pub(crate) fn parse(file: File) -> Result<Checkpoint, Unreadable> {
     let Inner {
         global_record,
         progress,
+        records,
     } = document.checkpoint;
+    let (counted, found) = (progress.list(), records.list().length);
+    let driven = match counted.first {
+        [Some(done), Some(total)] if done == total && found >= total && !document.entry_status.goes_back() => {
+            Some(total)
+        }
+        _ => None,
+    };
     Ok(Checkpoint {
         complete: global_record == Filled::Object,
-        partial: progress == Filled::List,
+        partial: counted.length > 0,
+        driven: driven.filter(|runs| *runs > 0),
     })
 }
 
@@ -153,6 +165,8 @@ impl<R: Read> Read for PythonJson<R> {
 struct Document {
     #[serde(rename = "_checkpoint")]
     checkpoint: Inner,
+    #[serde(default)]
+    entry_status: Filled,
 }
 
 #[derive(Deserialize)]
@@ -161,24 +175,60 @@ struct Inner {
     global_record: Filled,
     #[serde(default)]
     progress: Filled,
+    #[serde(default)]
+    records: Filled,
 }
 
-/// The outermost shape of a value; what is inside is skipped without being kept.
+/// The outermost shape of a value; what is inside is skipped without being kept, but for a list's first numbers.
 #[derive(Debug, Default, PartialEq)]
 enum Filled {
     Object,
-    List,
+    List(Listed),
+    Number(u32),
+    /// An entry status after which the evaluator does not go on from where it has counted: a crashed route is repeated, and an
+    /// invalid file is begun anew.
+    GoesBack,
     #[default]
     Nothing,
 }
 
-impl<'de> Deserialize<'de> for Filled {
-    fn deserialize<D: Deserializer<'de>>(deserializer: D) -> Result<Self, D::Error> {
-        deserializer.deserialize_any(Shape)
+/// A list.
+#[derive(Debug, Default, Clone, Copy, PartialEq)]
+struct Listed {
+    length: u32,
+    first: [Option<u32>; 2],
+}
+
+impl Filled {
+    fn list(&self) -> Listed {
+        match self {
+            Self::List(list) => *list,
+            _ => Listed::default(),
+        }
+    }
+
+    fn goes_back(&self) -> bool {
+        *self == Self::GoesBack
     }
 }
 
-struct Shape;
+impl<'de> Deserialize<'de> for Filled {
+    fn deserialize<D: Deserializer<'de>>(deserializer: D) -> Result<Self, D::Error> {
+        deserializer.deserialize_any(Shape { looks_inside: true })
+    }
+}
+
+struct Shape {
+    looks_inside: bool,
+}
+
+impl<'de> DeserializeSeed<'de> for Shape {
+    type Value = Filled;
+
+    fn deserialize<D: Deserializer<'de>>(self, deserializer: D) -> Result<Filled, D::Error> {
+        deserializer.deserialize_any(self)
+    }
+}
 
 impl<'de> Visitor<'de> for Shape {
     type Value = Filled;
@@ -196,11 +246,22 @@ impl<'de> Visitor<'de> for Shape {
     }
 
     fn visit_seq<A: SeqAccess<'de>>(self, mut list: A) -> Result<Filled, A::Error> {
-        let mut filled = Filled::Nothing;
-        while list.next_element::<IgnoredAny>()?.is_some() {
-            filled = Filled::List;
+        let mut found = Listed::default();
+        let places = found.first.iter_mut().filter(|_| self.looks_inside);
+        for place in places {
+            let Some(element) = list.next_element_seed(Self { looks_inside: false })? else {
+                return Ok(Filled::List(found));
+            };
+            found.length += 1;
+            *place = match element {
+                Filled::Number(number) => Some(number),
+                _ => None,
+            };
         }
-        Ok(filled)
+        while list.next_element::<IgnoredAny>()?.is_some() {
+            found.length = found.length.saturating_add(1);
+        }
+        Ok(Filled::List(found))
     }
 
     fn visit_bool<E>(self, _: bool) -> Result<Filled, E> {
@@ -211,16 +272,19 @@ impl<'de> Visitor<'de> for Shape {
         Ok(Filled::Nothing)
     }
 
-    fn visit_u64<E>(self, _: u64) -> Result<Filled, E> {
-        Ok(Filled::Nothing)
+    fn visit_u64<E>(self, number: u64) -> Result<Filled, E> {
+        Ok(u32::try_from(number).map_or(Filled::Nothing, Filled::Number))
     }
 
     fn visit_f64<E>(self, _: f64) -> Result<Filled, E> {
         Ok(Filled::Nothing)
     }
 
-    fn visit_str<E>(self, _: &str) -> Result<Filled, E> {
-        Ok(Filled::Nothing)
+    fn visit_str<E>(self, text: &str) -> Result<Filled, E> {
+        Ok(match text {
+            "Crashed" | "Invalid" => Filled::GoesBack,
+            _ => Filled::Nothing,
+        })
     }
 
     fn visit_unit<E>(self) -> Result<Filled, E> {
@@ -278,7 +342,44 @@ mod tests {
             ),
         ];
         for (text, complete, partial) in cases {
-            assert_eq!(read_text(text).unwrap(), Checkpoint { complete, partial }, "{text}");
+            let found = read_text(text).unwrap();
+            assert_eq!(
+                (found.complete, found.partial, found.driven),
+                (complete, partial, None),
+                "{text}"
+            );
+        }
+    }
+
+    #[test]
+    fn all_routes_are_driven_where_the_evaluator_would_find_none_left() {
+        let file = |status: &str, progress: &str, records: &str| {
+            format!(
+                r#"{{"_checkpoint": {{"global_record": {{}}, "progress": {progress}, "records": {records}}}, "entry_status": {status}}}"#
+            )
+        };
+        let cases = [
+            ("\"Started\"", "[2, 2]", "[{}, {}]", Some(2)),
+            ("\"Finished\"", "[2, 2]", "[{}, {}]", Some(2)),
+            ("\"Rejected\"", "[2, 2]", "[{}, {}]", Some(2)),
+            ("\"\"", "[1, 1]", "[{}]", Some(1)),
+            // A crashed route is repeated, and an invalid file is begun anew.
+            ("\"Crashed\"", "[2, 2]", "[{}, {}]", None),
+            ("\"Invalid\"", "[2, 2]", "[{}, {}]", None),
+            ("\"Started\"", "[1, 2]", "[{}, {}]", None),
+            ("\"Started\"", "[2, 2]", "[{}]", None),
+            ("\"Started\"", "[0, 0]", "[]", None),
+            ("\"Started\"", "[]", "[{}]", None),
+            ("\"Started\"", "[NaN, 2]", "[{}, {}]", None),
+            ("\"Started\"", "[2.0, 2.0]", "[{}, {}]", None),
+            ("\"Started\"", "[[2], [2]]", "[{}, {}]", None),
+            ("\"Started\"", "[4294967298, 4294967298]", "[{}, {}]", None),
+            ("\"Started\"", "\"22\"", "{\"a\": 1, \"b\": 2}", None),
+            ("7", "[1, 1, 9]", "[[[[]]]]", Some(1)),
+        ];
+        for (status, progress, records, driven) in cases {
+            let text = file(status, progress, records);
+            assert_eq!(read_text(&text).unwrap().driven, driven, "{text}");
         }
     }
 
@@ -291,6 +392,7 @@ mod tests {
         let partial = Checkpoint {
             complete: false,
             partial: true,
+            driven: None,
         };
         assert_eq!(read_text(&checkpoint(of_python)).unwrap(), partial);
         let whole = checkpoint(of_python);

@@ -249,7 +249,7 @@ const SIMULATOR_DONE: Conclusion = Conclusion {
     code: CODE_OVER,
 };
 
-/// What the end means, once every process has ended. `complete`: the agent's checkpoint has its global record.
+/// What the end means, once every process has ended. `complete`: the agent's checkpoint has its global record, or all its routes.
 pub(crate) fn conclude(side: Side, cause: Cause, complete: bool, seen: &Seen) -> Conclusion {
     let silent = |hold, code| Conclusion { mark: None, hold, code };
     let hold = |hold| if side == Side::Simulator { hold } else { Hold::Free };

@@ -122,6 +122,7 @@ fn reason(end: &End<'_>) -> String {
 fn results_text(results: &Result<Checkpoint, Unreadable>) -> String {
     match results {
         Ok(Checkpoint { complete: true, .. }) => "its results are complete".to_owned(),
+        Ok(Checkpoint { driven: Some(_), .. }) => "its routes are all driven (no global record)".to_owned(),
         Ok(Checkpoint { partial: true, .. }) => "its results are partial (no global record)".to_owned(),
         Ok(_) => "its checkpoint holds no results".to_owned(),
         Err(error) => error.to_string(),
@@ -164,6 +165,7 @@ mod tests {
         let partial = Ok(Checkpoint {
             complete: false,
             partial: true,
+            driven: None,
         });
         let missing = Err(Unreadable::Missing);
         let killed = Some(Status::Killed(Some(9)));

@@ -3,6 +3,7 @@
 //! All waiting is one `poll` over signals, folders and output; a look once a second stands behind it. Policy is `decide`'s.
 
 mod agent_gpu;
+mod nothing_left;
 mod own_server;
 
 use std::io;
@@ -111,7 +112,7 @@ impl Runner {
         if self.round >= MAX_ROUNDS {
             return self.too_many_crashes();
         }
-        if let Err(cause) = self.report_gpu() {
+        if let Err(cause) = self.report_gpu().and_then(|()| self.close_if_driven()) {
             return cause;
         }
         loop {
@@ -346,7 +347,7 @@ impl Runner {
             }
             _ => None,
         };
-        let complete = matches!(&results, Some(Ok(found)) if found.complete);
+        let complete = matches!(&results, Some(Ok(found)) if found.complete || self.is_driven(found));
         self.report(&report::End {
             status: self.group.as_ref().and_then(Group::status),
             out_of_memory: ran && memory::kills() > self.memory_kills,

@@ -8,7 +8,7 @@ mod verify;
 pub(crate) use record::Record;
 
 use crate::json::{self, Limit, ReadError, Text, Value};
-use crate::names::CRASHED;
+use crate::names::{CRASHED, FINISHED, INVALID};
 use crate::plan::Verify;
 use crate::{Plan, Refusal};
 
@@ -22,27 +22,37 @@ const MAX_TOTAL: i128 = 1_000_000;
 pub struct Checkpoint {
     pub(crate) records: Vec<Record>,
     pub(crate) total: u32,
+    done: u32,
+    /// How many the evaluator itself counts, after which it resumes. V1 writes a route's record first and the count after it.
     counted: u32,
     pub(crate) sensors: Vec<Text>,
-    ended: bool,
-    repeats: bool,
+    end: End,
+    /// Sensors are in this file, or were in one that it continues. The first file that is read may have had one before it, if a route
+    /// in it was begun.
+    has_named_sensors: bool,
     warnings: Vec<String>,
+}
+
+/// How the evaluator itself ended.
+#[derive(Clone, Copy, Debug, PartialEq, Eq)]
+enum End {
+    /// It did not: the file has no global record.
+    Open,
+    /// It calls its results finished and eligible.
+    Good,
+    /// It calls them something else.
+    Bad,
+    /// It calls the file invalid, and starts at the first route if it is started again.
+    Invalid,
 }
 
 impl Checkpoint {
     /// How many routes the worker has finished.
     ///
-    /// In a pod, a route in which the simulation crashed is not finished: the evaluator repeats it when it
-    /// is started again.
+    /// In a pod, a route that the evaluator repeats is not finished, although its record is still there: one in which the
+    /// simulation crashed, and one that the evaluator's own count has not reached.
     pub fn done(&self) -> u32 {
-        let records = u32::try_from(self.records.len()).unwrap_or(u32::MAX);
-        records.saturating_sub(u32::from(self.repeats))
-    }
-
-    /// How many routes the evaluator itself counts as finished, after which it resumes. V1 writes a route's record first and the
-    /// count after it.
-    pub fn counted(&self) -> u32 {
-        self.counted
+        self.done
     }
 
     /// How many the file promises.
@@ -53,13 +63,51 @@ impl Checkpoint {
     /// Whether the evaluator came to its regular end: the file has a global record of its own. After a crashed simulation it
     /// has none, even when no route is missing.
     pub fn ended(&self) -> bool {
-        self.ended
+        self.end != End::Open
+    }
+
+    /// True where the evaluator came to its end and calls its results good, and sensors have been named: in this file, or in one that
+    /// it continues. An evaluator of V2 that is started on a complete file writes it again without them.
+    pub(crate) fn counts_without_sensors(&self) -> bool {
+        self.end == End::Good && self.has_named_sensors
+    }
+
+    /// This checkpoint as the one after `earlier` of the same worker; `None` if it has less: routes, the global record or the sensors.
+    /// Then the earlier one counts, as a whole: parts of two files are not the results of one drive.
+    #[must_use]
+    pub fn after(mut self, earlier: &Self) -> Option<Self> {
+        let reached = |checkpoint: &Self| {
+            let Self { done, counted, .. } = *checkpoint;
+            (done, counted, checkpoint.ended(), !checkpoint.sensors.is_empty())
+        };
+        // After an invalid end an evaluator begins anew.
+        if earlier.end != End::Invalid && reached(&self) < reached(earlier) {
+            return None;
+        }
+        self.has_named_sensors = !self.sensors.is_empty() || (earlier.has_named_sensors && self.continues(earlier));
+        Some(self)
+    }
+
+    /// True if it has the same records of the routes that were done.
+    fn continues(&self, earlier: &Self) -> bool {
+        let done = earlier.records.iter().take(count(earlier.done));
+        let same = |(own, old): (&Record, &Record)| own.object == old.object;
+        self.records.len() >= done.len() && self.records.iter().zip(done).all(same)
+    }
+
+    /// The records of the routes that are done.
+    pub(crate) fn done_records(&self) -> impl Iterator<Item = &Record> {
+        self.records.iter().take(count(self.done))
     }
 
     /// Records whose scores do not follow from their infractions, one sentence each.
     pub fn warnings(&self) -> &[String] {
         &self.warnings
     }
+}
+
+fn count(records: u32) -> usize {
+    usize::try_from(records).unwrap_or(usize::MAX)
 }
 
 /// Reads the file of the worker at position `pair` (from 0) of the plan.
@@ -90,18 +138,25 @@ pub fn read_worker(plan: &Plan, pair: usize, bytes: &[u8]) -> Result<Option<Chec
         plausible::check_file(plan, pair, total, &records)?;
     }
     let warnings = verified(plan, pair, &records)?;
-    // The evaluator goes by the same text when it resumes.
-    let is_left_open = file.has_crashed && !file.ended && !records.is_empty();
-    let repeats = is_left_open && plan.is_pod() && !plan.as_original;
     Ok(Some(Checkpoint {
+        done: done(plan, file.end, file.has_crashed, counted, &records),
+        has_named_sensors: !sensors.is_empty() || records.iter().any(Record::was_begun),
         records,
         total,
         counted,
         sensors,
-        ended: file.ended,
-        repeats,
+        end: file.end,
         warnings,
     }))
+}
+
+/// How many routes are done. The evaluator goes by the same count and the same text when it resumes.
+fn done(plan: &Plan, end: End, has_crashed: bool, counted: u32, records: &[Record]) -> u32 {
+    let found = u32::try_from(records.len()).unwrap_or(u32::MAX);
+    if end != End::Open || !plan.is_pod() || plan.as_original {
+        return found;
+    }
+    found.saturating_sub(u32::from(has_crashed)).min(counted)
 }
 
 /// The parts of the JSON that are used, taken out of it.
@@ -109,7 +164,7 @@ struct File {
     records: Vec<Value>,
     progress: Vec<Value>,
     sensors: Value,
-    ended: bool,
+    end: End,
     has_crashed: bool,
 }
 
@@ -122,6 +177,15 @@ impl File {
         let Some(Value::Object(mut inner)) = outer.take("_checkpoint") else {
             return Err(shape("_checkpoint", "an object"));
         };
+        let entry_status = outer.get("entry_status").and_then(Value::as_str);
+        let has_crashed = entry_status == Some(CRASHED);
+        let is_eligible = matches!(outer.get("eligible"), Some(Value::Bool(true)));
+        let end = match entry_status {
+            _ if inner.get("global_record").is_none_or(Value::is_falsy) => End::Open,
+            Some(FINISHED) if is_eligible => End::Good,
+            Some(INVALID) => End::Invalid,
+            _ => End::Bad,
+        };
         let mut list = |key: &str, place| match inner.take(key) {
             Some(Value::List(list)) => Ok(list),
             _ => Err(shape(place, "a list")),
@@ -130,8 +194,8 @@ impl File {
             records: list("records", "_checkpoint.records")?,
             progress: list("progress", "_checkpoint.progress")?,
             sensors: outer.take("sensors").ok_or_else(|| shape("sensors", "a list"))?,
-            ended: inner.get("global_record").is_some_and(|global| !global.is_falsy()),
-            has_crashed: outer.get("entry_status").and_then(Value::as_str) == Some(CRASHED),
+            end,
+            has_crashed,
         })
     }
 }

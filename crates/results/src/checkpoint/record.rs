@@ -92,6 +92,19 @@ impl Record {
             object,
         })
     }
+
+    /// True if an agent was set up for it: its evaluator has named the sensors then.
+    pub(crate) fn was_begun(&self) -> bool {
+        let is_before = |what: &&str| self.status.contains(what);
+        ![
+            names::NOT_SET_UP,
+            names::SENSORS_INVALID,
+            names::SIMULATION_CRASHED,
+            names::STARTED,
+        ]
+        .iter()
+        .any(is_before)
+    }
 }
 
 /// The numbers in `RouteScenario_<id>` (V1) and `RouteScenario_<id>_rep<k>` (V2), as leniently as the original finds them:

@@ -352,6 +352,7 @@ fn the_runner_gets_the_deadlines() {
         idle: seconds(30),
         python_path: Some(FRONT.into()),
         report_gpu: false,
+        route_runs: Some(5),
     };
     assert_eq!((agent.role, agent.log_limit), (role, 2_097_152));
 }

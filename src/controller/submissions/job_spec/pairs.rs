@@ -93,6 +93,7 @@ pub(super) fn agent(input: &JobInput<'_>, pair: Pair) -> Container {
         seconds("idle", deadlines.idle_seconds),
         format!("--log-limit={}", spec.log_size_limit.bytes()),
         format!("--python-path={}", python_path()),
+        format!("--route-runs={}", route_runs(input, pair)),
     ];
     let flags = flags.into_iter().chain(gpu::report(source(input.spec())));
     let host = commands::of_host(spec.command.as_deref(), spec.args.as_deref());
@@ -110,6 +111,13 @@ pub(super) fn agent(input: &JobInput<'_>, pair: Pair) -> Container {
         name,
         ..Container::default()
     }
+}
+
+/// How many route runs the pair's evaluator is to drive; 0 if there were no slice for it.
+fn route_runs(input: &JobInput<'_>, pair: Pair) -> u32 {
+    let slice = input.plan.slices.get(pair.index());
+    let repetitions = u32::try_from(input.plan.repetitions).unwrap_or(0);
+    slice.map_or(0, |slice| slice.routes().saturating_mul(repetitions))
 }
 
 fn behind_runner(member: Member, flags: impl IntoIterator<Item = String>, words: Vec<String>) -> Vec<String> {
