@@ -200,6 +200,7 @@ impl Probe {
         let format = results_format(spec.leaderboard_version);
         let created = leaderboard.metadata.creation_timestamp.as_ref();
         Some(Target {
+            leaderboard: key_of(leaderboard),
             api_server: evalai.server(),
             challenge: evalai.challenge,
             split: evalai.split.clone(),

@@ -60,7 +60,7 @@ impl Queue {
     /// What every answer shows about the token.
     fn note(&mut self, answer: &Answer<()>, now: &Now) {
         match answer {
-            Answer::Throttled(wait) => self.budget.close_until(now.at + *wait),
+            Answer::Throttled(wait) => self.share.budget(|budget| budget.close_until(now.at + *wait)),
             Answer::Refused(refusal) if refusal.about == About::Token => {
                 let news = self.token_refused.is_none();
                 self.token_refused = Some((refusal.message.clone(), now.at + TOKEN_PAUSE));

@@ -8,6 +8,7 @@ use std::time::Duration;
 use jiff::{SignedDuration, Timestamp};
 
 use super::poll::{Challenge, Poll};
+use super::purse::{Price, Rank};
 use super::sub::{Sub, Write};
 use super::{Busy, Lane, MAX_IN_FLIGHT, Next, Now, Queue, Ticket};
 use crate::services::evalai::request::{Purpose, Request, SubmissionRef};
@@ -79,7 +80,7 @@ struct Offer<'a> {
 
 impl Offer<'_> {
     /// Less comes first.
-    fn rank(&self) -> (Priority, Option<Timestamp>, Duration) {
+    fn rank(&self) -> Rank {
         (self.priority, self.ended, self.since)
     }
 }
@@ -102,6 +103,7 @@ impl Queue {
         let (now_affordable, not_yet): (Vec<_>, Vec<_>) = chosen
             .map(|offer| (self.affordable_at(&now, offer), offer))
             .partition(|(at, _)| *at <= now.at);
+        self.claim(&now, not_yet.first().map(|(_, offer)| *offer));
         let Some((_, best)) = now_affordable.first() else {
             let waits = later
                 .iter()
@@ -125,7 +127,7 @@ impl Queue {
         match started {
             Some(request) => {
                 if request.counts() {
-                    self.budget.take(now.at);
+                    self.share.take(now.at);
                 }
                 Next::Send(Ticket {
                     request,
@@ -136,25 +138,51 @@ impl Queue {
         }
     }
 
-    /// When the budget allows it: every read for a write keeps one request back for the write that follows it.
+    /// When the budget allows it, and the token is not refused.
     fn affordable_at(&self, now: &Now, offer: &Offer<'_>) -> Duration {
-        let reserved = self
-            .lanes
-            .values()
-            .filter(|lane| lane.busy == Some(Busy::ReadForWrite))
-            .count();
-        let reserved = u32::try_from(reserved).unwrap_or(u32::MAX);
-        let count = match (&offer.what, offer.priority) {
-            (_, Priority::Free) => return now.at,
-            (_, Priority::Write) => 1,
-            (What::Sub(_, Step::GetForWrite), _) => reserved.saturating_add(2),
-            _ => reserved.saturating_add(1),
-        };
+        if offer.priority == Priority::Free {
+            return now.at;
+        }
         let token = self.token_refused.as_ref().map_or(now.at, |(_, until)| *until);
+        self.share.ready_at(self.price(offer), now.at).max(token)
+    }
+
+    /// What it takes: every read for a write keeps one request back for the write that follows it.
+    fn price(&self, offer: &Offer<'_>) -> Price {
+        let is_write = offer.priority == Priority::Write;
+        let count = match offer.what {
+            _ if is_write => 1,
+            What::Sub(_, Step::GetForWrite) => self.reserved().saturating_add(2),
+            _ => self.reserved().saturating_add(1),
+        };
         // A list that is due, and a write whose read is made, may use what the others leave.
-        let urgent = [Priority::Write, Priority::CancelList].contains(&offer.priority);
-        let keep = if urgent { 0 } else { self.budget.kept() };
-        self.budget.ready_keeping(now.at, count, keep).max(token)
+        let is_urgent = is_write || offer.priority == Priority::CancelList;
+        Price {
+            rank: offer.rank(),
+            count,
+            keep: if is_urgent {
+                0
+            } else {
+                self.share.budget(|budget| budget.kept())
+            },
+            is_after_reserved: !is_write,
+        }
+    }
+
+    /// Writes that follow the reads on their way.
+    fn reserved(&self) -> u32 {
+        let reads = self.lanes.values().filter(|lane| lane.busy == Some(Busy::ReadForWrite));
+        u32::try_from(reads.count()).unwrap_or(u32::MAX)
+    }
+
+    /// Tells the other queues of the same user what waits for the budget here. A refused token needs nothing of it.
+    fn claim(&self, now: &Now, waits: Option<&Offer<'_>>) {
+        let is_refused = self.token_refused.as_ref().is_some_and(|(_, until)| *until > now.at);
+        let waits = waits.filter(|_| !is_refused).map(|offer| {
+            let price = self.price(offer);
+            (price.rank, price.count)
+        });
+        self.share.claim(self.reserved(), waits);
     }
 
     fn offers(&self, now: &Now, may_write: bool) -> Vec<Offer<'_>> {

@@ -312,7 +312,8 @@ impl Queue {
         let named = self.served.values();
         let wanted = named.filter_map(|target| Some((target.inbox.clone()?, target.api_server.clone())));
         let wanted = wanted.collect();
-        self.inboxes.arrange(&wanted, self.budget.limit(), now.at);
+        let limit = self.share.budget(|budget| budget.limit());
+        self.inboxes.arrange(&wanted, limit, now.at);
     }
 
     /// Takes the answer about a queue in.

@@ -265,7 +265,7 @@ fn an_image_is_downloaded_only_where_it_is_missing_and_costs_nothing() {
         ..row(7, Status::Submitted)
     };
     bench.get(7, found);
-    let used = bench.queue.requests_of_last_minute(now);
+    let used = bench.queue.usage(now).used;
     let ticket = bench.expect("image 7");
     bench.answer(&ticket, Reply::Image(Answer::Refused(refusal(About::Request, 404))));
     assert!(matches!(bench.view(7).image, Some(ImageAnswer::Unread(_))));
@@ -274,7 +274,7 @@ fn an_image_is_downloaded_only_where_it_is_missing_and_costs_nothing() {
     let named = ImageAnswer::Named("registry.example/a:1".into());
     bench.answer(&ticket, Reply::Image(Answer::Done(named.clone())));
     assert_eq!(bench.view(7).image, Some(named));
-    assert_eq!(bench.queue.requests_of_last_minute(now), used);
+    assert_eq!(bench.queue.usage(now).used, used);
     bench.wait(100.0);
     bench.expect_nothing();
 }
