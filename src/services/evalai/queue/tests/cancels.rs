@@ -389,3 +389,28 @@ fn forty_cancels_aimed_between_a_list_and_a_write_are_undone_only_while_the_serv
         assert!((5..12).contains(&undone.len()), "{update:?}: {undone:?}");
     }
 }
+
+#[test]
+fn a_cancel_is_not_written_over_what_had_finished_before_any_run_of_ours() {
+    for has_job in [false, true] {
+        let mut bench = Bench::new();
+        let mut cancelled = of(7, 1);
+        cancelled.run.has_job = has_job;
+        let now = bench.now();
+        let end = DesiredUpdate::Final(Outcome::Cancelled, results(43.0));
+        bench.queue.update(&cancelled, end, now);
+        bench.get(7, row(7, Status::Finished));
+        if has_job {
+            bench.write("cancelled 7");
+        }
+        bench.expect_nothing();
+        let kept = matches!(
+            bench.view(7).end,
+            Some(Ended::Agreed {
+                status: Status::Finished,
+                ..
+            })
+        );
+        assert_eq!(kept, !has_job, "{:?}", bench.view(7).end);
+    }
+}
