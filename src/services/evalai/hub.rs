@@ -302,6 +302,13 @@ impl Hub {
         refused.map(str::to_owned)
     }
 
+    /// Since when EvalAI has answered no request with a Leaderboard's token, and why; none if that is not long.
+    pub fn silence(&self, leaderboard: &Key) -> Option<(Timestamp, String)> {
+        let shared = self.place(leaderboard)?;
+        let queue = shared.queue();
+        queue.silence().map(|(since, why)| (since, why.to_owned()))
+    }
+
     /// Why the queue of a Leaderboard's challenge is not read; none while it is, or need not be.
     pub fn inbox_trouble(&self, leaderboard: &Key) -> Option<InboxTrouble> {
         let shared = self.place(leaderboard)?;

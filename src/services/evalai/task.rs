@@ -163,10 +163,12 @@ pub(super) async fn run(task: Task) -> bool {
     all && !shared.queue().is_unsure(shared.now())
 }
 
-/// Sends one request, unless the guard forbids writes since it was chosen. None as reply: it was not sent.
+/// Sends one request, unless the guard forbids writes since it was chosen, or the read of a write is too old by now. None as reply: it was
+/// not sent.
 async fn send(shared: &Shared, client: &Client, guard: &dyn WriteGuard, ticket: Ticket) -> (Ticket, Option<Reply>) {
     let write = ticket.request.is_write();
-    if write && !guard.may_write() {
+    let is_late = ticket.leave_by.is_some_and(|by| shared.now().at > by);
+    if write && (!guard.may_write() || is_late) {
         return (ticket, None);
     }
     let started = Instant::now();

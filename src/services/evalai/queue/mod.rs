@@ -16,6 +16,7 @@ mod lists;
 mod outlook;
 mod poll;
 mod purse;
+mod silence;
 mod sub;
 mod transfer;
 
@@ -31,6 +32,7 @@ use jiff::Timestamp;
 use self::inbox::Inboxes;
 use self::poll::Challenge;
 pub use self::purse::{Purse, Share};
+use self::silence::Silent;
 use self::sub::{Asked, Pending, Sub};
 use super::labels::{Labels, compare};
 use super::payload::{check, digest, for_split};
@@ -70,6 +72,11 @@ pub struct Timing {
     pub refresh: Duration,
     /// Between two checks of a challenge's leaderboards.
     pub check: Duration,
+    /// A submission that EvalAI does not have is asked for again after so long, before that counts: one answer may be of a server that is just
+    /// being replaced, and would end a run.
+    pub missing: Duration,
+    /// The same as `fresh` for `running`, and the read is made again once only.
+    pub fresh_running: Duration,
 }
 
 impl Default for Timing {
@@ -82,6 +89,8 @@ impl Default for Timing {
             // What is deleted is to be ended there within a minute, and its Pod takes some seconds to stop.
             refresh: Duration::from_secs(40),
             check: Duration::from_hours(1),
+            missing: Duration::from_secs(30),
+            fresh_running: Duration::from_millis(100),
         }
     }
 }
@@ -101,6 +110,8 @@ pub struct Ticket {
     pub request: Request,
     /// When it was sent.
     pub requested: Duration,
+    /// A write that is not sent by then is not sent: its read is too old.
+    pub leave_by: Option<Duration>,
 }
 
 /// A submission's place on the wire, kept while its object comes and goes.
@@ -112,6 +123,10 @@ struct Lane {
     unsure: bool,
     /// Answer of a read that was made for a write, until anything else is sent.
     checked: Option<Duration>,
+    /// A write was not sent soon enough after its read, and that is made once more.
+    reread: bool,
+    /// EvalAI does not have the submission, as of this read, and had it before.
+    missing_since: Option<Duration>,
 }
 
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
@@ -137,6 +152,8 @@ pub struct Queue {
     served: BTreeMap<Key, Target>,
     /// EvalAI's refusal of the token, and until when nothing is asked with it.
     token_refused: Option<(String, Duration)>,
+    /// The server does not answer.
+    silent: Option<Silent>,
     changes: BTreeSet<Changed>,
     sweep: Vec<SweepRow>,
     inboxes: Inboxes,
@@ -157,6 +174,7 @@ impl Queue {
             challenges: BTreeMap::new(),
             served: BTreeMap::new(),
             token_refused: None,
+            silent: None,
             changes: BTreeSet::new(),
             sweep: Vec::new(),
             inboxes: Inboxes::new(requests_per_minute, now.at),
