@@ -374,14 +374,13 @@ impl Hub {
         let mut state = self.state();
         let account = state.account_of(key, target);
         let known = state.tokens.get(&account).map(|entry| entry.shared.clone());
-        let shared = match known {
-            Some(shared) => shared,
-            None => {
-                let entry = self.start(&mut state, target, &account)?;
-                let shared = entry.shared.clone();
-                state.tokens.insert(account.clone(), entry);
-                shared
-            }
+        let shared = if let Some(shared) = known {
+            shared
+        } else {
+            let entry = self.start(&mut state, target, &account)?;
+            let shared = entry.shared.clone();
+            state.tokens.insert(account.clone(), entry);
+            shared
         };
         if let Some(old) = state.enter(key, &account) {
             self.move_over(&mut state, key, &old, (&account, &shared));

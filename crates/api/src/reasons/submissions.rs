@@ -339,7 +339,8 @@ reasons! {
     Event {
         MESSAGES_HELD_BACK = "MessagesHeldBack",
             "Event of a Leaderboard: the bridge cannot use messages of its queue yet, and receives them again later: no Leaderboard \
-             serves their phase, an older Submission of the same name is being deleted, or the API server does not take them.",
+             serves their phase, an older Submission of the same name is being deleted, the attempt before is being stopped, or the API \
+             server does not take them.",
             "Apply the Leaderboard of their phase. If it lasts, look at the log of the bridge.";
         JOB_RECREATED = "JobRecreated",
             "Somebody deleted the Job; the operator creates it again, at most three times between two retries.",

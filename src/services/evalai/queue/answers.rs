@@ -92,7 +92,7 @@ impl Queue {
                 let since = *lane.missing_since.get_or_insert(requested);
                 let again = since + self.timing.missing;
                 if requested < again {
-                    return self.missed(subject, message, again, now);
+                    return self.missed(subject, &message, again, now);
                 }
                 Row::missing(subject.pk)
             }
@@ -113,7 +113,7 @@ impl Queue {
     }
 
     /// EvalAI does not have it, which is to be confirmed.
-    fn missed(&mut self, subject: &SubmissionRef, why: String, again: Duration, now: &Now) {
+    fn missed(&mut self, subject: &SubmissionRef, why: &str, again: Duration, now: &Now) {
         self.change(subject, |sub| {
             sub.read_failed(format!("{why}; it is asked for again before that counts"), now);
             sub.retry_at = again;

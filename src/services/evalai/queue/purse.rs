@@ -157,7 +157,7 @@ impl Inner {
 mod tests {
     use super::*;
 
-    const NOW: Duration = Duration::from_secs(60);
+    const NOW: Duration = Duration::from_mins(1);
 
     fn price(priority: Priority, count: u32) -> Price {
         Price {
@@ -170,7 +170,7 @@ mod tests {
 
     /// Two queues of one purse that has earned one request.
     fn two() -> (Share, Share) {
-        let purse = Purse::new(60, NOW - Duration::from_secs(1));
+        let purse = Purse::new(60, Duration::from_secs(59));
         (purse.share(60, NOW), purse.share(60, NOW))
     }
 
