@@ -49,6 +49,7 @@ fn timing() -> Timing {
         hold: Duration::from_millis(1500),
         accept: Duration::from_millis(50),
         lost: Duration::ZERO,
+        missing: Duration::from_millis(100),
         ..Timing::default()
     }
 }
@@ -388,7 +389,7 @@ fn refused(status: Status, wanted: Outcome) -> Option<Kept> {
     );
     match (status, wanted) {
         (Status::Deleted, Finished | Failed) => Some(Kept::Otherwise(status)),
-        (Status::Failed, Failed | Cancelled) => Some(Kept::Agreed(status)),
+        (Status::Failed, Failed | Cancelled) | (Status::Finished, Cancelled) => Some(Kept::Agreed(status)),
         _ if is_gone && wanted == Cancelled => Some(Kept::Agreed(status)),
         _ if is_gone => Some(Kept::Otherwise(status)),
         _ => None,
