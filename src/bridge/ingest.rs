@@ -29,8 +29,8 @@ const SWEEP_AGE_MS: i64 = 120_000;
 const CALL_LIMIT: Duration = Duration::from_secs(8);
 /// How often a lost race is run again before the caller has to come back later.
 const ROUNDS: usize = 6;
-/// So many attempts begin without a message after one that came. EvalAI lets only hosts resume, but lets participants write their
-/// row's status and times: more would be runs without a grant. One is enough for a resume whose message was lost; a person
+/// So many attempts begin without a message after one that came. EvalAI lets hosts resume, and participants only where the challenge has
+/// `allow_participants_resubmissions`; but any participant may write the row's status and times: more would be runs without a grant. One is enough for a resume whose message was lost; a person
 /// who wants another one raises `spec.attempt`.
 const MOST_WITHOUT_MESSAGE: usize = 1;
 
@@ -99,7 +99,8 @@ pub enum Ingest {
     Create(Box<Submission>),
     /// It has ended and is wanted again: raise its attempt, if it still is at this resourceVersion.
     Bump { attempt: Attempt, resource_version: String },
-    /// It has ended, and EvalAI's row asks for an attempt that no message has announced: note that, so that people see it.
+    /// It has ended, and no further attempt begins: it has finished, or EvalAI's row alone asks for one, which no message has announced.
+    /// Note that, so that people see it.
     Refuse { attempt: Attempt, resource_version: String },
     /// It is known already.
     Repeat,
@@ -107,6 +108,8 @@ pub enum Ingest {
     NotNew,
     /// The old one is being deleted: come back when it is gone.
     Deleting,
+    /// Its present attempt is being stopped: come back when that has ended.
+    Stopping,
     /// The name belongs to another leaderboard, challenge or phase.
     IdTaken(String),
 }
@@ -118,7 +121,7 @@ pub enum Outcome {
     Created,
     /// Its attempt was raised to this number.
     Bumped(Attempt),
-    /// No message has announced the attempt that EvalAI's row asks for, and none begins.
+    /// The attempt that is asked for does not begin, which is noted.
     Refused,
     /// EvalAI's row was run before, and no message has announced that it is to be run again: none is made.
     NotNew,
@@ -126,6 +129,8 @@ pub enum Outcome {
     Repeat,
     /// The old one is being deleted: come back when it is gone.
     Deleting,
+    /// Its present attempt is being stopped: come back when that has ended.
+    Stopping,
     /// The name belongs to another leaderboard, challenge or phase; the text names them.
     IdTaken(String),
 }
@@ -135,10 +140,13 @@ impl std::fmt::Display for Outcome {
         match self {
             Self::Created => f.write_str("created"),
             Self::Bumped(attempt) => write!(f, "resumed as attempt {attempt}"),
-            Self::Refused => f.write_str("no message has announced the attempt, so none begins"),
+            Self::Refused => {
+                f.write_str("it has ended, and no further attempt begins; its condition Stalled shows why")
+            }
             Self::NotNew => f.write_str("it was run before and no message has announced another run, so none is made"),
             Self::Repeat => f.write_str("known already"),
             Self::Deleting => f.write_str("the old one is still being deleted"),
+            Self::Stopping => f.write_str("its present attempt is still being stopped"),
             Self::IdTaken(owner) => write!(f, "the name is taken by {owner}; rename or delete that"),
         }
     }
@@ -176,13 +184,20 @@ fn decide_ingest(leaderboard: &str, existing: Option<&Submission>, incoming: &In
     let Some(resource_version) = existing.metadata.resource_version.clone() else {
         return Ingest::Repeat;
     };
-    if !is_ended(existing) || !is_newer(existing, incoming) {
+    if !is_newer(existing, incoming) {
         return Ingest::Repeat;
+    }
+    let progress = progress(existing);
+    match progress {
+        Progress::Live => return Ingest::Repeat,
+        Progress::Stopping => return Ingest::Stopping,
+        Progress::Finished | Progress::Ended => {}
     }
     let record = Ingested::of(existing).unwrap_or_default();
     let attempt = spec.attempt.next();
+    let is_noted = record.refused.is_some_and(|refused| refused.attempt == attempt);
     match incoming.source {
-        Source::Message(_) => Ingest::Bump {
+        Source::Message(_) if progress == Progress::Ended => Ingest::Bump {
             attempt,
             resource_version,
         },
@@ -195,8 +210,8 @@ fn decide_ingest(leaderboard: &str, existing: Option<&Submission>, incoming: &In
             }
         }
         // Noted once: a row that is edited again and again is not worth a write each time.
-        Source::Sweep(_) if record.refused.is_some_and(|refused| refused.attempt == attempt) => Ingest::Repeat,
-        Source::Sweep(_) => Ingest::Refuse {
+        _ if is_noted => Ingest::Repeat,
+        _ => Ingest::Refuse {
             attempt,
             resource_version,
         },
@@ -209,14 +224,30 @@ fn was_run_before(source: &Source) -> bool {
     matches!(source, Source::Sweep(Swept::Edited | Swept::Resuming))
 }
 
-/// True if the present attempt has ended in a way that a resume can follow.
-fn is_ended(existing: &Submission) -> bool {
-    existing.status.as_ref().is_some_and(|status| {
-        status.has_ended()
-            && matches!(status.state_of_conditions(), State::Failed | State::Cancelled)
-            // A raised attempt that the controller has not read yet still shows the end of the one before.
-            && status.attempt.is_none_or(|attempt| attempt == existing.spec.attempt)
-    })
+/// How far the present attempt has come.
+#[derive(Clone, Copy, PartialEq, Eq)]
+enum Progress {
+    Live,
+    /// It ends in a moment, as what may be resumed.
+    Stopping,
+    /// It has ended in a way that a resume can follow.
+    Ended,
+    /// It has finished, which is final.
+    Finished,
+}
+
+fn progress(existing: &Submission) -> Progress {
+    // A raised attempt that the controller has not read yet still shows the end of the one before.
+    let is_of_present =
+        |status: &&SubmissionStatus| status.attempt.is_none_or(|attempt| attempt == existing.spec.attempt);
+    let status = existing.status.as_ref().filter(is_of_present);
+    let is_stopping = status.is_some_and(|status| status.times.stopping.is_some());
+    match status.map(SubmissionStatus::state_of_conditions) {
+        Some(State::Failed | State::Cancelled) => Progress::Ended,
+        Some(State::Finished) => Progress::Finished,
+        _ if is_stopping || existing.spec.cancel => Progress::Stopping,
+        _ => Progress::Live,
+    }
 }
 
 /// True if EvalAI can have resumed it: it resumes only what has failed. The row of one that a host cancelled was edited by its
@@ -368,6 +399,7 @@ async fn rounds(
             Ingest::NotNew => Some(Outcome::NotNew),
             Ingest::Repeat => Some(Outcome::Repeat),
             Ingest::Deleting => Some(Outcome::Deleting),
+            Ingest::Stopping => Some(Outcome::Stopping),
             Ingest::IdTaken(owner) => Some(Outcome::IdTaken(owner)),
         };
         if let Some(outcome) = done {

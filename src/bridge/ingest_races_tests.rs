@@ -117,3 +117,36 @@ async fn lines_about_what_comes_in_have_its_attempt_and_its_trace_once_its_objec
         }
     }
 }
+
+#[tokio::test]
+async fn a_resume_that_comes_while_the_run_is_being_stopped_waits_for_its_end() {
+    let first = message("a", 100_000);
+    let resume = message("b", 200_000);
+    let mut running = with_state(made_by(&first), State::Running);
+    let mut cancelled = running.clone();
+    cancelled.spec.cancel = true;
+    let status = running.status.as_mut().unwrap();
+    status.times.stopping = Some(Time(jiff::Timestamp::UNIX_EPOCH));
+    for stopping in [running, cancelled] {
+        check("the message that made it", &stopping, &first, &REPEAT);
+        let script = vec![refusal(409, "AlreadyExists"), object(&stopping)];
+        let (outcome, _) = against(script, resume.clone()).await;
+        assert_eq!(outcome.unwrap(), Outcome::Stopping);
+        check(
+            "after its end",
+            &with_state(stopping, State::Cancelled),
+            &resume,
+            &bump_to(2),
+        );
+    }
+}
+
+#[test]
+fn what_has_finished_is_not_run_again_and_says_so() {
+    let finished = with_state(made_by(&message("a", 100_000)), State::Finished);
+    check("a late copy", &finished, &message("a", 100_000), &REPEAT);
+    for resume in [message("b", 200_000), swept_resume(200_000)] {
+        check("a resume", &finished, &resume, &refuse(2, "10"));
+        check("once more", &refused(finished.clone(), 200_000), &resume, &REPEAT);
+    }
+}

@@ -4,6 +4,7 @@
 //! a message to one of them. `route` holds the policy, `ingest` is also the controller's, for its sweep.
 
 pub mod ages;
+mod dead_letter;
 pub mod ingest;
 mod leaderboards;
 pub mod message;

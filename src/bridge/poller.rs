@@ -202,7 +202,7 @@ impl Poller {
         let hidden = Duration::from_secs(u64::try_from(seconds).unwrap_or_default());
         match why {
             Later::Foreign => self.ages.forget(&message.id),
-            Later::Unknown | Later::Deleting | Later::Refused | Later::Blocked => {
+            Later::Unknown | Later::Deleting | Later::Stopping | Later::Refused | Later::Blocked => {
                 let until = Instant::now() + hidden + SEEN_AGAIN;
                 self.ages.keep(&message.id, message.sent_ms, until);
             }
@@ -276,8 +276,12 @@ impl Poller {
                 let waited = Duration::from_millis(u64::try_from(waited).unwrap_or_default());
                 self.shared.telemetry.metrics.sqs_message_waited(waited);
             }
-            Ok(Outcome::Repeat | Outcome::Refused | Outcome::NotNew) => {
+            Ok(Outcome::Repeat | Outcome::NotNew) => {
                 tracing::debug!("a repeat");
+            }
+            Ok(Outcome::Refused) => tracing::warn!("{}", Outcome::Refused),
+            Ok(Outcome::Stopping) => {
+                tracing::info!("the attempt before is still being stopped; the message comes back");
             }
             Ok(Outcome::Deleting) => {
                 tracing::info!("the Submission of this name is still being deleted; the message comes back");

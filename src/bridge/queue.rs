@@ -13,6 +13,7 @@ use aws_sdk_sqs::types::{
 use aws_sdk_sqs::{Client, operation::receive_message::ReceiveMessageOutput};
 use thiserror::Error;
 
+use super::dead_letter::{self, DeadLetter};
 use super::route::DeadReason;
 use crate::services::fault::{self, Fault};
 use crate::services::meter::Meter;
@@ -23,6 +24,9 @@ const LONG_POLL: i32 = 20;
 pub const BATCH: usize = 10;
 /// SQS's own default, used when the attribute may not be read.
 const DEFAULT_VISIBILITY: Duration = Duration::from_secs(30);
+
+/// How the name of a FIFO queue ends.
+const FIFO: &str = ".fifo";
 
 /// A message that was received and is ours until its visibility lapses.
 #[derive(Clone, Debug)]
@@ -182,31 +186,35 @@ impl Reader {
     }
 
     /// Puts a copy of a message into the dead-letter queue; the caller then deletes it here. A crash between the two
-    /// makes two copies.
+    /// makes two copies. One that is refused is sent again in a smaller form: it may be too large for that queue.
     pub async fn send_dead(&self, to: &str, message: &Received, reason: &DeadReason) -> Result<(), QueueError> {
-        let fields = [
-            ("reason", reason.as_str().to_owned()),
-            ("detail", reason.detail().to_owned()),
-            ("queue", self.url.clone()),
-            ("messageId", message.id.clone()),
-            ("firstSeen", iso(message.first_seen_ms)),
-        ];
-        let mut request = self.client.send_message().queue_url(to).message_body(&message.body);
-        for (name, text) in fields.into_iter().filter(|(_, text)| !text.is_empty()) {
-            let value = MessageAttributeValue::builder()
-                .data_type("String")
-                .string_value(printable(&text))
-                .build();
-            request = request.message_attributes(name, value.map_err(|error| self.unsendable("SendMessage", &error))?);
+        let mut sent = Ok(());
+        for letter in dead_letter::forms(message, reason, &self.url) {
+            sent = self.send(to, message, letter).await;
+            if !matches!(&sent, Err(error) if error.fault == Fault::Refused) {
+                break;
+            }
         }
-        if let Some(group) = &message.group {
-            request = request.message_group_id(group).message_deduplication_id(&message.id);
-        }
-        let answer = self.call("SendMessage", request.send()).await;
-        answer.map(|_| ()).map_err(|error| QueueError {
+        sent.map_err(|error| QueueError {
             queue: to.to_owned(),
             ..error
         })
+    }
+
+    async fn send(&self, to: &str, message: &Received, letter: DeadLetter) -> Result<(), QueueError> {
+        let mut request = self.client.send_message().queue_url(to).message_body(letter.body);
+        for (name, text) in letter.attributes {
+            let value = MessageAttributeValue::builder()
+                .data_type("String")
+                .string_value(text)
+                .build();
+            request = request.message_attributes(name, value.map_err(|error| self.unsendable("SendMessage", &error))?);
+        }
+        // A queue that is not FIFO refuses the id, and has no use for the group.
+        if let Some(group) = message.group.as_ref().filter(|_| to.ends_with(FIFO)) {
+            request = request.message_group_id(group).message_deduplication_id(&message.id);
+        }
+        self.call("SendMessage", request.send()).await.map(|_| ())
     }
 
     /// Counts a call and turns an error into one that names the queue.
@@ -260,21 +268,97 @@ fn received(message: Message) -> Option<Received> {
     })
 }
 
-fn iso(milliseconds: i64) -> String {
-    jiff::Timestamp::from_millisecond(milliseconds).map_or_else(|_| String::new(), |time| time.to_string())
-}
-
-/// SQS refuses control characters in attributes.
-fn printable(text: &str) -> String {
-    text.chars()
-        .map(|c| if c.is_control() { ' ' } else { c })
-        .take(1024)
-        .collect()
-}
-
 #[cfg(test)]
 mod tests {
+    use std::collections::VecDeque;
+    use std::sync::{Arc, Mutex};
+
+    use aws_sdk_sqs::config::{BehaviorVersion, Credentials, Region};
+    use axum::body::Bytes;
+    use axum::extract::State;
+    use axum::http::StatusCode;
+    use serde_json::Value;
+    use tokio::net::TcpListener;
+
     use super::*;
+    use crate::lock::lock;
+    use crate::services::aws::Aws;
+
+    /// What a queue was sent, and how many of the next ones it finds too large.
+    type Sent = Arc<Mutex<(VecDeque<Value>, usize)>>;
+
+    async fn answer(State(sent): State<Sent>, body: Bytes) -> (StatusCode, &'static str) {
+        let mut sent = lock(&sent);
+        sent.0.push_back(serde_json::from_slice(&body).unwrap());
+        if sent.1 > 0 {
+            sent.1 -= 1;
+            let refused = r#"{"__type":"com.amazonaws.sqs#InvalidParameterValue","message":"Message must be shorter"}"#;
+            return (StatusCode::BAD_REQUEST, refused);
+        }
+        (StatusCode::OK, r#"{"MessageId":"d-1","MD5OfMessageBody":"x"}"#)
+    }
+
+    /// A reader of a queue of the test's own.
+    async fn reader(too_large: usize) -> (Reader, Sent) {
+        let listener = TcpListener::bind("127.0.0.1:0").await.unwrap();
+        let url = format!("http://{}", listener.local_addr().unwrap());
+        let sent = Sent::new(Mutex::new((VecDeque::new(), too_large)));
+        let app = axum::Router::new().fallback(answer).with_state(sent.clone());
+        tokio::spawn(async move { axum::serve(listener, app).await.unwrap() });
+        let config = aws_config::defaults(BehaviorVersion::latest())
+            .http_client(aws_smithy_http_client::Builder::new().build_http())
+            .credentials_provider(Credentials::new("a", "b", None, None, "test"))
+            .region(Region::new("us-east-1"))
+            .load()
+            .await;
+        let reader = Reader {
+            client: Aws::from_config(config).sqs(None, Some(&url)),
+            url: format!("{url}/1/queue"),
+            visibility: DEFAULT_VISIBILITY,
+            meter: Meter::default(),
+        };
+        (reader, sent)
+    }
+
+    fn message() -> Received {
+        Received {
+            id: "m-1".into(),
+            receipt: "r".into(),
+            body: r#"{"submission_pk":7}"#.into(),
+            sent_ms: 0,
+            first_seen_ms: 0,
+            receives: 1,
+            group: Some("1-3".into()),
+        }
+    }
+
+    #[tokio::test]
+    async fn a_dead_letter_that_is_too_large_is_cut_and_blocks_nothing() {
+        let reason = DeadReason::Unknown("nobody serves it".into());
+        for too_large in 0..=3 {
+            let (reader, sent) = reader(too_large).await;
+            let done = reader.send_dead("https://q/dead", &message(), &reason).await;
+            assert_eq!(done.is_ok(), too_large < 3, "{done:?}");
+            let sent = &lock(&sent).0;
+            assert_eq!(sent.len(), (too_large + 1).min(3));
+            let last = sent.back().unwrap();
+            let is_cut = last["MessageBody"].as_str().unwrap().contains("cut_from_message");
+            assert_eq!(is_cut, too_large >= 2, "{last}");
+            assert_eq!(last["MessageAttributes"]["detail"].is_null(), too_large == 1, "{last}");
+        }
+    }
+
+    #[tokio::test]
+    async fn only_a_fifo_queue_gets_a_group_and_an_id_against_duplicates() {
+        let reason = DeadReason::Malformed("no JSON".into());
+        for (to, is_fifo) in [("https://q/dead", false), ("https://q/dead.fifo", true)] {
+            let (reader, sent) = reader(0).await;
+            reader.send_dead(to, &message(), &reason).await.unwrap();
+            let sent = lock(&sent).0.pop_front().unwrap();
+            assert_eq!(sent["MessageDeduplicationId"].is_string(), is_fifo, "{to}");
+            assert_eq!(sent["MessageGroupId"].is_string(), is_fifo, "{to}");
+        }
+    }
 
     #[test]
     fn only_as_many_as_fit_in_half_the_visibility() {
@@ -308,10 +392,5 @@ mod tests {
                 .ends_with("check queue.url, queue.region and queue.endpoint of its Leaderboards")
         );
         assert!(error(Fault::Throttled).to_string().ends_with("it is retried"));
-    }
-
-    #[test]
-    fn attributes_hold_no_control_characters() {
-        assert_eq!(printable("a\n\u{1}b"), "a  b");
     }
 }

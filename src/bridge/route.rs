@@ -72,7 +72,7 @@ impl DeadReason {
 }
 
 /// All that becomes of messages, as the metric's label has it.
-pub const OUTCOMES: [&str; 10] = [
+pub const OUTCOMES: [&str; 11] = [
     "dead_letter",
     "created",
     "bumped",
@@ -81,6 +81,7 @@ pub const OUTCOMES: [&str; 10] = [
     "unknown",
     "foreign",
     "deleting",
+    "stopping",
     "refused",
     "blocked",
 ];
@@ -109,6 +110,8 @@ pub enum Later {
     Foreign,
     /// Its Submission's predecessor is being deleted.
     Deleting,
+    /// The attempt before it is being stopped.
+    Stopping,
     /// The API server refused its Submission.
     Refused,
     /// It belongs in a dead-letter queue, and the queue has none.
@@ -146,6 +149,7 @@ impl MessageOutcome {
                 Later::Unknown => "unknown",
                 Later::Foreign => "foreign",
                 Later::Deleting => "deleting",
+                Later::Stopping => "stopping",
                 Later::Refused => "refused",
                 Later::Blocked => "blocked",
             },
@@ -236,9 +240,9 @@ pub fn settle(
     match outcome {
         Ok(Outcome::Created) => MessageOutcome::Delete(Done::Created),
         Ok(Outcome::Bumped(_)) => MessageOutcome::Delete(Done::Bumped),
-        // Only the sweep is refused an attempt.
         Ok(Outcome::Repeat | Outcome::Refused | Outcome::NotNew) => MessageOutcome::Delete(Done::Repeat),
         Ok(Outcome::Deleting) => later(envelope.receives, SHORT_WAIT, Later::Deleting),
+        Ok(Outcome::Stopping) => later(envelope.receives, SHORT_WAIT, Later::Stopping),
         Ok(Outcome::IdTaken(owner)) => MessageOutcome::Dead(DeadReason::IdTaken(owner.clone())),
         // Definitions that are newer or older than this program may refuse what others accept.
         Err(IngestError::Refused { .. }) if !is_overdue(envelope, rules, now_ms) => {

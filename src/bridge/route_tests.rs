@@ -261,6 +261,8 @@ fn each_outcome_of_ingest_settles_its_message() {
         (Ok(Outcome::Bumped(Attempt(2))), 0, MessageOutcome::Delete(Done::Bumped)),
         (Ok(Outcome::Repeat), 0, MessageOutcome::Delete(Done::Repeat)),
         (Ok(Outcome::Deleting), 90_000, wait(30, Later::Deleting)),
+        (Ok(Outcome::Stopping), 90_000, wait(30, Later::Stopping)),
+        (Ok(Outcome::Refused), 0, MessageOutcome::Delete(Done::Repeat)),
         (
             Ok(Outcome::IdTaken("x".into())),
             0,
@@ -292,6 +294,7 @@ fn each_outcome_has_a_sample_from_the_start() {
         Later::Unknown,
         Later::Foreign,
         Later::Deleting,
+        Later::Stopping,
         Later::Refused,
         Later::Blocked,
     ];

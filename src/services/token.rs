@@ -190,15 +190,24 @@ impl Token {
         self.expires.is_some_and(|at| at.duration_since(now) <= WARN_BEFORE)
     }
 
-    /// Whose requests it makes, without its value. EvalAI counts by user, so a renewed token of the same user keeps the
-    /// identity; a key that names no user is its own.
-    pub fn identity(&self) -> String {
-        if let Some(user) = &self.user {
-            return format!("user-{user}");
-        }
-        let digest = Sha256::digest(self.value.as_bytes());
+    /// Tells it from every other token, without its value.
+    pub fn digest(&self) -> [u8; 32] {
+        Sha256::digest(self.value.as_bytes()).into()
+    }
+
+    /// Its name in logs, without its value.
+    pub fn label(&self) -> String {
+        let digest = self.digest();
         let start: [u8; 8] = std::array::from_fn(|index| digest[index]);
         format!("token-{:016x}", u64::from_be_bytes(start))
+    }
+
+    /// Whose requests EvalAI counts it with, as far as the token itself claims: only EvalAI can verify that, so nothing but a budget may
+    /// depend on it. One that names no user is counted alone.
+    pub fn claimed_user(&self) -> String {
+        self.user
+            .as_ref()
+            .map_or_else(|| self.label(), |user| format!("user-{user}"))
     }
 }
 
@@ -284,16 +293,18 @@ mod tests {
     }
 
     #[test]
-    fn a_renewed_token_of_the_same_user_keeps_its_identity() {
-        let of = |claims: Value| Token::parse(&jwt(&claims)).unwrap().identity();
-        assert_eq!(
+    fn tokens_of_one_user_are_two_tokens_with_one_budget() {
+        let of = |claims: Value| Token::parse(&jwt(&claims)).unwrap();
+        let (one, other) = (
             of(json!({"user_id": 7, "exp": 1})),
-            of(json!({"user_id": "7", "exp": 2}))
+            of(json!({"user_id": "7", "exp": 2})),
         );
-        assert_ne!(of(json!({"user_id": 7})), of(json!({"user_id": 8})));
-        let plain = |text: &str| Token::parse(text).unwrap().identity();
-        assert_ne!(plain("one"), plain("other"));
-        assert!(!plain("local-host-token").contains("local"));
+        assert_eq!(one.claimed_user(), other.claimed_user());
+        assert_ne!(one.digest(), other.digest());
+        assert_ne!(one.claimed_user(), of(json!({"user_id": 8})).claimed_user());
+        let plain = |text: &str| Token::parse(text).unwrap();
+        assert_ne!(plain("one").claimed_user(), plain("other").claimed_user());
+        assert!(!plain("local-host-token").label().contains("local"));
     }
 
     #[test]

@@ -49,6 +49,7 @@ fn timing() -> Timing {
         hold: Duration::from_millis(1500),
         accept: Duration::from_millis(50),
         lost: Duration::ZERO,
+        missing: Duration::from_millis(100),
         ..Timing::default()
     }
 }
@@ -64,6 +65,7 @@ fn timeouts() -> Timeouts {
 fn target(api_server: &str, token: &str) -> Target {
     let seed = evalai_stand_in::Seed::built_in().unwrap();
     Target {
+        leaderboard: leaderboard(),
         api_server: api_server.to_owned(),
         challenge: 1,
         split: "leaderboard".into(),
@@ -387,7 +389,7 @@ fn refused(status: Status, wanted: Outcome) -> Option<Kept> {
     );
     match (status, wanted) {
         (Status::Deleted, Finished | Failed) => Some(Kept::Otherwise(status)),
-        (Status::Failed, Failed | Cancelled) => Some(Kept::Agreed(status)),
+        (Status::Failed, Failed | Cancelled) | (Status::Finished, Cancelled) => Some(Kept::Agreed(status)),
         _ if is_gone && wanted == Cancelled => Some(Kept::Agreed(status)),
         _ if is_gone => Some(Kept::Otherwise(status)),
         _ => None,

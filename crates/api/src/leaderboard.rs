@@ -225,6 +225,9 @@ pub struct LeaderboardStatus {
     /// Use of EvalAI; absent for a local leaderboard.
     #[serde(default, skip_serializing_if = "Option::is_none")]
     pub evalai: Option<EvalaiUse>,
+    /// Use of the table; absent while no row waits for it.
+    #[serde(default, skip_serializing_if = "Option::is_none")]
+    pub table: Option<TableUse>,
     /// Teams with attempts in a row that ended because of the infrastructure in ways that an agent can cause as well; those with the
     /// most come first.
     #[serde(default, skip_serializing_if = "Vec::is_empty")]
@@ -271,6 +274,14 @@ pub struct EvalaiBacklog {
     pub waiting: i32,
     /// When the last of them is expected to be in EvalAI, to the minute.
     pub last_expected_time: Time,
+}
+
+/// Rows that the table does not have yet, of all Leaderboards that write to it.
+#[derive(Serialize, Deserialize, schemars::JsonSchema, Clone, Debug, PartialEq, Eq)]
+#[serde(rename_all = "camelCase")]
+pub struct TableUse {
+    /// How many wait for more than 10 s. The table gets one in 2 s.
+    pub waiting: i32,
 }
 
 /// What a track effectively runs.

@@ -58,7 +58,7 @@ pub use ingested::{Ingested, RefusedAttempt};
 pub use job_number::JobNumber;
 pub use keeping::StorageClass;
 pub use leaderboard::{
-    EvalaiBacklog, EvalaiUse, JOB_SECONDS, Leaderboard, LeaderboardSpec, LeaderboardStatus, TrackStatus,
+    EvalaiBacklog, EvalaiUse, JOB_SECONDS, Leaderboard, LeaderboardSpec, LeaderboardStatus, TableUse, TrackStatus,
 };
 pub use leaderboard_parts::*;
 pub use pair_status::{EndReason, LastEnd, PairState, PairStatus};

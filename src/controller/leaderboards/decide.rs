@@ -19,7 +19,7 @@ use crate::services::evalai::{InboxTrouble, Usage};
 use leaderboard_api::conditions::{self, Truth};
 use leaderboard_api::leaderboard::Counts;
 use leaderboard_api::{
-    CheckEnd, Evalai, EvalaiBacklog, EvalaiUse, Leaderboard, LeaderboardStatus, TeamFailures, TeamUse, Track,
+    CheckEnd, Evalai, EvalaiBacklog, EvalaiUse, Leaderboard, LeaderboardStatus, TableUse, TeamFailures, TeamUse, Track,
     TrackStatus, effective, names, reasons,
 };
 
@@ -73,6 +73,8 @@ pub struct LeaderboardView {
     pub evalai_writes_from: Option<Timestamp>,
     /// How the requests of its token are used.
     pub usage: Option<Usage>,
+    /// Rows that have waited for its table for a while.
+    pub rows_waiting: Option<usize>,
 }
 
 /// What a reconcile has to do.
@@ -95,6 +97,7 @@ pub fn decide(view: &LeaderboardView) -> LeaderboardPlan {
     status.infrastructure_failures.clone_from(&view.teams);
     status.gpu_use.clone_from(&view.gpu_use);
     status.evalai = view.usage.filter(|_| view.refusal.is_none()).map(evalai_use);
+    status.table = view.rows_waiting.filter(|waiting| *waiting > 0).map(table_use);
     status.tracks = tracks(leaderboard);
     let now = Time(view.now);
     let set = |status: &mut LeaderboardStatus, type_, (truth, reason, message): (Truth, &str, String)| {
@@ -137,6 +140,12 @@ fn evalai_use(usage: Usage) -> EvalaiUse {
             waiting,
             last_expected_time: Time(at),
         }),
+    }
+}
+
+fn table_use(waiting: usize) -> TableUse {
+    TableUse {
+        waiting: i32::try_from(waiting).unwrap_or(i32::MAX),
     }
 }
 

@@ -64,6 +64,7 @@ fn view(mine: &Arc<Leaderboard>, all: &[Arc<Leaderboard>]) -> LeaderboardView {
         evalai: EvalaiStanding::Fits { note: None },
         evalai_writes_from: None,
         usage: Some(USAGE),
+        rows_waiting: None,
     }
 }
 
@@ -284,6 +285,20 @@ fn a_leaderboard_shows_until_when_nothing_is_written_to_evalai() {
             (ready, message)
         );
     }
+}
+
+#[test]
+fn rows_that_wait_for_the_table_are_shown_while_there_are_some() {
+    let one = leaderboard("one", 1, 7, "https://e", "a/");
+    let seen = |rows_waiting| {
+        let view = LeaderboardView {
+            rows_waiting,
+            ..view(&one, &[])
+        };
+        decide(&view).status.table
+    };
+    assert_eq!(seen(Some(187)), Some(TableUse { waiting: 187 }));
+    assert_eq!((seen(Some(0)), seen(None)), (None, None));
 }
 
 #[test]

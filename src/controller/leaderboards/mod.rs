@@ -119,7 +119,8 @@ async fn drive(leaderboard: Arc<Leaderboard>, uses: Uses<'_>) -> Result<Duration
         None => write_status(client, state, &leaderboard, &plan, now).await?,
     };
     // The end of a look wakes it.
-    let due = known.next(&leaderboard, now).filter(|_| since.is_none());
+    let due = known.next(&leaderboard, is_refused(uses, &leaderboard), now);
+    let due = due.filter(|_| since.is_none());
     let due = due.map_or(RESYNC, |at| at.duration_since(now).unsigned_abs());
     let policy = isolation::again(&view.policy, stores.shows_policy(&view.leaderboard));
     Ok(policy.min(due).max(SOONEST).min(again))
@@ -131,6 +132,7 @@ fn show_limits(uses: Uses<'_>, view: &LeaderboardView, probe: &Probe) {
     let state = LimitsState {
         slots_in_use: view.in_use,
         slots: total.and_then(|total| usize::try_from(total).ok()),
+        rows_waiting: view.rows_waiting,
         ..probe.limits()
     };
     let name = key_of(view.leaderboard.as_ref()).to_string();
@@ -147,12 +149,16 @@ fn serve(uses: Uses<'_>, view: &LeaderboardView, plan: &LeaderboardPlan, known: 
     }
 }
 
+/// Whether EvalAI refuses the token that is used now.
+fn is_refused(uses: Uses<'_>, leaderboard: &Leaderboard) -> bool {
+    uses.external.hub.token_refused(&key_of(leaderboard)).is_some()
+}
+
 /// Begins a look if something is due; returns when it began. Where a Leaderboard names what it may not, nothing is asked.
 fn look(uses: Uses<'_>, view: &LeaderboardView, known: &Probe) -> Option<Instant> {
     let leaderboard = &view.leaderboard;
     let key = key_of(leaderboard.as_ref());
-    let is_token_refused = uses.external.hub.token_refused(&key).is_some();
-    let due = known.due(leaderboard, is_token_refused, view.now);
+    let due = known.due(leaderboard, is_refused(uses, leaderboard), view.now);
     if view.refusal.is_some() || due.is_nothing() {
         return None;
     }
@@ -199,7 +205,14 @@ fn observe(
         evalai: standing::standing(hub, leaderboard, probe.token(leaderboard), now),
         evalai_writes_from: hub.writes_from(),
         usage: hub.usage(&key),
+        rows_waiting: rows_waiting(uses, leaderboard),
     }
+}
+
+/// None without a table.
+fn rows_waiting(uses: Uses<'_>, leaderboard: &Leaderboard) -> Option<usize> {
+    let table = leaderboard.spec.table.as_ref()?;
+    Some(uses.external.recorder.waiting(table))
 }
 
 /// Writes the status if it shows something new; returns when to look again. On top of a status that the cache does not show yet
@@ -222,6 +235,7 @@ async fn write_status(
     let only_numbers = leaderboard_api::LeaderboardStatus {
         counts: old.counts,
         evalai: old.evalai.clone(),
+        table: old.table.clone(),
         gpu_use: old.gpu_use.clone(),
         ..plan.status.clone()
     } == old;

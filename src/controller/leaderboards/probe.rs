@@ -33,6 +33,8 @@ use leaderboard_api::{EvalaiMode, Leaderboard, Token as TokenPlace};
 const AGAIN: SignedDuration = SignedDuration::from_mins(5);
 /// A failed look is repeated sooner.
 const SOON: SignedDuration = SignedDuration::from_secs(15);
+/// A token that EvalAI refuses may be renewed at any moment, and runs wait for that.
+const REFUSED: SignedDuration = SignedDuration::from_secs(6);
 
 /// What a look uses.
 #[derive(Clone, Copy)]
@@ -96,15 +98,25 @@ impl Probe {
         let is_edited = !self.is_of(leaderboard);
         let has_classes = !self.pods.classes.is_empty();
         let has_claims = self.claims != Claims::NotRequired;
-        let token = self.token_of(leaderboard);
-        let has_token = token.is_some_and(|found| found.token.is_ok()) && !is_token_refused;
         let is_queue_due = self.queue.as_ref().is_some_and(|queue| queue.is_due(now));
         Due {
             priority: is_edited || has_classes && due(self.priority_at, self.priority.refused.is_none(), now),
             claims: is_edited || has_claims && due(self.claims_at, self.claims == Claims::InPlace, now),
-            token: leaderboard.spec.evalai.is_some() && due(token.map(|found| found.at), has_token, now),
+            token: leaderboard.spec.evalai.is_some() && self.token_is_due(leaderboard, is_token_refused, now),
             places: places::due(leaderboard, &self.reach, is_queue_due, now),
         }
+    }
+
+    fn token_is_due(&self, leaderboard: &Leaderboard, is_refused: bool, now: Timestamp) -> bool {
+        let Some(found) = self.token_of(leaderboard) else {
+            return true;
+        };
+        let wait = if is_refused && found.token.is_ok() {
+            REFUSED
+        } else {
+            wait(found.token.is_ok())
+        };
+        has_passed(found.at, wait, now)
     }
 
     /// Looks at what is due.
@@ -200,6 +212,7 @@ impl Probe {
         let format = results_format(spec.leaderboard_version);
         let created = leaderboard.metadata.creation_timestamp.as_ref();
         Some(Target {
+            leaderboard: key_of(leaderboard),
             api_server: evalai.server(),
             challenge: evalai.challenge,
             split: evalai.split.clone(),
@@ -235,15 +248,17 @@ impl Probe {
     }
 
     /// When something has to be tried again.
-    pub(super) fn next(&self, leaderboard: &Leaderboard, now: Timestamp) -> Option<Timestamp> {
-        let token = self.token_of(leaderboard).filter(|found| found.token.is_err());
-        let token = token.map(|found| found.at);
+    pub(super) fn next(&self, leaderboard: &Leaderboard, is_token_refused: bool, now: Timestamp) -> Option<Timestamp> {
+        let token = self.token_of(leaderboard);
+        let missing = token.filter(|found| found.token.is_err()).map(|found| found.at);
+        let refused = token.filter(|found| is_token_refused && found.token.is_ok());
+        let refused = refused.and_then(|found| found.at.checked_add(REFUSED).ok());
         let priority = self.priority_at.filter(|_| self.priority.refused.is_some());
         let is_missing = matches!(self.claims, Claims::NotServed | Claims::Missing(_));
         let claims = self.claims_at.filter(|_| is_missing);
-        let [token, priority, claims] = [token, priority, claims].map(|at| at?.checked_add(SOON).ok());
+        let [missing, priority, claims] = [missing, priority, claims].map(|at| at?.checked_add(SOON).ok());
         let queue = self.queue.as_ref().and_then(SharedQueue::next);
-        [self.reach.next(now), token, claims, priority, queue]
+        [self.reach.next(now), missing, refused, claims, priority, queue]
             .into_iter()
             .flatten()
             .min()
@@ -255,9 +270,16 @@ fn generation_of(leaderboard: &Leaderboard) -> i64 {
 }
 
 fn due(at: Option<Timestamp>, good: bool, now: Timestamp) -> bool {
-    let wait = if good { AGAIN } else { SOON };
-    // A clock that was set back makes it due as well.
-    at.is_none_or(|at| now.duration_since(at) >= wait || now < at)
+    at.is_none_or(|at| has_passed(at, wait(good), now))
+}
+
+fn wait(good: bool) -> SignedDuration {
+    if good { AGAIN } else { SOON }
+}
+
+/// A clock that was set back makes it due as well.
+fn has_passed(at: Timestamp, wait: SignedDuration, now: Timestamp) -> bool {
+    now.duration_since(at) >= wait || now < at
 }
 
 async fn find_token(
@@ -332,8 +354,13 @@ mod tests {
             !probe.due(&old, true, now).token,
             "a refused one is not read again at once"
         );
-        let later = now.checked_add(SOON).unwrap();
-        assert!(probe.due(&old, true, later).token);
+        let later = now.checked_add(REFUSED).unwrap();
+        assert!(probe.due(&old, true, later).token && !probe.due(&old, false, later).token);
+        assert!(
+            probe.next(&old, true, now) == Some(later),
+            "it wakes its Leaderboard for that"
+        );
+        assert_eq!(probe.next(&old, false, now), None);
         assert!(probe.target(&new).is_none() && probe.due(&new, false, now).token);
     }
 }

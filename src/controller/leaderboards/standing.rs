@@ -9,6 +9,7 @@ use crate::controller::objects::key_of;
 use crate::services::evalai::{Hub, InboxTrouble, Labels};
 use crate::services::token::Token;
 use leaderboard_api::Leaderboard;
+use leaderboard_api::text::sentence;
 
 /// How a Leaderboard stands with EvalAI.
 #[derive(Clone, Debug, PartialEq, Eq)]
@@ -55,22 +56,32 @@ pub(super) fn standing(
         }
         _ => {}
     }
+    let silence = hub.silence(key).map(|(since, why)| silent(since, &why));
     match labels {
-        None => EvalaiStanding::Unchecked(why),
+        None => EvalaiStanding::Unchecked(silence.or(why)),
         Some(labels) if !labels.ok() => {
             let problems: Vec<String> = labels.problems.iter().map(ToString::to_string).collect();
             EvalaiStanding::Misfit(problems.join("; "))
         }
         Some(labels) => EvalaiStanding::Fits {
-            note: note(&labels, ends_soon(token, now)),
+            note: note(silence, &labels, ends_soon(token, now)),
         },
     }
 }
 
-/// What is worth saying although results can be published: columns that stay empty, and a token that ends soon.
-fn note(labels: &Labels, of_token: Option<String>) -> Option<String> {
+/// That EvalAI does not answer. A run needs it only to start and to be published, so that its Leaderboard stays ready.
+fn silent(since: Timestamp, why: &str) -> String {
+    format!(
+        "EvalAI has not answered since {}: {} Runs go on, and what EvalAI is to get waits until it answers; new submissions start then.",
+        since.strftime("%Y-%m-%d %H:%M:%S UTC"),
+        sentence(why)
+    )
+}
+
+/// What is worth saying although results can be published: a server that is away, columns that stay empty, and a token that ends soon.
+fn note(silence: Option<String>, labels: &Labels, of_token: Option<String>) -> Option<String> {
     let of_labels = labels.problems.iter().map(|problem| capitalized(&problem.to_string()));
-    let notes: Vec<String> = of_labels.chain(of_token).collect();
+    let notes: Vec<String> = silence.into_iter().chain(of_labels).chain(of_token).collect();
     (!notes.is_empty()).then(|| notes.join(" "))
 }
 
@@ -96,13 +107,20 @@ mod tests {
             problems,
         };
         let ends = || Some("EvalAI's token ends on 2027-01-01.".to_owned());
-        assert_eq!(note(&labels(vec![]), None), None);
-        assert_eq!(note(&labels(vec![]), ends()), ends());
+        assert_eq!(note(None, &labels(vec![]), None), None);
+        assert_eq!(note(None, &labels(vec![]), ends()), ends());
+        let away = silent(Timestamp::UNIX_EPOCH, "EvalAI could not be reached");
+        assert!(
+            away.starts_with(
+                "EvalAI has not answered since 1970-01-01 00:00:00 UTC: EvalAI could not be reached. Runs"
+            )
+        );
+        assert_eq!(note(Some(away.clone()), &labels(vec![]), None), Some(away));
         let unsent = Misfit::Unsent {
             phase: 2,
             labels: vec!["Speed".into(), "Comfort".into()],
         };
-        let said = note(&labels(vec![unsent]), ends()).unwrap();
+        let said = note(None, &labels(vec![unsent]), ends()).unwrap();
         assert_eq!(
             said,
             "The leaderboard of phase 2 also has Speed, Comfort, which the operator never sends and which stay empty; remove them from its schema, or check spec.leaderboardVersion. EvalAI's token ends \

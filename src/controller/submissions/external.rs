@@ -291,10 +291,15 @@ fn map_view(seen: &SubmissionState, submission: &Submission, rerun_of: Option<Re
 
 fn map_end(end: &Ended, is_due: bool) -> EvalaiEnd {
     match end {
-        Ended::Published { at, .. } | Ended::Agreed { at, .. } => EvalaiEnd::Published { at: *at },
-        Ended::Otherwise(status) => EvalaiEnd::Ended {
+        // It was there before our own end, which then is a cancel: nothing else of ours leaves it as it is.
+        Ended::Agreed {
+            status: status @ Status::Finished,
+            ..
+        }
+        | Ended::Otherwise(status) => EvalaiEnd::Ended {
             status: status.as_str().to_owned(),
         },
+        Ended::Published { at, .. } | Ended::Agreed { at, .. } => EvalaiEnd::Published { at: *at },
         Ended::Refused(message) => EvalaiEnd::Refused {
             message: message.clone(),
             is_due,

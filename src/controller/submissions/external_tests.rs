@@ -269,3 +269,15 @@ fn an_end_that_evalai_showed_already_is_published_at_one_moment_whatever_is_read
         assert_eq!(end_after(seconds), Some(EvalaiEnd::Published { at }));
     }
 }
+
+#[test]
+fn what_had_finished_in_evalai_before_is_its_own_end() {
+    let of = |end: Ended| map_end(&end, false);
+    let at = Timestamp::UNIX_EPOCH;
+    let agreed = |status| Ended::Agreed { status, at };
+    let kept = EvalaiEnd::Ended {
+        status: "finished".into(),
+    };
+    assert_eq!(of(agreed(Status::Finished)), kept);
+    assert_eq!(of(agreed(Status::Cancelled)), EvalaiEnd::Published { at });
+}

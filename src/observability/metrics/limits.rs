@@ -16,6 +16,7 @@ pub(super) struct Limits {
     visible: Family<OfLeaderboard, Gauge>,
     in_flight: Family<OfLeaderboard, Gauge>,
     dead: Family<OfLeaderboard, Gauge>,
+    rows: Family<OfLeaderboard, Gauge>,
 }
 
 impl Limits {
@@ -51,6 +52,11 @@ impl Limits {
                 "dead_letter_queue_messages",
                 "Messages that lie in the dead-letter queue, as SQS reported last",
             ),
+            rows: zero(
+                r,
+                "table_rows_waiting",
+                "Rows that have waited for the table for more than 10 s, of all Leaderboards that write to it",
+            ),
         }
     }
 
@@ -61,6 +67,7 @@ impl Limits {
         self.visible.clear();
         self.in_flight.clear();
         self.dead.clear();
+        self.rows.clear();
     }
 
     pub(super) fn forget(&self, of: &OfLeaderboard) {
@@ -70,6 +77,7 @@ impl Limits {
         self.visible.remove(of);
         self.in_flight.remove(of);
         self.dead.remove(of);
+        self.rows.remove(of);
     }
 }
 
@@ -82,6 +90,8 @@ pub struct LimitsState {
     /// Visible, and in flight.
     pub queue: Option<(u64, u64)>,
     pub dead_letters: Option<u64>,
+    /// None without a table.
+    pub rows_waiting: Option<usize>,
 }
 
 impl Metrics {
@@ -101,6 +111,7 @@ impl Metrics {
             state.queue.map(|(_, in_flight)| number(in_flight)),
         );
         show(&limits.dead, &of, state.dead_letters.map(number));
+        show(&limits.rows, &of, state.rows_waiting.map(whole));
         match state.token_ends {
             Some(at) => {
                 let seconds = at.duration_since(Timestamp::UNIX_EPOCH).as_secs_f64();

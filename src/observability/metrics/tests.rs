@@ -69,6 +69,7 @@ fn limits() -> LimitsState {
         token_ends: Some(jiff::Timestamp::from_second(1_800_000_000).unwrap()),
         queue: Some((5, 2)),
         dead_letters: Some(1),
+        rows_waiting: Some(187),
     }
 }
 
@@ -104,6 +105,7 @@ fn every_metric_has_its_name_and_its_labels() {
         "leaderboard_queue_visible_messages{leaderboard=\"ns/board\"} 5",
         "leaderboard_queue_in_flight_messages{leaderboard=\"ns/board\"} 2",
         "leaderboard_dead_letter_queue_messages{leaderboard=\"ns/board\"} 1",
+        "leaderboard_table_rows_waiting{leaderboard=\"ns/board\"} 187",
         "leaderboard_submission_phase_duration_seconds_bucket{le=\"3600.0\",phase=\"run\"} 1",
         "leaderboard_submission_phase_duration_seconds_bucket{le=\"1800.0\",phase=\"run\"} 0",
         "leaderboard_trace_spans_total{outcome=\"sent\"} 12",
@@ -295,6 +297,7 @@ fn what_a_leaderboard_no_longer_has_is_no_longer_shown() {
         "slots_limit{",
         "token_expiry_timestamp_seconds{",
         "_messages{leaderboard",
+        "rows_waiting{leaderboard",
     ] {
         assert!(!text.contains(gone), "{gone} in\n{text}");
     }

@@ -63,14 +63,15 @@ impl Budget {
 
     /// When `count` requests may be made, one after the other, if nothing else is. More than a burst counts as a burst.
     pub fn ready_at(&self, now: Duration, count: u32) -> Duration {
-        self.ready_keeping(now, count, 0)
+        self.ready_behind(now, count, 0, 0)
     }
 
-    /// The same, if `keep` more of the minute's requests are left for what comes at any time.
-    pub fn ready_keeping(&self, now: Duration, count: u32, keep: u32) -> Duration {
-        let count = count.clamp(1, self.burst());
+    /// The same, if `keep` more of the minute's requests are left for what comes at any time, and after `ahead` others. Those are not cut to
+    /// a burst: what has to let more than that pass waits until there are fewer.
+    pub fn ready_behind(&self, now: Duration, count: u32, keep: u32, ahead: u32) -> Duration {
+        let count = count.clamp(1, self.burst()).saturating_add(ahead);
         let credit = self.credit_at(now);
-        let earned = now + (self.interval() * count).saturating_sub(credit);
+        let earned = now + (self.interval().saturating_mul(count)).saturating_sub(credit);
         let recent = self.sent.iter().filter(|at| **at + WINDOW > now);
         let wanted = recent.clone().count() + count as usize + keep as usize;
         let excess = wanted.saturating_sub(self.limit as usize);

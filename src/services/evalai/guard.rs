@@ -98,6 +98,8 @@ pub fn end(status: Status, attempt: Attempt, wanted: Outcome) -> End {
     match (standing(status, attempt), wanted) {
         (Status::Unknown, _) => End::Wait,
         (Status::Deleted, Outcome::Finished | Outcome::Failed) => End::Cancel,
+        // A result that was published before, as of an object that was restored since. EvalAI's leaderboard lists what is finished alone.
+        (Status::Finished, Outcome::Cancelled) if !attempt.under_way => End::Done(status),
         (Status::Failed, Outcome::Failed | Outcome::Cancelled)
         | (Status::Cancelled | Status::Archived | Status::Ignored | Status::Missing, Outcome::Cancelled) => {
             End::Done(status)
@@ -243,11 +245,20 @@ mod tests {
     #[test]
     fn finals_follow_their_table() {
         use Outcome::{Cancelled, Failed, Finished};
+        let all = [(1, false), (1, true), (2, false), (2, true)].map(|(attempt, begun)| of(attempt, begun));
         for status in LIVE.into_iter().chain([S::Finished]) {
-            for wanted in [Finished, Failed, Cancelled] {
-                for (attempt, begun) in [(1, false), (1, true), (2, false), (2, true)] {
-                    assert_eq!(end(status, of(attempt, begun), wanted), End::Put, "{status} {wanted:?}");
-                }
+            for (attempt, wanted) in all
+                .iter()
+                .flat_map(|attempt| [Finished, Failed, Cancelled].map(|o| (*attempt, o)))
+            {
+                let under_way = Attempt {
+                    under_way: true,
+                    ..attempt
+                };
+                assert_eq!(end(status, under_way, wanted), End::Put, "{status} {wanted:?}");
+                let is_kept = status == S::Finished && wanted == Cancelled;
+                let expected = if is_kept { End::Done(status) } else { End::Put };
+                assert_eq!(end(status, attempt, wanted), expected, "{status} {wanted:?}");
             }
         }
         assert_eq!(end(S::Failed, of(1, true), Finished), End::Put);

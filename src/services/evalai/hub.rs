@@ -1,10 +1,11 @@
 //! The controller's way to EvalAI: desired updates in, what is known out, nothing waits.
 //!
-//! Called by the controller's reconciles. Hands each update to the queue of the right server and token, and starts a task for
-//! each, which ends when nothing uses the token any more. Knows no policy.
+//! Called by the controller's reconciles. Hands each update to the queue of its server, namespace and token, and starts a task for
+//! each, which ends when nothing uses the token any more. A submission is where its Leaderboard is: with another token of that, both go to
+//! another queue, as they are. Knows no policy.
 
 use std::collections::BTreeMap;
-use std::sync::{Arc, Mutex, MutexGuard};
+use std::sync::{Arc, Mutex, MutexGuard, Weak};
 
 use jiff::{SignedDuration, Timestamp};
 use tokio::sync::{mpsc, watch};
@@ -14,7 +15,7 @@ use tokio::time::Instant;
 use super::client::Client;
 use super::http::{ClientError, Timeouts};
 use super::labels::Labels;
-use super::queue::{Now, Queue, Timing};
+use super::queue::{Now, Purse, Queue, Timing};
 use super::task::{Arrived, Outlets, Shared, Task, now, run};
 use super::types::{
     Changed, DesiredUpdate, InboxTrouble, Key, Load, Publisher, Subject, SubmissionState, SweepRow, Target, Usage,
@@ -81,10 +82,24 @@ struct State {
     tokens: BTreeMap<Account, Entry>,
     /// Which queue an object is in.
     places: BTreeMap<Key, Account>,
+    purses: BTreeMap<Payer, Weak<Purse>>,
 }
 
-/// A server and whose requests are counted there.
-type Account = (String, String);
+/// What one queue is for. The token is named by its digest: the user that it claims could be anybody's.
+#[derive(Clone, Debug, PartialEq, Eq, PartialOrd, Ord)]
+struct Account {
+    server: String,
+    namespace: String,
+    token: [u8; 32],
+}
+
+/// Whose requests share a budget. A claimed user counts within a namespace alone, so that no namespace slows another.
+#[derive(Clone, Debug, PartialEq, Eq, PartialOrd, Ord)]
+struct Payer {
+    server: String,
+    namespace: String,
+    user: String,
+}
 
 struct Entry {
     shared: Arc<Shared>,
@@ -94,15 +109,58 @@ struct Entry {
     task: Option<JoinHandle<Option<bool>>>,
 }
 
+impl Account {
+    fn of(target: &Target) -> Self {
+        Self {
+            server: root(target),
+            namespace: target.leaderboard.namespace.clone(),
+            token: target.token.digest(),
+        }
+    }
+}
+
+impl Payer {
+    fn of(target: &Target) -> Self {
+        Self {
+            server: root(target),
+            namespace: target.leaderboard.namespace.clone(),
+            user: target.token.claimed_user(),
+        }
+    }
+}
+
+fn root(target: &Target) -> String {
+    target.api_server.trim_end_matches('/').to_owned()
+}
+
 impl State {
+    /// The account of an object: that of its Leaderboard, which alone may change its token.
+    fn account_of(&self, key: &Key, target: &Target) -> Account {
+        let of_leaderboard = self
+            .places
+            .get(&target.leaderboard)
+            .filter(|_| *key != target.leaderboard);
+        of_leaderboard.cloned().unwrap_or_else(|| Account::of(target))
+    }
+
     /// Puts an object into the queue of an account. Returns the one that it was in before, if that is another one.
-    fn enter(&mut self, key: &Key, account: &Account) -> Option<Account> {
+    fn enter(&mut self, key: &Key, account: &Account) -> Option<Arc<Shared>> {
         let before = self.places.insert(key.clone(), account.clone());
         if before.as_ref() == Some(account) {
             return None;
         }
         self.count(account, 1);
-        before
+        self.count(&before?, -1)
+    }
+
+    /// The purse of a user, made if there is none.
+    fn purse_of(&mut self, target: &Target, now: Now) -> Arc<Purse> {
+        self.purses.retain(|_, purse| purse.strong_count() > 0);
+        let payer = Payer::of(target);
+        let known = self.purses.get(&payer).and_then(Weak::upgrade);
+        let purse = known.unwrap_or_else(|| Purse::new(target.requests_per_minute, now.at));
+        self.purses.insert(payer, Arc::downgrade(&purse));
+        purse
     }
 
     fn leave(&mut self, key: &Key) -> Option<Arc<Shared>> {
@@ -157,11 +215,9 @@ impl Hub {
         (Instant::now() < inner.options.not_before).then_some(inner.writes_from)
     }
 
-    /// A Leaderboard serves its challenge: it is swept, checked, and its token is renewed by calling this again.
+    /// A Leaderboard serves its challenge: it is swept and checked. Called again, it and its submissions go on with the token of now.
     pub fn serve(&self, leaderboard: &Key, target: &Target) -> Result<(), ClientError> {
-        self.with(leaderboard, None, target, |queue, now| {
-            queue.serve(leaderboard, target, now)
-        })
+        self.with(leaderboard, target, |queue, now| queue.serve(leaderboard, target, now))
     }
 
     /// A Leaderboard is gone.
@@ -222,8 +278,20 @@ impl Hub {
 
     /// Over all tokens.
     pub fn load(&self) -> Load {
-        let queues: Vec<_> = self.state().tokens.values().map(|entry| entry.shared.clone()).collect();
-        queues.iter().map(|shared| shared.queue().load(shared.now())).sum()
+        let state = self.state();
+        let queues: Vec<_> = state.tokens.values().map(|entry| entry.shared.clone()).collect();
+        let purses: Vec<_> = state.purses.values().filter_map(Weak::upgrade).collect();
+        drop(state);
+        let now = now(self.0.start).at;
+        let uses = purses.iter().map(|purse| purse.use_at(now));
+        let (used, limit) = uses.fold((0, 0), |(used, limit), (one, of)| {
+            (used + one as usize, limit + of as usize)
+        });
+        Load {
+            used,
+            limit,
+            waiting: queues.iter().map(|shared| shared.queue().waiting()).sum(),
+        }
     }
 
     /// Why EvalAI refuses a Leaderboard's token, at all or for the challenge; none while it does not.
@@ -232,6 +300,13 @@ impl Hub {
         let queue = shared.queue();
         let refused = queue.token_refused().or_else(|| queue.challenge_refused(leaderboard));
         refused.map(str::to_owned)
+    }
+
+    /// Since when EvalAI has answered no request with a Leaderboard's token, and why; none if that is not long.
+    pub fn silence(&self, leaderboard: &Key) -> Option<(Timestamp, String)> {
+        let shared = self.place(leaderboard)?;
+        let queue = shared.queue();
+        queue.silence().map(|(since, why)| (since, why.to_owned()))
     }
 
     /// Why the queue of a Leaderboard's challenge is not read; none while it is, or need not be.
@@ -278,80 +353,61 @@ impl Hub {
     }
 
     fn with_subject(&self, subject: &Subject, act: impl FnOnce(&mut Queue, Now) -> bool) -> Result<(), ClientError> {
-        self.with(&subject.key, Some(subject.pk), &subject.target, act)
+        self.with(&subject.key, &subject.target, act)
     }
 
     /// Does something with the queue that an object belongs to, and wakes its task.
-    fn with(
-        &self,
-        key: &Key,
-        pk: Option<i64>,
-        target: &Target,
-        act: impl FnOnce(&mut Queue, Now) -> bool,
-    ) -> Result<(), ClientError> {
+    fn with(&self, key: &Key, target: &Target, act: impl FnOnce(&mut Queue, Now) -> bool) -> Result<(), ClientError> {
         if *self.0.closing.borrow() {
             return Ok(());
         }
-        let shared = self.shared(key, pk, target)?;
-        let renewed = shared.renew(&target.token);
-        if renewed {
-            shared.queue().renew_token();
-        }
+        let shared = self.shared(key, target)?;
         let news = act(&mut shared.queue(), shared.now());
-        if news || renewed {
+        if news {
             shared.publish(&self.0.outlets);
             shared.notify.notify_one();
         }
         Ok(())
     }
 
-    fn shared(&self, key: &Key, pk: Option<i64>, target: &Target) -> Result<Arc<Shared>, ClientError> {
-        let account = (
-            target.api_server.trim_end_matches('/').to_owned(),
-            target.token.identity(),
-        );
+    fn shared(&self, key: &Key, target: &Target) -> Result<Arc<Shared>, ClientError> {
         let mut state = self.state();
-        let shared = if let Some(entry) = state.tokens.get(&account) {
-            entry.shared.clone()
+        let account = state.account_of(key, target);
+        let known = state.tokens.get(&account).map(|entry| entry.shared.clone());
+        let shared = if let Some(shared) = known {
+            shared
         } else {
-            let entry = self.start(target, &account)?;
+            let entry = self.start(&mut state, target, &account)?;
             let shared = entry.shared.clone();
             state.tokens.insert(account.clone(), entry);
             shared
         };
-        let old = state.enter(key, &account).and_then(|before| state.count(&before, -1));
-        drop(state);
-        if let Some(old) = old {
-            self.move_over(key, pk, &old, &shared);
-            old.notify.notify_one();
+        if let Some(old) = state.enter(key, &account) {
+            self.move_over(&mut state, key, &old, (&account, &shared));
         }
         Ok(shared)
     }
 
-    /// An object whose token now is another user's: what the old queue has on its way is waited out.
-    fn move_over(&self, key: &Key, pk: Option<i64>, old: &Shared, new: &Shared) {
-        let now = now(self.0.start);
-        let mut queue = old.queue();
-        queue.retire(key, now);
-        queue.forget(key, now);
-        let unsettled = pk.filter(|pk| queue.is_unsettled(*pk));
-        drop(queue);
-        if let Some(pk) = unsettled {
-            new.queue()
-                .hold(pk, now.at + self.0.options.timing.hold + self.0.options.timeouts.write);
+    /// An object whose token is another one now: all that waits goes on with that, and what is on its way is waited out.
+    fn move_over(&self, state: &mut State, key: &Key, old: &Shared, (account, new): (&Account, &Shared)) {
+        let (now, options) = (now(self.0.start), &self.0.options);
+        let settled = now.at + options.timing.hold + options.timeouts.write;
+        let leaving = old.queue().part_with(key, settled, now);
+        for submission in leaving.submissions().filter(|submission| *submission != key) {
+            state.enter(submission, account);
         }
+        new.queue().take_over(leaving);
+        new.notify.notify_one();
+        old.notify.notify_one();
     }
 
-    fn start(&self, target: &Target, account: &Account) -> Result<Entry, ClientError> {
+    fn start(&self, state: &mut State, target: &Target, account: &Account) -> Result<Entry, ClientError> {
         let inner = &self.0;
         let client = Client::new(&target.api_server, inner.options.timeouts)?;
+        let (timing, now) = (inner.options.timing, now(inner.start));
         let not_before = inner.options.not_before.saturating_duration_since(inner.start);
-        let queue = Queue::new(
-            inner.options.timing,
-            target.requests_per_minute,
-            not_before,
-            now(inner.start),
-        );
+        let share = state.purse_of(target, now).share(target.requests_per_minute, now.at);
+        let queue = Queue::new(timing, share, not_before, now);
         let shared = Arc::new(Shared::new(queue, target.token.clone(), inner.start));
         let (weak, account) = (Arc::downgrade(inner), account.clone());
         let work = run(Task {
@@ -362,7 +418,7 @@ impl Hub {
             closing: inner.closing.subscribe(),
             is_unused: Box::new(move || weak.upgrade().is_none_or(|hub| hub.state().remove_unused(&account))),
         });
-        let name = format!("EvalAI requests of {}", target.token.identity());
+        let name = format!("EvalAI requests of {}", target.token.label());
         // It ends when its token is no longer used.
         let task = inner.options.tasks.may_end(name, work);
         Ok(Entry {

@@ -122,6 +122,11 @@ mod tests {
 
     fn target(phases: &[i64], labels: &[&str]) -> Target {
         Target {
+            leaderboard: crate::services::ObjectKey {
+                namespace: "ns".into(),
+                name: "board".into(),
+                uid: "board".into(),
+            },
             api_server: "http://evalai".into(),
             challenge: 1,
             split: "leaderboard".into(),

@@ -1,7 +1,8 @@
-//! EvalAI: what it shows of submissions, and what is written there, as one budget of requests for each token.
+//! EvalAI: what it shows of submissions, and what is written there, within a budget of requests.
 //!
 //! The controller calls [`Hub`] only, which never waits: a [`DesiredUpdate`] goes in, a [`SubmissionState`] comes out, a channel
-//! reports what has changed. Behind it each token has one `task` that carries out what `queue` decides. The rules of what may
+//! reports what has changed. Behind it each token of a namespace has one `task` that carries out what `queue` decides; a request
+//! carries the token of its own Leaderboard, and no other. The rules of what may
 //! be written over what are in [`guard`], and nowhere else. This module knows no Kubernetes object: a [`Key`] is only handed
 //! back.
 

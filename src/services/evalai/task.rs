@@ -1,6 +1,6 @@
 //! Carries out what one token's queue decides: takes requests out, sends them, brings the answers back.
 //!
-//! Started by `hub`, one for each server and token. Holds the queue's lock only for moments, never while it waits.
+//! Started by `hub`, one for each server, namespace and token. Holds the queue's lock only for moments, never while it waits.
 
 use std::sync::{Arc, Mutex, MutexGuard};
 use std::time::Duration;
@@ -24,7 +24,7 @@ const DRAIN: Duration = Duration::from_secs(70);
 /// What the hub and the task of one token share.
 pub(super) struct Shared {
     queue: Mutex<Queue>,
-    token: Mutex<Arc<Token>>,
+    token: Arc<Token>,
     /// Notified of new updates and questions.
     pub notify: Notify,
     /// The queue's time counts from here.
@@ -61,7 +61,7 @@ impl Shared {
     pub fn new(queue: Queue, token: Arc<Token>, start: Instant) -> Self {
         Self {
             queue: Mutex::new(queue),
-            token: Mutex::new(token),
+            token,
             notify: Notify::new(),
             start,
         }
@@ -75,20 +75,6 @@ impl Shared {
     /// The queue. A panic elsewhere leaves it whole: every change of it is one call.
     pub fn queue(&self) -> MutexGuard<'_, Queue> {
         lock(&self.queue)
-    }
-
-    /// Takes a renewed token. Returns whether it is another one.
-    pub fn renew(&self, token: &Arc<Token>) -> bool {
-        let mut kept = lock(&self.token);
-        let other = *kept != *token;
-        if other {
-            *kept = token.clone();
-        }
-        other
-    }
-
-    fn token(&self) -> Arc<Token> {
-        lock(&self.token).clone()
     }
 
     /// Reports what has changed.
@@ -177,14 +163,16 @@ pub(super) async fn run(task: Task) -> bool {
     all && !shared.queue().is_unsure(shared.now())
 }
 
-/// Sends one request, unless the guard forbids writes since it was chosen. None as reply: it was not sent.
+/// Sends one request, unless the guard forbids writes since it was chosen, or the read of a write is too old by now. None as reply: it was
+/// not sent.
 async fn send(shared: &Shared, client: &Client, guard: &dyn WriteGuard, ticket: Ticket) -> (Ticket, Option<Reply>) {
     let write = ticket.request.is_write();
-    if write && !guard.may_write() {
+    let is_late = ticket.leave_by.is_some_and(|by| shared.now().at > by);
+    if write && (!guard.may_write() || is_late) {
         return (ticket, None);
     }
     let started = Instant::now();
-    let reply = client.send(&shared.token(), &ticket.request).await;
+    let reply = client.send(&shared.token, &ticket.request).await;
     log(&ticket, &reply.answer(), started.elapsed());
     (ticket, Some(reply))
 }

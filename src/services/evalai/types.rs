@@ -18,6 +18,8 @@ use leaderboard_api::Attempt;
 /// The challenge of a Leaderboard and how it is asked.
 #[derive(Clone, Debug, PartialEq)]
 pub struct Target {
+    /// The Leaderboard itself.
+    pub leaderboard: Key,
     /// Root of the server.
     pub api_server: String,
     /// Id of the challenge.
@@ -26,7 +28,7 @@ pub struct Target {
     pub split: String,
     /// A host's token.
     pub token: Arc<Token>,
-    /// Requests per minute; the smallest of all Leaderboards with this token holds.
+    /// Requests per minute; the smallest of all Leaderboards of the namespace whose tokens name this one's user holds.
     pub requests_per_minute: u32,
     /// Time between two sweeps.
     pub sweep: Duration,
@@ -306,14 +308,4 @@ pub struct Load {
     pub limit: usize,
     /// Updates and questions that wait for a request.
     pub waiting: usize,
-}
-
-impl std::iter::Sum for Load {
-    fn sum<I: Iterator<Item = Self>>(loads: I) -> Self {
-        loads.fold(Self::default(), |sum, load| Self {
-            used: sum.used + load.used,
-            limit: sum.limit + load.limit,
-            waiting: sum.waiting + load.waiting,
-        })
-    }
 }

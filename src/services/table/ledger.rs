@@ -15,6 +15,8 @@ use leaderboard_api as api;
 
 /// How long a row that was refused for its own sake is not retried.
 const REFUSED: Duration = Duration::from_mins(5);
+/// A row that waits for less is on its way.
+const ON_ITS_WAY: Duration = Duration::from_secs(10);
 
 /// What identifies a table and how it is reached.
 #[derive(Clone, Debug, PartialEq, Eq, Hash)]
@@ -63,6 +65,8 @@ struct Entry {
     table: TableId,
     /// Place in line, kept while newer rows replace older ones.
     turn: u64,
+    /// When it began to wait.
+    since: Instant,
     newest: RowUpdate,
     is_pending: bool,
     is_written: bool,
@@ -94,7 +98,9 @@ impl Ledger {
             if update.row.attempt != old.row.attempt || entry.is_superseded {
                 entry.error = None;
             }
-            entry.turn = if entry.is_pending { entry.turn } else { turn };
+            if !entry.is_pending {
+                (entry.turn, entry.since) = (turn, now);
+            }
             entry.newest = update;
             (entry.is_pending, entry.is_written, entry.refused_until) = (true, false, None);
             entry.is_superseded = false;
@@ -103,6 +109,7 @@ impl Ledger {
         let entry = Entry {
             table,
             turn,
+            since: now,
             newest: update,
             is_pending: true,
             is_written: false,
@@ -122,6 +129,12 @@ impl Ledger {
             .filter(|(_, entry)| entry.is_pending && entry.table == *table);
         let first = waiting.min_by_key(|(_, entry)| (!entry.newest.end, entry.turn));
         first.map(|(key, entry)| (key.clone(), entry.newest.clone()))
+    }
+
+    /// How many rows have waited for a table for longer than one takes.
+    pub fn waiting(&self, table: &TableId, now: Instant) -> usize {
+        let waits = |entry: &&Entry| entry.is_pending && entry.table == *table && entry.since + ON_ITS_WAY < now;
+        self.entries.values().filter(waits).count()
     }
 
     /// Takes in what became of a write to a table. True if the view of the object has changed.
@@ -272,6 +285,32 @@ mod tests {
             "but for a resume"
         );
         assert_eq!(record(update(1, "9/9", true)), (false, update(2, "3/9", false)));
+    }
+
+    #[test]
+    fn rows_that_wait_for_long_are_counted_table_by_table() {
+        let (mut ledger, now) = (Ledger::default(), Instant::now());
+        for name in ["a", "b", "c"] {
+            ledger.record(table("t"), &key(name), update(1, "9/9", true), now);
+        }
+        ledger.record(table("u"), &key("d"), update(1, "9/9", true), now);
+        let (soon, late) = (now + ON_ITS_WAY, now + ON_ITS_WAY + Duration::from_secs(1));
+        assert_eq!(ledger.waiting(&table("t"), soon), 0, "they are on their way");
+        assert_eq!(
+            (ledger.waiting(&table("t"), late), ledger.waiting(&table("u"), late)),
+            (3, 1)
+        );
+        ledger.report(
+            &table("t"),
+            &key("a"),
+            &update(1, "9/9", true),
+            Ok(Written::Stored),
+            late,
+        );
+        ledger.report(&table("t"), &key("b"), &update(1, "9/9", true), Err(throttled()), late);
+        // A newer row waits as long as the one that it replaces.
+        ledger.record(table("t"), &key("c"), update(2, "1/9", false), late);
+        assert_eq!(ledger.waiting(&table("t"), late), 2);
     }
 
     #[test]

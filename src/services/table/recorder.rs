@@ -116,6 +116,11 @@ impl Recorder {
         self.shared.ledger().view(key)
     }
 
+    /// How many rows have waited for a table for a while.
+    pub fn waiting(&self, table: &api::Table) -> usize {
+        self.shared.ledger().waiting(&TableId::from(table), Instant::now())
+    }
+
     /// Forgets an object; a row of it that waits is not written any more.
     pub fn forget(&self, key: &ObjectKey) {
         self.shared.ledger().forget(key);

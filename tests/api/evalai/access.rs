@@ -16,7 +16,13 @@ async fn a_token_whose_user_is_no_host_is_named_and_one_submission_condemns_none
         "{why}"
     );
     // A submission that the host of another challenge may not read.
-    world.target = target(&world.server.url(), "local-stranger-token");
+    world.target = Target {
+        leaderboard: Key {
+            name: "of-another-challenge".into(),
+            ..leaderboard()
+        },
+        ..target(&world.server.url(), "local-stranger-token")
+    };
     let pk = world.submit();
     world.ask(pk, false);
     let view = world.until(pk, |view| view.last_error.is_some()).await;

@@ -30,10 +30,11 @@ async fn a_lost_message_is_found_for_the_server_that_has_it() {
         ..leaderboard()
     };
     world.hub.serve(&leaderboard(), &world.target).unwrap();
-    world
-        .hub
-        .serve(&second, &target(&world.server.url(), "local-host-token"))
-        .unwrap();
+    let of_second = Target {
+        leaderboard: second.clone(),
+        ..target(&world.server.url(), "local-host-token")
+    };
+    world.hub.serve(&second, &of_second).unwrap();
     let mut servers = Vec::new();
     for _ in 0..2 {
         let found = world.sweep.recv().await.unwrap();

@@ -357,18 +357,23 @@ reasons! {
     Event {
         MESSAGES_HELD_BACK = "MessagesHeldBack",
             "Event of a Leaderboard: the bridge cannot use messages of its queue yet, and receives them again later: no Leaderboard \
-             serves their phase, an older Submission of the same name is being deleted, or the API server does not take them.",
+             serves their phase, an older Submission of the same name is being deleted, the attempt before is being stopped, or the API \
+             server does not take them.",
             "Apply the Leaderboard of their phase. If it lasts, look at the log of the bridge.";
         JOB_RECREATED = "JobRecreated",
             "Somebody deleted the Job; the operator creates it again, at most three times between two retries.",
             "Find out who deletes Jobs.";
         ATTEMPT_WITHOUT_MESSAGE = "AttemptWithoutMessage",
-            "EvalAI's row asks for another attempt that no message has announced. EvalAI lets only hosts resume and re-run, but \
-             participants can edit the row. One such attempt begins (a message can be lost) if the row shows `resuming` and the \
+            "EvalAI's row asks for another attempt that no message has announced. EvalAI lets hosts resume and re-run, and \
+             participants only where the challenge has `allow_participants_resubmissions`; but any participant can edit the row. One such attempt begins (a message can be lost) if the row shows `resuming` and the \
              attempt before has failed, or if it is the new row of a re-run; the next one begins only after a message. Until then \
              the condition `Stalled` reports it, too.",
             "Check in EvalAI who asked. If the attempt has begun and must not run, cancel it. If it has not begun and must run, \
              raise `spec.attempt`; otherwise set the status back in EvalAI.";
+        ATTEMPT_AFTER_FINISH = "AttemptAfterFinish",
+            "EvalAI asks for another attempt of a submission that has finished, as after its row was set to `failed` by hand and resumed. \
+             It is not run again: a finished submission is final. The condition `Stalled` reports it, too.",
+            "Re-run the submission in EvalAI, which makes a new one. Otherwise set its status back to `finished` there.";
         TEAM_DIFFERS = "TeamDiffers",
             "EvalAI showed the submission under another team when its result was published; the run counts for the team it was \
              accepted for.",

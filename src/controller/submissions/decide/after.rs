@@ -5,9 +5,10 @@ use std::time::Duration;
 use jiff::Timestamp;
 use k8s_openapi::apimachinery::pkg::apis::meta::v1::Time;
 
-use super::plan::{Action, EvalaiUpdate, TableUpdate};
+use super::plan::{Action, EvalaiUpdate};
 use super::plan_builder::{PlanBuilder, after, seconds};
 use super::reading::{self, Reading};
+use super::record::{self, is_superseded, record_again, record_end, row_of_end};
 use super::{accept, log, observe, retention, stop};
 use crate::controller::submissions::view::{EvalaiEnd, ObservedJob, ObservedTexts};
 use leaderboard_api::conditions::{self, Truth};
@@ -24,11 +25,13 @@ const TOGETHER_SECONDS: i64 = 10;
 const RERUN_SECONDS: i64 = 60;
 /// What EvalAI calls a row that was cancelled.
 const CANCELLED: &str = "cancelled";
-/// What a check finds of the table.
-const TRIED: &str = "The table would take a row; a check writes none.";
-/// Shown of an end that is settled without a row: another try would be refused again.
-const SUPERSEDED: &str = "The table has a later attempt or another end of this run, and its row was left as it was. Correct the row by \
-                          hand if this end is the one that counts.";
+/// What EvalAI calls a row with a result.
+const FINISHED: &str = "finished";
+/// Why an attempt does not begin.
+const NO_MESSAGE: &str = "no queue message announced it, and participants can edit the status there. Raise spec.attempt if it is to \
+                          run; otherwise set the status back in EvalAI.";
+const HAS_FINISHED: &str = "the submission has finished, which is final. Nothing to do if an old message was only sent again. Otherwise \
+                            re-run it in EvalAI, which makes a new submission, or set its status back there.";
 const SENT_AGAIN: &str = "EvalAI may have lost its own end of this submission: one of our requests may have overwritten it, or \
                            the submission was deleted before its end. EvalAI is read again, and `cancelled` is written if \
                            needed.";
@@ -41,7 +44,14 @@ pub(super) fn decide(draft: &mut PlanBuilder<'_>) {
     let log_left = log::keep_at_end(draft);
     let published = publish(draft, log_left);
     // The row follows EvalAI's word, which may still turn the end into Cancelled; a refusal is a word too.
-    let recorded = published != Delivery::Waiting && record(draft) == Delivery::Done;
+    let recorded = match published {
+        Delivery::Waiting => {
+            record::follow_evalai(draft);
+            false
+        }
+        Delivery::Answered(at) => record::decide(draft, draft.now() >= shown_by(at)) == Delivery::Done,
+        Delivery::Done | Delivery::Refused => record::decide(draft, true) == Delivery::Done,
+    };
     if let Delivery::Answered(at) = published {
         show_published(draft, at, recorded);
     }
@@ -68,13 +78,15 @@ fn show_refused_attempt(draft: &mut PlanBuilder<'_>) {
     let Some(refused) = refused.filter(|refused| refused.attempt == draft.spec().attempt.next()) else {
         return;
     };
-    let reason = reasons::ATTEMPT_WITHOUT_MESSAGE;
-    let message = format!(
-        "Attempt {} does not begin: EvalAI's status asks for it since {}, but no queue message announced it, and participants \
-         can edit that status. Raise spec.attempt if it is to run; otherwise set the status back in EvalAI.",
-        refused.attempt,
-        seconds(refused.at)
-    );
+    let has_finished = draft.status.state_of_conditions() == State::Finished;
+    let (reason, why) = if has_finished {
+        (reasons::ATTEMPT_AFTER_FINISH, HAS_FINISHED)
+    } else {
+        (reasons::ATTEMPT_WITHOUT_MESSAGE, NO_MESSAGE)
+    };
+    let (attempt, since) = (refused.attempt, seconds(refused.at));
+    let message =
+        format!("Attempt {attempt} does not begin: EvalAI's status or queue asks for it since {since}, but {why}");
     let is_new = draft.blocked_since(reason).is_none();
     draft.stall_with(reason, &message);
     if is_new {
@@ -84,7 +96,7 @@ fn show_refused_attempt(draft: &mut PlanBuilder<'_>) {
 
 /// How far another system is with the end.
 #[derive(Clone, Copy, PartialEq, Eq)]
-enum Delivery {
+pub(super) enum Delivery {
     /// It knows the end, or need not.
     Done,
     /// It has answered so at this time, which the status does not show yet.
@@ -96,13 +108,17 @@ enum Delivery {
 
 /// Shows that EvalAI has the end. The table's answer is waited for, so that both are one write.
 fn show_published(draft: &mut PlanBuilder<'_>, at: Timestamp, recorded: bool) {
-    let until = after(at, TOGETHER_SECONDS);
+    let until = shown_by(at);
     if !recorded && draft.now() < until {
         return draft.requeue_at(until);
     }
     draft.status.times.published = Some(Time(at));
     let team = draft.view.evalai.as_ref().and_then(|evalai| evalai.team_id.clone());
     published(draft, team.as_deref());
+}
+
+fn shown_by(at: Timestamp) -> Timestamp {
+    after(at, TOGETHER_SECONDS)
 }
 
 /// What becomes of the Job of an attempt that has ended: it is kept for its time, and one that shows up late is ended.
@@ -138,15 +154,8 @@ fn is_not_wanted(draft: &PlanBuilder<'_>, type_: &str) -> bool {
     known.is_some_and(|c| c.reason == reasons::NOT_REQUIRED)
 }
 
-/// Whether the table keeps another row than that of this end: the recorder says so until it has forgotten the end, then the status.
-fn is_superseded(draft: &PlanBuilder<'_>) -> bool {
-    let shown = draft.status.condition(conditions::RECORDED);
-    let is_shown = shown.is_some_and(|c| c.reason == reasons::NOT_REQUIRED && c.message == SUPERSEDED);
-    is_shown || draft.view.record.as_ref().is_some_and(|row| row.is_superseded)
-}
-
 /// A Leaderboard that is gone can't show what is wanted: what was decided before stands, and what never ran needs nothing.
-fn without_leaderboard(draft: &mut PlanBuilder<'_>, type_: &str) -> Delivery {
+pub(super) fn without_leaderboard(draft: &mut PlanBuilder<'_>, type_: &str) -> Delivery {
     if is_not_wanted(draft, type_) {
         return Delivery::Done;
     }
@@ -197,16 +206,6 @@ fn follow_rerun(draft: &mut PlanBuilder<'_>) -> bool {
     draft.event(false, reasons::RERUN_IN_EVALAI, message);
     draft.status.rerun_as = Some(Box::new(rerun));
     record_again(draft)
-}
-
-/// The row has its end and is written once more, with the re-run. Returns whether that is still to come.
-fn record_again(draft: &mut PlanBuilder<'_>) -> bool {
-    let is_recorded = draft.status.is_true(conditions::RECORDED);
-    if is_recorded {
-        record_end(draft);
-        draft.condition(conditions::RECORDED, Truth::False, reasons::WAITING, "");
-    }
-    is_recorded
 }
 
 /// Whether what was read may be from before a re-run that EvalAI dates so. A time that is still to come was not written by EvalAI.
@@ -329,7 +328,7 @@ pub fn previous_controller(until: Timestamp) -> String {
 }
 
 /// What keeps an end from being published. The first text stands: another one for the same would be a write each time.
-fn cannot_be_read(draft: &PlanBuilder<'_>, type_: &str, why: &str) -> String {
+pub(super) fn cannot_be_read(draft: &PlanBuilder<'_>, type_: &str, why: &str) -> String {
     const BEGINS: &str = "The stored result cannot be read:";
     let known = draft.status.condition(type_).map(|c| c.message.to_string());
     let known = known.filter(|message| message.starts_with(BEGINS));
@@ -366,6 +365,7 @@ fn refused(draft: &mut PlanBuilder<'_>, message: &str) {
 fn amend(draft: &mut PlanBuilder<'_>, status: &str) -> Delivery {
     draft.condition(conditions::PUBLISHED, Truth::False, reasons::NOT_REQUIRED, "");
     if draft.status.state_of_conditions() == State::Cancelled {
+        keep_evalais_end(draft, status);
         return Delivery::Done;
     }
     draft.status.failure = None;
@@ -382,72 +382,14 @@ fn amend(draft: &mut PlanBuilder<'_>, status: &str) -> Delivery {
     Delivery::Waiting
 }
 
-fn record(draft: &mut PlanBuilder<'_>) -> Delivery {
-    if draft.status.is_true(conditions::RECORDED) {
-        return Delivery::Done;
-    }
-    if draft.leaderboard().is_none() {
-        return without_leaderboard(draft, conditions::RECORDED);
-    }
-    if let Some(message) = why_without_row(draft) {
-        draft.condition(conditions::RECORDED, Truth::False, reasons::NOT_REQUIRED, message);
-        return Delivery::Done;
-    }
-    let view = draft.view.record.clone().unwrap_or_default();
-    if view.end_written {
-        let message = if draft.spec().check { TRIED } else { "" };
-        draft.condition(conditions::RECORDED, Truth::True, reasons::RECORDED, message);
-        return Delivery::Done;
-    }
-    let mut unread = None;
-    match row_of_end(draft) {
-        Reading::Waits(why) => unread = why.map(|why| cannot_be_read(draft, conditions::RECORDED, &why)),
-        Reading::Done => record_end(draft),
-    }
-    let (reason, message) = match view.error {
-        Some(error) => (
-            reasons::REFUSED,
-            format!(
-                "The last write failed: {} It is tried again; look at the table and the operator's rights.",
-                sentence(&error)
-            ),
-        ),
-        None => (reasons::WAITING, unread.unwrap_or_default()),
-    };
-    draft.condition(conditions::RECORDED, Truth::False, reason, &message);
-    Delivery::Waiting
-}
-
-/// Why the end has no row of its own; none if it has one, or will.
-fn why_without_row(draft: &PlanBuilder<'_>) -> Option<&'static str> {
-    let has_team = draft.status.team.as_ref().is_some_and(|team| team.id.is_some());
-    if draft.view.record.is_none() {
-        Some("")
-    } else if draft.status.plan.is_none() {
-        Some("The submission was never accepted, so the table has no row for it.")
-    } else if !has_team && !draft.spec().check {
-        Some("The row needs a team; give spec.team.id to a submission that is not EvalAI's.")
-    } else {
-        is_superseded(draft).then_some(SUPERSEDED)
-    }
-}
-
-/// A check only learns whether the table would take its row.
-fn record_end(draft: &mut PlanBuilder<'_>) {
-    let is_check = draft.spec().check;
-    draft.act(Action::Record(if is_check {
-        TableUpdate::Trial
-    } else {
-        TableUpdate::End
-    }));
-}
-
-/// Whether all that the row shows is there: only that of a finished submission has metrics.
-fn row_of_end(draft: &mut PlanBuilder<'_>) -> Reading {
-    if draft.is_successful() && !draft.spec().check {
-        reading::report_of_end(draft)
-    } else {
-        Reading::Done
+/// A cancel of what EvalAI calls finished: that is kept, and the object says whose end holds.
+fn keep_evalais_end(draft: &mut PlanBuilder<'_>, status: &str) {
+    let end = draft.status.condition(conditions::FINISHED);
+    let is_ours = end.is_some_and(|end| end.reason != reasons::ENDED_IN_EVALAI);
+    if is_ours && status == FINISHED {
+        let message = format!("EvalAI showed {status} before the submission was run here; that is kept.");
+        draft.condition(conditions::FINISHED, Truth::True, reasons::ENDED_IN_EVALAI, &message);
+        draft.show(reasons::ENDED_IN_EVALAI, message);
     }
 }
 

@@ -31,6 +31,7 @@ mod plan;
 mod plan_builder;
 mod pulls;
 mod reading;
+mod record;
 mod reported;
 mod requeue;
 mod restored;

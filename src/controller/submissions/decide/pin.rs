@@ -21,7 +21,7 @@ pub(super) fn pin(draft: &mut PlanBuilder<'_>, terms: Terms<'_>, image: String) 
             contents_image: leaderboard.contents.image.as_str().into(),
             simulator_image: leaderboard.simulator.image.as_str().into(),
             // A status that was restored may be older than the last resume.
-            earlier_attempts: pinned.earlier_attempts.max(attempts_before(draft, info)),
+            earlier_attempts: pinned.earlier_attempts.max(stored::attempts_ahead(draft)),
             ..pinned
         },
         Some(pinned) => pinned,
@@ -31,7 +31,7 @@ pub(super) fn pin(draft: &mut PlanBuilder<'_>, terms: Terms<'_>, image: String) 
             let plan = effective::plan(leaderboard, track, draft.submission().run_id(), image, resume);
             let plan = if draft.spec().check { first_route(plan) } else { plan };
             RunPlan {
-                earlier_attempts: attempts_before(draft, info),
+                earlier_attempts: attempts_before(draft, info).max(stored::attempts_ahead(draft)),
                 submission_uid: draft.submission().metadata.uid.clone(),
                 ..plan
             }
@@ -48,18 +48,12 @@ pub(super) fn pin(draft: &mut PlanBuilder<'_>, terms: Terms<'_>, image: String) 
     }
 }
 
-/// How many attempts the table's row counts before ours, by EvalAI and by what is stored. Both count from the object's attempt on, so that
-/// a second look adds nothing.
+/// How many attempts the table's row counts before those of an object that was made anew, as EvalAI's row names their Jobs: the table takes
+/// no attempt that is not above its own. An object with a history asks the table alone, since participants can edit EvalAI's row.
 fn attempts_before(draft: &PlanBuilder<'_>, info: Option<&EvalaiInfo>) -> i64 {
-    earlier_attempts(draft, info).max(stored::attempts_ahead(draft))
-}
-
-/// How many attempts the table's row of a resumed run counts before ours: those of a Submission that was deleted after its end, or that
-/// a restored one does not know of. The row takes no attempt that is not above its own.
-fn earlier_attempts(draft: &PlanBuilder<'_>, info: Option<&EvalaiInfo>) -> i64 {
-    let resumed = info.filter(|info| info.standing == Standing::Resumed);
-    let next = resumed.and_then(|info| info.last_attempt).map(Attempt::next);
-    next.map_or(0, |next| (next.0 - draft.spec().attempt.0).max(0))
+    let is_new = draft.spec().attempt == Attempt::FIRST;
+    let resumed = info.filter(|info| is_new && info.standing == Standing::Resumed);
+    resumed.and_then(|info| info.last_attempt).map_or(0, |last| last.0)
 }
 
 /// The plan of a check: the first route, once, with one pair.

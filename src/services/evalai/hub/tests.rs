@@ -1,3 +1,5 @@
+mod tokens;
+
 use super::*;
 use crate::observability::about::LogSpan;
 use crate::observability::shutdown::Stop;
@@ -7,12 +9,14 @@ use futures::FutureExt;
 use leaderboard_api::Attempt;
 use std::time::Duration;
 
+/// A hub that nobody listens to.
 fn hub(tasks: &Tasks, write_guard: impl WriteGuard) -> Hub {
     Hub::new(Options::unheard(tasks, write_guard))
 }
 
 fn target(token: &str) -> Target {
     Target {
+        leaderboard: key("board"),
         api_server: "http://127.0.0.1:9".into(),
         challenge: 1,
         split: "leaderboard".into(),

@@ -30,7 +30,9 @@ impl Queue {
     /// Takes an answer in.
     pub fn answered(&mut self, ticket: &Ticket, reply: Reply, now: Now) {
         if ticket.request.counts() {
-            self.note(&reply.answer(), &now);
+            let answer = reply.answer();
+            self.note(&answer, &now);
+            self.note_silence(&answer, &now);
         }
         match (&ticket.request, reply) {
             (Request::Get(subject), Reply::Row(answer)) => self.took_row(subject, ticket.requested, answer, &now),
@@ -46,21 +48,21 @@ impl Queue {
         }
     }
 
-    /// A request was not sent after all; it is chosen again.
+    /// A write was not sent after all; it is chosen again.
     pub fn not_sent(&mut self, ticket: &Ticket) {
         if let Some(lane) = ticket
             .request
             .submission()
             .and_then(|subject| self.lanes.get_mut(&subject.pk))
         {
-            lane.busy = None;
+            (lane.busy, lane.reread) = (None, true);
         }
     }
 
     /// What every answer shows about the token.
     fn note(&mut self, answer: &Answer<()>, now: &Now) {
         match answer {
-            Answer::Throttled(wait) => self.budget.close_until(now.at + *wait),
+            Answer::Throttled(wait) => self.share.budget(|budget| budget.close_until(now.at + *wait)),
             Answer::Refused(refusal) if refusal.about == About::Token => {
                 let news = self.token_refused.is_none();
                 self.token_refused = Some((refusal.message.clone(), now.at + TOKEN_PAUSE));
@@ -83,8 +85,17 @@ impl Queue {
         let row = match answer {
             Answer::Done(row) if row.id == subject.pk => row,
             Answer::Refused(Refusal {
-                about: About::Missing, ..
-            }) => Row::missing(subject.pk),
+                about: About::Missing,
+                message,
+                ..
+            }) => {
+                let since = *lane.missing_since.get_or_insert(requested);
+                let again = since + self.timing.missing;
+                if requested < again {
+                    return self.missed(subject, &message, again, now);
+                }
+                Row::missing(subject.pk)
+            }
             Answer::Done(_) => return self.went_wrong(subject, "EvalAI answered with another submission".into(), now),
             other => return self.read_failed(subject, &other, now),
         };
@@ -101,8 +112,19 @@ impl Queue {
         });
     }
 
+    /// EvalAI does not have it, which is to be confirmed.
+    fn missed(&mut self, subject: &SubmissionRef, why: &str, again: Duration, now: &Now) {
+        self.change(subject, |sub| {
+            sub.read_failed(format!("{why}; it is asked for again before that counts"), now);
+            sub.retry_at = again;
+        });
+    }
+
     /// Gives a row to every object of that submission.
     pub(super) fn spread(&mut self, row: &Arc<Row>, requested: Duration, now: &Now, mut also: impl FnMut(&mut Sub)) {
+        if let Some(lane) = self.lanes.get_mut(&row.id).filter(|_| row.status != Status::Missing) {
+            lane.missing_since = None;
+        }
         let lane = self.lanes.get(&row.id);
         let calm = lane.is_none_or(|lane| lane.busy != Some(Busy::Write) && !lane.unsure);
         for key in self.pks.get(&row.id).cloned().unwrap_or_default() {

@@ -5,9 +5,10 @@
 use std::collections::BTreeMap;
 use std::time::Duration;
 
-use jiff::{SignedDuration, Timestamp};
+use jiff::Timestamp;
 
 use super::poll::{Challenge, Poll};
+use super::purse::{Price, Rank};
 use super::sub::{Sub, Write};
 use super::{Busy, Lane, MAX_IN_FLIGHT, Next, Now, Queue, Ticket};
 use crate::services::evalai::request::{Purpose, Request, SubmissionRef};
@@ -18,10 +19,6 @@ use crate::services::evalai::types::Key;
 const ASKED_ONE_BY_ONE: usize = 5;
 /// More live submissions than these that one list holds are read again by that list.
 const READ_ONE_BY_ONE: usize = 5;
-/// How far back a list of new submissions reaches: the queue's messages live four days.
-const ACCEPT_REACH: SignedDuration = SignedDuration::from_hours(5 * 24);
-/// How far before its Leaderboard a re-run or resumed submission may first have been submitted: it keeps that time.
-const SWEEP_REACH: SignedDuration = SignedDuration::from_hours(180 * 24);
 /// After so long a question whether a submission may run comes before ends.
 const OVERDUE: Duration = Duration::from_mins(1);
 /// While writes are not allowed they are checked again so often: no event reports that they are.
@@ -79,7 +76,7 @@ struct Offer<'a> {
 
 impl Offer<'_> {
     /// Less comes first.
-    fn rank(&self) -> (Priority, Option<Timestamp>, Duration) {
+    fn rank(&self) -> Rank {
         (self.priority, self.ended, self.since)
     }
 }
@@ -102,6 +99,7 @@ impl Queue {
         let (now_affordable, not_yet): (Vec<_>, Vec<_>) = chosen
             .map(|offer| (self.affordable_at(&now, offer), offer))
             .partition(|(at, _)| *at <= now.at);
+        self.claim(&now, not_yet.first().map(|(_, offer)| *offer));
         let Some((_, best)) = now_affordable.first() else {
             let waits = later
                 .iter()
@@ -110,9 +108,11 @@ impl Queue {
             let opens = (!self.open).then_some(self.not_before);
             return Next::Wait(waits.chain((!may_write).then(|| now.at + RECHECK)).chain(opens).min());
         };
+        let mut leave_by = None;
         let started = match best.what {
             What::Sub(key, step) => {
                 let key = key.clone();
+                leave_by = self.leave_by(&key, step);
                 self.start_sub(&key, step)
             }
             What::List(id, purpose) => self.start_list(id, purpose, &now),
@@ -125,36 +125,63 @@ impl Queue {
         match started {
             Some(request) => {
                 if request.counts() {
-                    self.budget.take(now.at);
+                    self.share.take(now.at);
                 }
                 Next::Send(Ticket {
                     request,
                     requested: now.at,
+                    leave_by,
                 })
             }
             None => Next::Wait(Some(now.at + RECHECK)),
         }
     }
 
-    /// When the budget allows it: every read for a write keeps one request back for the write that follows it.
+    /// When the budget allows it, and the token is not refused.
     fn affordable_at(&self, now: &Now, offer: &Offer<'_>) -> Duration {
-        let reserved = self
-            .lanes
-            .values()
-            .filter(|lane| lane.busy == Some(Busy::ReadForWrite))
-            .count();
-        let reserved = u32::try_from(reserved).unwrap_or(u32::MAX);
-        let count = match (&offer.what, offer.priority) {
-            (_, Priority::Free) => return now.at,
-            (_, Priority::Write) => 1,
-            (What::Sub(_, Step::GetForWrite), _) => reserved.saturating_add(2),
-            _ => reserved.saturating_add(1),
-        };
+        if offer.priority == Priority::Free {
+            return now.at;
+        }
         let token = self.token_refused.as_ref().map_or(now.at, |(_, until)| *until);
+        self.share.ready_at(self.price(offer), now.at).max(token)
+    }
+
+    /// What it takes: every read for a write keeps one request back for the write that follows it.
+    fn price(&self, offer: &Offer<'_>) -> Price {
+        let is_write = offer.priority == Priority::Write;
+        let count = match offer.what {
+            _ if is_write => 1,
+            What::Sub(_, Step::GetForWrite) => self.reserved().saturating_add(2),
+            _ => self.reserved().saturating_add(1),
+        };
         // A list that is due, and a write whose read is made, may use what the others leave.
-        let urgent = [Priority::Write, Priority::CancelList].contains(&offer.priority);
-        let keep = if urgent { 0 } else { self.budget.kept() };
-        self.budget.ready_keeping(now.at, count, keep).max(token)
+        let is_urgent = is_write || offer.priority == Priority::CancelList;
+        Price {
+            rank: offer.rank(),
+            count,
+            keep: if is_urgent {
+                0
+            } else {
+                self.share.budget(|budget| budget.kept())
+            },
+            is_after_reserved: !is_write,
+        }
+    }
+
+    /// Writes that follow the reads on their way.
+    fn reserved(&self) -> u32 {
+        let reads = self.lanes.values().filter(|lane| lane.busy == Some(Busy::ReadForWrite));
+        u32::try_from(reads.count()).unwrap_or(u32::MAX)
+    }
+
+    /// Tells the other queues of the same user what waits for the budget here. A refused token needs nothing of it.
+    fn claim(&self, now: &Now, waits: Option<&Offer<'_>>) {
+        let is_refused = self.token_refused.as_ref().is_some_and(|(_, until)| *until > now.at);
+        let waits = waits.filter(|_| !is_refused).map(|offer| {
+            let price = self.price(offer);
+            (price.rank, price.count)
+        });
+        self.share.claim(self.reserved(), waits);
     }
 
     fn offers(&self, now: &Now, may_write: bool) -> Vec<Offer<'_>> {
@@ -303,7 +330,7 @@ impl Queue {
         let (write, since) = sub.next_write()?;
         let is_checked = lane
             .checked
-            .is_some_and(|at| now.at.saturating_sub(at) <= self.timing.fresh);
+            .is_some_and(|at| now.at <= at + self.fresh(sub, lane, write));
         if is_checked && sub.may_write(write) {
             return Some((Priority::Write, since, true, Step::Write(write)));
         }
@@ -316,6 +343,27 @@ impl Queue {
             Write::Partial => Priority::Rest,
         };
         Some((priority, since, true, Step::GetForWrite))
+    }
+
+    /// How old the read of a write may be. A run that just begins is cancelled more often than any other, and `running` is little to lose.
+    fn fresh(&self, sub: &Sub, lane: &Lane, write: Write) -> Duration {
+        let is_running = sub
+            .progress
+            .as_ref()
+            .is_some_and(|wanted| wanted.what == Progress::Running);
+        if write == Write::Progress && is_running && !lane.reread {
+            self.timing.fresh_running
+        } else {
+            self.timing.fresh
+        }
+    }
+
+    /// When the read of a write that is about to be sent gets too old.
+    fn leave_by(&self, key: &Key, step: Step) -> Option<Duration> {
+        let Step::Write(write) = step else { return None };
+        let sub = self.subs.get(key)?;
+        let lane = self.lanes.get(&sub.pk)?;
+        Some(lane.checked? + self.fresh(sub, lane, write))
     }
 
     fn offers_of(&self, id: i64, challenge: &Challenge, asked: Option<Duration>, now: &Now) -> Vec<Offer<'static>> {
@@ -381,37 +429,14 @@ impl Queue {
             Step::Write(Write::End) => Request::Final(subject, sub.outcome()?, sub.end.as_ref()?.what.1.clone()),
         };
         let lane = self.lanes.entry(sub.pk).or_default();
-        lane.checked = None;
+        let was_checked = lane.checked.take().is_some();
+        lane.reread = step == Step::GetForWrite && (was_checked || lane.reread);
         lane.busy = Some(match step {
             Step::GetForWrite => Busy::ReadForWrite,
             _ if request.is_write() => Busy::Write,
             _ => Busy::Read,
         });
         Some(request)
-    }
-
-    /// From when on a list reaches: never the whole table, which is costly for the server.
-    fn list_after(&self, id: i64, purpose: Purpose, wall: Timestamp) -> Option<Timestamp> {
-        match purpose {
-            Purpose::Cancel => {
-                let live = self
-                    .subs
-                    .values()
-                    .filter(|sub| sub.challenge == id && sub.live.is_some());
-                let first = live.filter_map(Sub::submitted_at).min()?;
-                Some(back(first, SignedDuration::from_secs(1)))
-            }
-            Purpose::Queued | Purpose::Running => {
-                let listed = |sub: &&Sub| sub.challenge == id && list_of_live(sub) == Some(purpose);
-                let first = self.subs.values().filter(listed).filter_map(Sub::submitted_at).min()?;
-                Some(back(first, SignedDuration::from_secs(1)))
-            }
-            Purpose::Accept => Some(back(wall, ACCEPT_REACH)),
-            Purpose::SweepSubmitted | Purpose::SweepResuming => {
-                let (_, since) = self.challenges.get(&id)?.sweep?;
-                Some(back(since, SWEEP_REACH))
-            }
-        }
     }
 }
 
@@ -446,7 +471,7 @@ fn acceptance(since: Duration, now: &Now) -> Priority {
 }
 
 /// The list that holds a live submission, going by its last row.
-fn list_of_live(sub: &Sub) -> Option<Purpose> {
+pub(super) fn list_of_live(sub: &Sub) -> Option<Purpose> {
     let row = sub.view.row.as_ref().filter(|_| sub.live.is_some())?;
     Purpose::of_live(row.status)
 }
@@ -460,11 +485,6 @@ fn offer_of_list(priority: Priority, challenge: &Challenge, id: i64, purpose: Pu
         ready: poll.due,
         what: What::List(id, purpose),
     })
-}
-
-/// Earlier, or as it is at the beginning of time.
-fn back(at: Timestamp, by: SignedDuration) -> Timestamp {
-    at.checked_sub(by).unwrap_or(at)
 }
 
 impl Progress {

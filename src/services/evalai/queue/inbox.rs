@@ -24,6 +24,8 @@ const IDLE: Backoff = Backoff::new(Duration::from_secs(5), Duration::from_secs(2
 const LEFT: Duration = Duration::from_secs(5);
 /// The controller has so long for a message; then it is taken for left.
 const TAKEN_IN: Duration = Duration::from_mins(1);
+/// EvalAI did not have a submission when its message came: a second message of it within so long shows that it is not there.
+const MISSING: Duration = Duration::from_mins(10);
 /// A queue that fails for so long is reported.
 const FAILING: Duration = Duration::from_mins(5);
 
@@ -50,6 +52,8 @@ struct Inbox {
     /// Failures in a row, since when, and what EvalAI has answered.
     failures: u32,
     trouble: Option<(Duration, InboxTrouble)>,
+    /// Submissions that EvalAI does not have, and since when.
+    missing: BTreeMap<i64, Duration>,
 }
 
 /// The message in hand.
@@ -91,12 +95,22 @@ impl Inbox {
             empty: 0,
             failures: 0,
             trouble: None,
+            missing: BTreeMap::new(),
         }
     }
 
     /// Nothing is in hand any more.
     fn let_go(&mut self, due: Duration) {
         (self.hand, self.due) = (Hand::Empty, due);
+    }
+
+    /// Notes that EvalAI does not have a submission. True if it was not asked for before.
+    fn is_first_miss(&mut self, submission: i64, now: Duration) -> bool {
+        self.missing.retain(|_, since| *since + MISSING > now);
+        match self.missing.remove(&submission) {
+            Some(_) => false,
+            None => self.missing.insert(submission, now).is_none(),
+        }
     }
 
     /// A request was answered. True if that ends a trouble that people have been shown.
@@ -200,7 +214,22 @@ impl Inboxes {
         }
         match (hand, reply) {
             (_, Reply::Message(Answer::Done(received))) => self.received(name, received, now),
-            (Hand::Unread { body, receipt, .. }, Reply::Row(answer)) => self.read(name, body, receipt, answer, now),
+            (
+                Hand::Unread {
+                    body,
+                    receipt,
+                    submission,
+                },
+                Reply::Row(answer),
+            ) => {
+                let is_missing = matches!(&answer, Answer::Refused(refusal) if refusal.about == About::Missing);
+                if is_missing && inbox.is_first_miss(submission, now) {
+                    // The message comes back.
+                    inbox.let_go(now + LEFT);
+                    return inbox.answered(now);
+                }
+                self.read(name, body, receipt, answer, now)
+            }
             (Hand::Done { .. }, Reply::Written(Answer::Done(()))) => {
                 inbox.empty = 0;
                 inbox.let_go(now);
@@ -312,7 +341,8 @@ impl Queue {
         let named = self.served.values();
         let wanted = named.filter_map(|target| Some((target.inbox.clone()?, target.api_server.clone())));
         let wanted = wanted.collect();
-        self.inboxes.arrange(&wanted, self.budget.limit(), now.at);
+        let limit = self.share.budget(|budget| budget.limit());
+        self.inboxes.arrange(&wanted, limit, now.at);
     }
 
     /// Takes the answer about a queue in.

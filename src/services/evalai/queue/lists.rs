@@ -1,4 +1,4 @@
-//! What an answer about a whole challenge changes: lists of submissions, and what its leaderboards are.
+//! Lists of submissions and what a challenge's leaderboards are: from when on a list reaches, and what an answer changes.
 //!
 //! Owned by `queue`. Pure.
 
@@ -7,6 +7,8 @@ use std::time::Duration;
 
 use jiff::{SignedDuration, Timestamp};
 
+use super::choose::list_of_live;
+use super::sub::Sub;
 use super::{Now, Queue};
 use crate::services::evalai::answer::{About, Answer};
 use crate::services::evalai::request::{Purpose, Reply, Request};
@@ -19,6 +21,11 @@ use leaderboard_api::names;
 const SWEPT_FOR: Duration = Duration::from_mins(10);
 /// Before a failed check is retried.
 const RETRY_CHECK: Duration = Duration::from_mins(1);
+
+/// How far back a list of new submissions reaches: the queue's messages live four days.
+const ACCEPT_REACH: SignedDuration = SignedDuration::from_hours(5 * 24);
+/// How far before its Leaderboard a re-run or resumed submission may first have been submitted: it keeps that time.
+const SWEEP_REACH: SignedDuration = SignedDuration::from_hours(180 * 24);
 
 /// What kind of run a row asks for. EvalAI makes a re-run's row by copying the old one: it keeps the Jobs of the old one's id,
 /// when that was submitted and when it ended.
@@ -63,6 +70,30 @@ impl Queue {
                 });
             }
             _ => {}
+        }
+    }
+
+    /// From when on a list reaches: never the whole table, which is costly for the server.
+    pub(super) fn list_after(&self, id: i64, purpose: Purpose, wall: Timestamp) -> Option<Timestamp> {
+        match purpose {
+            Purpose::Cancel => {
+                let live = self
+                    .subs
+                    .values()
+                    .filter(|sub| sub.challenge == id && sub.live.is_some());
+                let first = live.filter_map(Sub::submitted_at).min()?;
+                Some(back(first, SignedDuration::from_secs(1)))
+            }
+            Purpose::Queued | Purpose::Running => {
+                let listed = |sub: &&Sub| sub.challenge == id && list_of_live(sub) == Some(purpose);
+                let first = self.subs.values().filter(listed).filter_map(Sub::submitted_at).min()?;
+                Some(back(first, SignedDuration::from_secs(1)))
+            }
+            Purpose::Accept => Some(back(wall, ACCEPT_REACH)),
+            Purpose::SweepSubmitted | Purpose::SweepResuming => {
+                let (_, since) = self.challenges.get(&id)?.sweep?;
+                Some(back(since, SWEEP_REACH))
+            }
         }
     }
 
@@ -193,4 +224,9 @@ impl Queue {
                 .extend(of.map(|(key, _)| Changed::Leaderboard(key.clone())));
         }
     }
+}
+
+/// Earlier, or as it is at the beginning of time.
+fn back(at: Timestamp, by: SignedDuration) -> Timestamp {
+    at.checked_sub(by).unwrap_or(at)
 }

@@ -3,7 +3,7 @@
 //! `hub` puts updates in, `task` takes requests out ([`Queue::next`]) and brings their answers back ([`Queue::answered`]).
 //! What holds for every request:
 //!
-//! - the budget of the token, priorities by [`choose`], oldest first within one;
+//! - the budget of the token's user, priorities by [`choose`], oldest first within one;
 //! - one request in flight for a submission, whatever it is, and [`MAX_IN_FLIGHT`] in all;
 //! - after a write without an answer nothing for that submission until the server must have given up, then a read;
 //! - each write follows at once a read of its own, judged by [`super::guard`]: the server overwrites whatever it has stored in
@@ -15,7 +15,10 @@ mod inbox;
 mod lists;
 mod outlook;
 mod poll;
+mod purse;
+mod silence;
 mod sub;
+mod transfer;
 
 #[cfg(test)]
 mod tests;
@@ -28,13 +31,14 @@ use jiff::Timestamp;
 
 use self::inbox::Inboxes;
 use self::poll::Challenge;
+pub use self::purse::{Purse, Share};
+use self::silence::Silent;
 use self::sub::{Asked, Pending, Sub};
-use super::budget::Budget;
 use super::labels::{Labels, compare};
 use super::payload::{check, digest, for_split};
 use super::request::Request;
 use super::status::{Outcome, Progress};
-use super::types::{Changed, DesiredUpdate, Ended, Key, Load, Payload, Subject, SubmissionState, SweepRow, Target};
+use super::types::{Changed, DesiredUpdate, Ended, Key, Payload, Subject, SubmissionState, SweepRow, Target};
 
 /// Requests about submissions that may wait for an answer at once; lists come on top, one of a kind.
 const MAX_IN_FLIGHT: usize = 4;
@@ -68,6 +72,11 @@ pub struct Timing {
     pub refresh: Duration,
     /// Between two checks of a challenge's leaderboards.
     pub check: Duration,
+    /// A submission that EvalAI does not have is asked for again after so long, before that counts: one answer may be of a server that is just
+    /// being replaced, and would end a run.
+    pub missing: Duration,
+    /// The same as `fresh` for `running`, and the read is made again once only.
+    pub fresh_running: Duration,
 }
 
 impl Default for Timing {
@@ -80,6 +89,8 @@ impl Default for Timing {
             // What is deleted is to be ended there within a minute, and its Pod takes some seconds to stop.
             refresh: Duration::from_secs(40),
             check: Duration::from_hours(1),
+            missing: Duration::from_secs(30),
+            fresh_running: Duration::from_millis(100),
         }
     }
 }
@@ -99,6 +110,8 @@ pub struct Ticket {
     pub request: Request,
     /// When it was sent.
     pub requested: Duration,
+    /// A write that is not sent by then is not sent: its read is too old.
+    pub leave_by: Option<Duration>,
 }
 
 /// A submission's place on the wire, kept while its object comes and goes.
@@ -110,6 +123,10 @@ struct Lane {
     unsure: bool,
     /// Answer of a read that was made for a write, until anything else is sent.
     checked: Option<Duration>,
+    /// A write was not sent soon enough after its read, and that is made once more.
+    reread: bool,
+    /// EvalAI does not have the submission, as of this read, and had it before.
+    missing_since: Option<Duration>,
 }
 
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
@@ -123,7 +140,7 @@ enum Busy {
 #[derive(Debug)]
 pub struct Queue {
     timing: Timing,
-    budget: Budget,
+    share: Share,
     /// No write before.
     not_before: Duration,
     /// That moment has come, and everything that waited for it knows.
@@ -135,6 +152,8 @@ pub struct Queue {
     served: BTreeMap<Key, Target>,
     /// EvalAI's refusal of the token, and until when nothing is asked with it.
     token_refused: Option<(String, Duration)>,
+    /// The server does not answer.
+    silent: Option<Silent>,
     changes: BTreeSet<Changed>,
     sweep: Vec<SweepRow>,
     inboxes: Inboxes,
@@ -142,10 +161,11 @@ pub struct Queue {
 
 impl Queue {
     /// An empty queue of one token. Writes start at `not_before`.
-    pub fn new(timing: Timing, requests_per_minute: u32, not_before: Duration, now: Now) -> Self {
+    pub fn new(timing: Timing, share: Share, not_before: Duration, now: Now) -> Self {
+        let requests_per_minute = share.budget(|budget| budget.limit());
         Self {
             timing,
-            budget: Budget::new(requests_per_minute, now.at),
+            share,
             not_before,
             open: not_before <= now.at,
             subs: BTreeMap::new(),
@@ -154,6 +174,7 @@ impl Queue {
             challenges: BTreeMap::new(),
             served: BTreeMap::new(),
             token_refused: None,
+            silent: None,
             changes: BTreeSet::new(),
             sweep: Vec::new(),
             inboxes: Inboxes::new(requests_per_minute, now.at),
@@ -185,25 +206,6 @@ impl Queue {
             self.drop_unused(target.challenge);
             self.arrange(now);
         }
-    }
-
-    /// The token was renewed: the refusal of the old one is void.
-    pub fn renew_token(&mut self) {
-        self.token_refused = None;
-    }
-
-    /// Nothing is written for a submission before that moment: its requests are another queue's.
-    pub fn hold(&mut self, pk: i64, until: Duration) {
-        let lane = self.lanes.entry(pk).or_default();
-        lane.hold_until = lane.hold_until.max(until);
-        lane.unsure = true;
-    }
-
-    /// Whether a submission has a request on its way, or one without an answer.
-    pub fn is_unsettled(&self, pk: i64) -> bool {
-        self.lanes
-            .get(&pk)
-            .is_some_and(|lane| lane.busy.is_some() || lane.unsure)
     }
 
     /// Whether a write was not answered and the server may still be working on it.
@@ -280,7 +282,11 @@ impl Queue {
 
     /// The object is gone, or needs no further update.
     pub fn forget(&mut self, key: &Key, now: Now) {
-        let Some(sub) = self.subs.remove(key) else { return };
+        self.remove(key, now);
+    }
+
+    fn remove(&mut self, key: &Key, now: Now) -> Option<Sub> {
+        let sub = self.subs.remove(key)?;
         if let Some(keys) = self.pks.get_mut(&sub.pk) {
             keys.remove(key);
             if keys.is_empty() {
@@ -291,6 +297,7 @@ impl Queue {
         self.lanes
             .retain(|pk, lane| lane.busy.is_some() || lane.hold_until > now.at || pks.contains_key(pk));
         self.drop_unused(sub.challenge);
+        Some(sub)
     }
 
     /// A lane that nothing uses needs no memory.
@@ -341,22 +348,8 @@ impl Queue {
         (labels, challenge.check.error.clone())
     }
 
-    /// Requests of the last minute.
-    fn requests_of_last_minute(&self, now: Now) -> u32 {
-        self.budget.used(now.at)
-    }
-
-    /// What the budget allows and what of it is used.
-    pub fn load(&self, now: Now) -> Load {
-        Load {
-            used: self.requests_of_last_minute(now) as usize,
-            limit: self.budget.limit() as usize,
-            waiting: self.waiting(),
-        }
-    }
-
     /// Updates and questions that wait for a request.
-    fn waiting(&self) -> usize {
+    pub fn waiting(&self) -> usize {
         let of = |sub: &Sub| {
             usize::from(sub.asked.is_some())
                 + usize::from(sub.progress.is_some())
@@ -396,8 +389,11 @@ impl Queue {
             .or_insert_with(|| Challenge::new(target.period));
         let sub = self.subs.entry(key.clone()).or_insert_with(|| {
             self.pks.entry(*pk).or_default().insert(key.clone());
-            Sub::new(*pk, target.challenge, run.clone())
+            Sub::new(*pk, target.leaderboard.clone(), target.challenge, run.clone())
         });
+        if sub.leaderboard != target.leaderboard {
+            sub.leaderboard = target.leaderboard.clone();
+        }
         if run.attempt > sub.run.attempt {
             sub.begin(run.clone());
         }
@@ -412,11 +408,14 @@ impl Queue {
     /// Computes what depends on all Leaderboards served.
     fn arrange(&mut self, now: Now) {
         if let Some(limit) = self.served.values().map(|target| target.requests_per_minute).min() {
-            self.budget.set_limit(limit, now.at);
+            self.share.set_limit(limit, now.at);
         }
         let served: BTreeSet<i64> = self.served.values().map(|target| target.challenge).collect();
         let lists = u32::try_from(served.len()).unwrap_or(u32::MAX).max(1);
-        let least = self.budget.interval().saturating_mul(lists.saturating_mul(LIST_SHARE));
+        let least = self
+            .share
+            .budget(|budget| budget.interval())
+            .saturating_mul(lists.saturating_mul(LIST_SHARE));
         for (id, challenge) in &mut self.challenges {
             let of = || self.served.values().filter(|target| target.challenge == *id);
             let period = of().map(|target| target.period).min().unwrap_or(challenge.period);

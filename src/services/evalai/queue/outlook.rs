@@ -20,8 +20,8 @@ impl Queue {
     pub fn usage(&self, now: Now) -> Usage {
         let waiting = self.subs.values().filter(|sub| sub.has_end_to_publish()).count();
         Usage {
-            used: self.budget.used(now.at),
-            limit: self.budget.limit(),
+            used: self.share.budget(|budget| budget.used(now.at)),
+            limit: self.share.budget(|budget| budget.limit()),
             waiting,
             last_expected: (waiting > 0).then(|| next_step(now.wall, self.time_for(waiting, &now))),
         }
@@ -32,11 +32,12 @@ impl Queue {
         let requests = u32::try_from(ends)
             .unwrap_or(u32::MAX)
             .saturating_mul(REQUESTS_OF_AN_END);
-        let limit = self.budget.limit();
-        let others = self.lists_a_minute().saturating_add(self.budget.kept());
+        let (limit, kept, ready) =
+            (self.share).budget(|budget| (budget.limit(), budget.kept(), budget.ready_at(now.at, 1)));
+        let others = self.lists_a_minute().saturating_add(kept);
         let free = limit.saturating_sub(others).max(limit / 2).max(1);
         let token = self.token_refused.as_ref().map_or(now.at, |(_, until)| *until);
-        let begin = self.budget.ready_at(now.at, 1).max(self.not_before).max(token);
+        let begin = ready.max(self.not_before).max(token);
         begin.saturating_sub(now.at) + WINDOW.saturating_mul(requests) / free
     }
 

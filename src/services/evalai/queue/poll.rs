@@ -85,6 +85,20 @@ impl Challenge {
         }
     }
 
+    /// The same challenge with what was read of it, and nothing on its way.
+    pub fn known(&self) -> Self {
+        let check = ChallengeCheck {
+            wanted: self.check.wanted.clone(),
+            catalog: self.check.catalog.clone(),
+            ..ChallengeCheck::default()
+        };
+        Self {
+            check,
+            swept: self.swept.clone(),
+            ..Self::new(self.period)
+        }
+    }
+
     pub fn poll(&mut self, purpose: Purpose) -> &mut Poll {
         self.lists.entry(purpose).or_default()
     }

@@ -13,7 +13,7 @@ use crate::services::evalai::guard::{self, Attempt, End, Start, Verdict};
 use crate::services::evalai::payload::{check, for_split};
 use crate::services::evalai::row::Row;
 use crate::services::evalai::status::{Outcome, Progress, Status};
-use crate::services::evalai::types::{Ended, ImageAnswer, Payload, Run, SubmissionState, Target};
+use crate::services::evalai::types::{Ended, ImageAnswer, Key, Payload, Run, SubmissionState, Target};
 
 /// Wait before an unknown status of EvalAI is read again.
 const UNCLEAR_PAUSE: Duration = Duration::from_mins(1);
@@ -46,6 +46,8 @@ pub(super) enum Write {
 #[derive(Debug)]
 pub(super) struct Sub {
     pub pk: i64,
+    /// The Leaderboard whose token its requests carry.
+    pub leaderboard: Key,
     pub challenge: i64,
     pub run: Run,
     /// When it was submitted, while its run may be cancelled.
@@ -83,13 +85,14 @@ pub(super) struct Sub {
 }
 
 impl Sub {
-    pub fn new(pk: i64, challenge: i64, run: Run) -> Self {
+    pub fn new(pk: i64, leaderboard: Key, challenge: i64, run: Run) -> Self {
         let view = SubmissionState {
             attempt: run.attempt,
             ..SubmissionState::default()
         };
         Self {
             pk,
+            leaderboard,
             challenge,
             run,
             live: None,
@@ -118,7 +121,7 @@ impl Sub {
     /// Begins a later attempt: every update of the earlier one is void, what was read stays.
     pub fn begin(&mut self, run: Run) {
         let old = std::mem::take(&mut self.view);
-        let fresh = Self::new(self.pk, self.challenge, run);
+        let fresh = Self::new(self.pk, self.leaderboard.clone(), self.challenge, run);
         *self = Self {
             read: self.read,
             outdated: self.outdated,

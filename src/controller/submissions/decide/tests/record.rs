@@ -1,8 +1,8 @@
 //! Ends over which the table keeps another row.
 
 use super::builders::*;
-use crate::controller::submissions::decide::{Action, Plan, TableUpdate};
-use crate::controller::submissions::view::{EvalaiEnd, RecordView};
+use crate::controller::submissions::decide::{Action, EvalaiUpdate, Plan, TableUpdate};
+use crate::controller::submissions::view::{EvalaiEnd, EvalaiView, RecordView};
 use leaderboard_api::State::{Cancelled, Finished};
 use leaderboard_api::conditions::{self, RECORDED};
 use leaderboard_api::reasons;
@@ -90,5 +90,57 @@ fn a_cancel_in_evalai_after_a_refusal_is_written_over_the_end_that_the_table_kep
         let plan = world.pass();
         assert_eq!(condition(&plan, RECORDED).0, "True");
         assert!(has(&plan, |a| *a == Action::Forget));
+    }
+}
+
+#[test]
+fn a_row_that_waits_for_evalai_says_so() {
+    let mut world = finished();
+    world.in_evalai().error = Some("EvalAI could not be reached".into());
+    let shown = |plan: &Plan| {
+        conditions::get(&plan.status.conditions, RECORDED)
+            .unwrap()
+            .message
+            .to_string()
+    };
+    let plan = world.pass();
+    assert!(shown(&plan).contains("when EvalAI has answered"), "{}", shown(&plan));
+    world.published();
+    let first = world.pass();
+    assert!(records(&first));
+    assert_eq!(shown(&first), shown(&plan), "it is shown with EvalAI's answer");
+    world.wait(60);
+    let plan = world.pass();
+    assert_eq!(condition(&plan, conditions::PUBLISHED).0, "True");
+    assert!(shown(&plan).contains("waits for the table"), "{}", shown(&plan));
+}
+
+#[test]
+fn a_cancel_before_evalais_row_is_known_keeps_what_had_finished_there() {
+    for is_deleted in [false, true] {
+        let mut world = World::evalai();
+        world.view.evalai = Some(EvalaiView::default());
+        if is_deleted {
+            world.delete();
+        } else {
+            world.submission().spec.cancel = true;
+        }
+        let reason = if is_deleted {
+            reasons::DELETED
+        } else {
+            reasons::CANCELLED
+        };
+        let plan = world.pass_to(Cancelled, reason);
+        let asked = has(&plan, |a| *a == Action::UpdateEvalai(EvalaiUpdate::Cancelled));
+        assert!(asked, "the row is read before anything is written");
+        world.in_evalai().end = Some(EvalaiEnd::Ended {
+            status: "finished".into(),
+        });
+        let plan = world.pass_to(Cancelled, reasons::ENDED_IN_EVALAI);
+        assert!(!has(&plan, |a| matches!(a, Action::UpdateEvalai(_))));
+        let published = condition(&plan, conditions::PUBLISHED);
+        assert_eq!(published, ("False".into(), reasons::NOT_REQUIRED.into()));
+        assert_eq!(has(&plan, |a| *a == Action::ReleaseFinalizer), is_deleted);
+        assert_eq!(world.pass().status, plan.status, "once");
     }
 }

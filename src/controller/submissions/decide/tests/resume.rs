@@ -240,7 +240,10 @@ fn a_resume_counts_on_from_attempts_that_a_restored_status_does_not_know() {
     for (last_job, row, earlier) in [
         (None, None, 0),
         (Some(1), Some(1), 0),
-        (Some(2), None, 1),
+        // A participant has written them into EvalAI's row.
+        (Some(2), None, 0),
+        (Some(9000), Some(1), 0),
+        (Some(9000), Some(2), 1),
         (None, Some(2), 1),
         (Some(3), Some(3), 2),
     ] {
@@ -251,6 +254,10 @@ fn a_resume_counts_on_from_attempts_that_a_restored_status_does_not_know() {
         for _ in 0..3 {
             assert_eq!(counted(&mut world), earlier, "{last_job:?} {row:?}");
         }
+        // It asks for a resume once more, while this attempt waits in line.
+        let known = world.in_evalai().info.as_mut().unwrap();
+        known.last_attempt = known.last_attempt.max(Some(Attempt(2)));
+        assert_eq!(counted(&mut world), earlier, "{last_job:?} {row:?}");
         // EvalAI's row names the Job of this attempt too.
         let known = world.in_evalai().info.as_mut().unwrap();
         (known.standing, known.last_attempt) = (Standing::Wanted, Some(Attempt(2)));

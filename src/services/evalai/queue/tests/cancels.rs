@@ -389,3 +389,62 @@ fn forty_cancels_aimed_between_a_list_and_a_write_are_undone_only_while_the_serv
         assert!((5..12).contains(&undone.len()), "{update:?}: {undone:?}");
     }
 }
+
+#[test]
+fn a_cancel_is_not_written_over_what_had_finished_before_any_run_of_ours() {
+    for has_job in [false, true] {
+        let mut bench = Bench::new();
+        let mut cancelled = of(7, 1);
+        cancelled.run.has_job = has_job;
+        let now = bench.now();
+        let end = DesiredUpdate::Final(Outcome::Cancelled, results(43.0));
+        bench.queue.update(&cancelled, end, now);
+        bench.get(7, row(7, Status::Finished));
+        if has_job {
+            bench.write("cancelled 7");
+        }
+        bench.expect_nothing();
+        let kept = matches!(
+            bench.view(7).end,
+            Some(Ended::Agreed {
+                status: Status::Finished,
+                ..
+            })
+        );
+        assert_eq!(kept, !has_job, "{:?}", bench.view(7).end);
+    }
+}
+
+#[test]
+fn running_follows_its_read_at_once_or_the_read_is_made_once_more() {
+    let mut bench = Bench::new();
+    bench.live(7, 1);
+    bench.list("list of cancelled", vec![]);
+    bench.update(7, 1, DesiredUpdate::Running);
+    bench.get(7, row(7, Status::Queued));
+    bench.wait(0.15);
+    bench.get(7, row(7, Status::Queued));
+    // A machine that is always so slow must not keep it from being written.
+    bench.wait(0.15);
+    bench.write("running 7");
+    bench.update(7, 1, DesiredUpdate::Partial(results(41.0)));
+    bench.get(7, row(7, Status::Running));
+    bench.wait(0.9);
+    bench.write("partial 7");
+}
+
+#[test]
+fn a_write_that_was_chosen_and_not_sent_in_time_is_read_for_again() {
+    let mut bench = Bench::new();
+    bench.live(7, 1);
+    bench.list("list of cancelled", vec![]);
+    bench.update(7, 1, DesiredUpdate::Running);
+    bench.get(7, row(7, Status::Queued));
+    let chosen = bench.expect("running 7");
+    let left = chosen.leave_by.unwrap().checked_sub(chosen.requested).unwrap();
+    assert!(left <= Duration::from_millis(100), "{left:?}");
+    bench.queue.not_sent(&chosen);
+    bench.get(7, row(7, Status::Cancelled));
+    bench.expect_nothing();
+    assert_eq!(bench.view(7).ended, Some(Status::Cancelled));
+}

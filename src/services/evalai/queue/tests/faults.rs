@@ -405,7 +405,11 @@ fn a_refused_token_is_reported_and_tried_again_after_a_minute_or_its_renewal() {
     bench.ask(7, 1);
     bench.wait(59.0);
     bench.expect_nothing();
-    bench.queue.renew_token();
+    let (now, settled) = (bench.now(), bench.at);
+    let leaving = bench.queue.part_with(&key(100), settled, now);
+    bench.queue = queue_of(54, Duration::ZERO, now);
+    bench.queue.take_over(leaving);
+    bench.wait(10.0);
     bench.get(7, row(7, Status::Submitted));
     assert_eq!(bench.queue.token_refused(), None);
 }

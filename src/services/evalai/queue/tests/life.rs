@@ -110,7 +110,34 @@ fn a_submission_that_evalai_has_ended_does_not_run() {
     bench.ask(7, 1);
     let ticket = bench.expect("submission 7");
     bench.answer(&ticket, Reply::Row(Answer::Refused(refusal(About::Missing, 404))));
+    assert_eq!(bench.view(7).ended, None, "one answer is none");
+    bench.wait(29.0);
+    bench.expect_nothing();
+    bench.wait(1.5);
+    let ticket = bench.expect("submission 7");
+    bench.answer(&ticket, Reply::Row(Answer::Refused(refusal(About::Missing, 404))));
     assert_eq!(bench.view(7).ended, Some(Status::Missing));
+}
+
+#[test]
+fn one_answer_that_a_submission_does_not_exist_ends_no_run() {
+    let missing = || Reply::Row(Answer::Refused(refusal(About::Missing, 404)));
+    let mut bench = Bench::new();
+    bench.running(7);
+    // As often as it likes, if a read in between finds it.
+    for _ in 0..3 {
+        bench.wait(70.0);
+        bench.list("list of cancelled", vec![]);
+        let ticket = bench.expect("submission 7");
+        bench.answer(&ticket, missing());
+        let view = bench.view(7);
+        assert_eq!(view.ended, None);
+        assert!(view.last_error.unwrap().contains("before that counts"));
+        bench.wait(31.0);
+        bench.list("list of cancelled", vec![]);
+        bench.get(7, row(7, Status::Running));
+        assert_eq!(bench.view(7).last_error, None);
+    }
 }
 
 #[test]
@@ -265,7 +292,7 @@ fn an_image_is_downloaded_only_where_it_is_missing_and_costs_nothing() {
         ..row(7, Status::Submitted)
     };
     bench.get(7, found);
-    let used = bench.queue.requests_of_last_minute(now);
+    let used = bench.queue.usage(now).used;
     let ticket = bench.expect("image 7");
     bench.answer(&ticket, Reply::Image(Answer::Refused(refusal(About::Request, 404))));
     assert!(matches!(bench.view(7).image, Some(ImageAnswer::Unread(_))));
@@ -274,7 +301,7 @@ fn an_image_is_downloaded_only_where_it_is_missing_and_costs_nothing() {
     let named = ImageAnswer::Named("registry.example/a:1".into());
     bench.answer(&ticket, Reply::Image(Answer::Done(named.clone())));
     assert_eq!(bench.view(7).image, Some(named));
-    assert_eq!(bench.queue.requests_of_last_minute(now), used);
+    assert_eq!(bench.queue.usage(now).used, used);
     bench.wait(100.0);
     bench.expect_nothing();
 }

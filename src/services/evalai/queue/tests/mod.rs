@@ -29,6 +29,7 @@ struct Bench {
 
 fn target() -> Target {
     Target {
+        leaderboard: key(100),
         api_server: "http://evalai".into(),
         challenge: 1,
         split: "leaderboard".into(),
@@ -42,6 +43,12 @@ fn target() -> Target {
         is_observed: false,
         since: wall(-3600),
     }
+}
+
+/// An empty queue whose budget is its own.
+fn queue_of(limit: u32, not_before: Duration, now: Now) -> Queue {
+    let share = Purse::new(limit, now.at).share(limit, now.at);
+    Queue::new(Timing::default(), share, not_before, now)
 }
 
 fn wall(seconds: i64) -> Timestamp {
@@ -121,7 +128,7 @@ impl Bench {
 
     fn with_writes_after(seconds: u64) -> Self {
         let mut bench = Self {
-            queue: Queue::new(Timing::default(), 54, Duration::from_secs(seconds), now(Duration::ZERO)),
+            queue: queue_of(54, Duration::from_secs(seconds), now(Duration::ZERO)),
             at: Duration::ZERO,
         };
         bench.wait(60.0);

@@ -183,3 +183,38 @@ fn results_are_published_two_minutes_after_an_hour_without_evalai() {
         );
     }
 }
+
+#[test]
+fn a_server_that_does_not_answer_is_shown_after_a_minute_and_until_its_next_answer() {
+    let mut bench = Bench::new();
+    bench.serve();
+    let board = || [Changed::Leaderboard(key(100))].into();
+    let away = || {
+        Reply::Rows(Answer::Unanswered(Silence {
+            sent: false,
+            why: "EvalAI could not be reached".into(),
+        }))
+    };
+    let first = bench.expect("sweep of submitted");
+    let since = bench.now().wall;
+    bench.answer(&first, away());
+    assert_eq!(bench.queue.silence(), None, "it may be back in a moment");
+    bench.queue.take_changes();
+    for _ in 0..90 {
+        bench.wait(1.0);
+        while let Some((_, ticket)) = bench.next() {
+            bench.answer(&ticket, away());
+        }
+    }
+    let shown = bench.queue.silence();
+    assert!(
+        shown.is_some_and(|(at, why)| at >= since && why.contains("could not be reached")),
+        "{shown:?}"
+    );
+    assert_eq!(bench.queue.take_changes(), board(), "once");
+    bench.wait(60.0);
+    let ticket = bench.next().unwrap().1;
+    bench.answer(&ticket, Reply::Rows(Answer::Refused(refusal(About::Request, 400))));
+    assert_eq!(bench.queue.silence(), None);
+    assert!(bench.queue.take_changes().contains(&Changed::Leaderboard(key(100))));
+}

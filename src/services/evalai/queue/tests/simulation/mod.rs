@@ -109,6 +109,7 @@ struct World {
 
 fn target() -> Target {
     Target {
+        leaderboard: key(0),
         api_server: "http://evalai".into(),
         challenge: 1,
         split: "leaderboard".into(),
@@ -175,7 +176,7 @@ impl World {
         let mut world = Self {
             rng: Rng::with_seed(seed),
             at: Duration::ZERO,
-            queue: Queue::new(Timing::default(), 54, Duration::from_secs(75), start),
+            queue: super::queue_of(54, Duration::from_secs(75), start),
             lease: true,
             events: BinaryHeap::new(),
             bodies: BTreeMap::new(),

@@ -1,0 +1,120 @@
+//! The row of an end in the table, which follows EvalAI's word.
+
+use super::after::{Delivery, cannot_be_read, without_leaderboard};
+use super::plan::{Action, TableUpdate};
+use super::plan_builder::PlanBuilder;
+use super::reading::{self, Reading};
+use leaderboard_api::conditions::{self, Truth};
+use leaderboard_api::reasons;
+use leaderboard_api::text::sentence;
+
+/// What a check finds of the table.
+const TRIED: &str = "The table would take a row; a check writes none.";
+/// Shown of an end that is settled without a row: another try would be refused again.
+const SUPERSEDED: &str = "The table has a later attempt or another end of this run, and its row was left as it was. Correct the row by \
+                          hand if this end is the one that counts.";
+/// Shown while the row may still turn out otherwise.
+const FOLLOWS_EVALAI: &str = "The table's row is written when EvalAI has answered, since EvalAI may still have cancelled the submission. The \
+                              condition Published shows what EvalAI is waited for.";
+/// Shown while the row is on its way.
+const IN_LINE: &str = "The row waits for the table, which takes one row after the other.";
+
+/// Writes the row of an end on which EvalAI has had its word. `is_shown`: the status shows that word. Until then its text about the row stays,
+/// which saves a write.
+pub(super) fn decide(draft: &mut PlanBuilder<'_>, is_shown: bool) -> Delivery {
+    if draft.status.is_true(conditions::RECORDED) {
+        return Delivery::Done;
+    }
+    if draft.leaderboard().is_none() {
+        return without_leaderboard(draft, conditions::RECORDED);
+    }
+    if let Some(message) = why_without_row(draft) {
+        draft.condition(conditions::RECORDED, Truth::False, reasons::NOT_REQUIRED, message);
+        return Delivery::Done;
+    }
+    let view = draft.view.record.clone().unwrap_or_default();
+    if view.end_written {
+        let message = if draft.spec().check { TRIED } else { "" };
+        draft.condition(conditions::RECORDED, Truth::True, reasons::RECORDED, message);
+        return Delivery::Done;
+    }
+    let mut unread = None;
+    match row_of_end(draft) {
+        Reading::Waits(why) => unread = why.map(|why| cannot_be_read(draft, conditions::RECORDED, &why)),
+        Reading::Done => record_end(draft),
+    }
+    let (reason, message) = match view.error {
+        Some(error) => (
+            reasons::REFUSED,
+            format!(
+                "The last write failed: {} It is tried again; look at the table and the operator's rights.",
+                sentence(&error)
+            ),
+        ),
+        None => (
+            reasons::WAITING,
+            unread.unwrap_or_else(|| (if is_shown { IN_LINE } else { FOLLOWS_EVALAI }).to_owned()),
+        ),
+    };
+    draft.condition(conditions::RECORDED, Truth::False, reason, &message);
+    Delivery::Waiting
+}
+
+/// Why the end has no row of its own; none if it has one, or will.
+fn why_without_row(draft: &PlanBuilder<'_>) -> Option<&'static str> {
+    let has_team = draft.status.team.as_ref().is_some_and(|team| team.id.is_some());
+    if draft.view.record.is_none() {
+        Some("")
+    } else if draft.status.plan.is_none() {
+        Some("The submission was never accepted, so the table has no row for it.")
+    } else if !has_team && !draft.spec().check {
+        Some("The row needs a team; give spec.team.id to a submission that is not EvalAI's.")
+    } else {
+        is_superseded(draft).then_some(SUPERSEDED)
+    }
+}
+
+/// A check only learns whether the table would take its row.
+pub(super) fn record_end(draft: &mut PlanBuilder<'_>) {
+    let is_check = draft.spec().check;
+    draft.act(Action::Record(if is_check {
+        TableUpdate::Trial
+    } else {
+        TableUpdate::End
+    }));
+}
+
+/// Whether all that the row shows is there: only that of a finished submission has metrics.
+pub(super) fn row_of_end(draft: &mut PlanBuilder<'_>) -> Reading {
+    if draft.is_successful() && !draft.spec().check {
+        reading::report_of_end(draft)
+    } else {
+        Reading::Done
+    }
+}
+
+/// Shows that the row waits for EvalAI, where there will be one.
+pub(super) fn follow_evalai(draft: &mut PlanBuilder<'_>) {
+    let known = draft.status.condition(conditions::RECORDED);
+    let is_waiting = known.is_some_and(|known| known.reason == reasons::WAITING);
+    if is_waiting && draft.leaderboard().is_some() && why_without_row(draft).is_none() {
+        draft.condition(conditions::RECORDED, Truth::False, reasons::WAITING, FOLLOWS_EVALAI);
+    }
+}
+
+/// The row has its end and is written once more, with the re-run. Returns whether that is still to come.
+pub(super) fn record_again(draft: &mut PlanBuilder<'_>) -> bool {
+    let is_recorded = draft.status.is_true(conditions::RECORDED);
+    if is_recorded {
+        record_end(draft);
+        draft.condition(conditions::RECORDED, Truth::False, reasons::WAITING, "");
+    }
+    is_recorded
+}
+
+/// Whether the table keeps another row than that of this end: the recorder says so until it has forgotten the end, then the status.
+pub(super) fn is_superseded(draft: &PlanBuilder<'_>) -> bool {
+    let shown = draft.status.condition(conditions::RECORDED);
+    let is_shown = shown.is_some_and(|c| c.reason == reasons::NOT_REQUIRED && c.message == SUPERSEDED);
+    is_shown || draft.view.record.as_ref().is_some_and(|row| row.is_superseded)
+}
