@@ -39,6 +39,9 @@ pub struct PairStatus {
     /// How its last container ended.
     #[serde(default, skip_serializing_if = "Option::is_none")]
     pub last: Option<Box<LastEnd>>,
+    /// Its simulator has failed in this attempt: by its own container's word, or by the kubelet's.
+    #[serde(default, rename = "simulatorFailed", skip_serializing_if = "std::ops::Not::not")]
+    pub simulator_failed: bool,
 }
 
 /// What ended a round of a pair.

@@ -76,6 +76,19 @@ fn is_false_claim(simulator: Option<&ContainerView>, agent: &ContainerView, end:
     }
 }
 
+/// Whether a crash was a failure of the simulator itself, which it was not if its Pod was being ended.
+pub(super) fn is_simulators_own(simulator: Option<&ContainerView>, crash: &Crash) -> bool {
+    let was_ended = simulator.and_then(|container| what(container.last.as_ref()?)) == Some(What::Stopped);
+    let is_its = matches!(
+        crash.cause,
+        EndReason::SimulatorCrashed
+            | EndReason::SimulatorNotReady
+            | EndReason::SimulatorSilent
+            | EndReason::SimulatorNotStarted
+    );
+    is_its && !was_ended
+}
+
 fn what(end: &EndView) -> Option<What> {
     end.verdict.as_ref().map(|verdict| verdict.what)
 }

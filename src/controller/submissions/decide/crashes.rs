@@ -28,6 +28,8 @@ pub(super) fn note(status: &mut SubmissionStatus, pod: &PodView, now: Timestamp)
     }
     for pair in &mut status.pairs {
         if let Some(crash) = last_crash(pod, pair.id, now) {
+            let simulator = pair_with(pair.id).and_then(|pair| container(pod, pair.simulator()));
+            pair.simulator_failed |= blame::is_simulators_own(simulator, &crash);
             pair.last = Some(Box::new(LastEnd {
                 reason: crash.cause,
                 exit_code: Some(crash.exit_code),
@@ -45,12 +47,17 @@ fn count(container: &ContainerView) -> i32 {
 }
 
 fn last_crash(pod: &PodView, id: i32, now: Timestamp) -> Option<Crash> {
-    let pair = u16::try_from(id).ok().and_then(Pair::new)?;
-    let container = |member: Member| {
-        let name = member.to_string();
-        pod.containers.iter().find(|container| container.name == name)
-    };
-    blame::last_crash(container(pair.simulator()), container(pair.agent()), now)
+    let pair = pair_with(id)?;
+    blame::last_crash(container(pod, pair.simulator()), container(pod, pair.agent()), now)
+}
+
+fn pair_with(id: i32) -> Option<Pair> {
+    u16::try_from(id).ok().and_then(Pair::new)
+}
+
+fn container(pod: &PodView, member: Member) -> Option<&ContainerView> {
+    let name = member.to_string();
+    pod.containers.iter().find(|container| container.name == name)
 }
 
 fn pair_of(container: &str) -> Option<i32> {
@@ -68,6 +75,7 @@ fn pair_entry(status: &mut SubmissionStatus, id: i32) -> &mut PairStatus {
         crashes: 0,
         state: PairState::Waiting,
         last: None,
+        simulator_failed: false,
     };
     let at = status.pairs.partition_point(|p| p.id < id);
     status.pairs.insert(at, fresh);

@@ -145,7 +145,7 @@ fn cause(draft: &PlanBuilder<'_>, report: Option<&ReportDigest>, job_end: Option
         return failure::invalid_results(why);
     }
     if let Some(report) = verdict {
-        return failure::not_eligible(&report.entry_status);
+        return failure::not_eligible(report, &draft.status.pairs);
     }
     match job_end {
         Some(end) => of_job(draft, end),

@@ -28,6 +28,7 @@ pub(super) fn take(draft: &mut PlanBuilder<'_>, report: &ReportDigest) {
                 crashes: told.max(known.map_or(0, |k| k.crashes)),
                 state: pair.state,
                 last: known.and_then(|k| k.last.clone()),
+                simulator_failed: known.is_some_and(|k| k.simulator_failed),
             }
         })
         .collect();

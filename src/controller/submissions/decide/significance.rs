@@ -157,6 +157,7 @@ mod tests {
             crashes: 1,
             state: PairState::Crashed,
             last: None,
+            simulator_failed: false,
         };
         let status = SubmissionStatus {
             pairs: vec![crashed],
