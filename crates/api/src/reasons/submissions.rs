@@ -215,6 +215,14 @@ reasons! {
              node the Jobs of this attempt avoid it.",
             "Look at the node: driver, device plugin, container runtime, and what docs/gpu.md asks for the Leaderboard's `gpu.mode`. Then \
              resume the submission.";
+        NODE_CANNOT_START = "NodeCannotStart",
+            "The node could not start a container, or its kubelet did not admit the Pod (`UnexpectedAdmissionError`): the container engine, \
+             the GPU toolkit or device plugin, a full disk, too many open files. All that is not proven to be the image's counts here. \
+             Another Job follows, which prefers other nodes; after two on one node the Jobs of this attempt avoid it \
+             (`status.failedNodes`).",
+            "Look at the node that the message names. The participant's image is not the cause.",
+            after_failure: "Look at the node that the message names: its container engine, GPU toolkit, device plugin and disk. Then resume the \
+             submission.";
         GRAPHICS_DRIVER_MISSING = "GraphicsDriverMissing",
             "A simulator saw its GPU, but the node's NVIDIA driver has no Vulkan/OpenGL part: nvidia_icd.json (V2) or libGLX_nvidia.so.0 (V1) \
              is missing in the container. It was not started. There is no retry.",

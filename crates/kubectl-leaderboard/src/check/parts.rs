@@ -389,6 +389,7 @@ fn part_of(reason: &str, text: &str) -> Part {
         | reasons::POD_REFUSED
         | reasons::SCHEDULE_DEADLINE
         | reasons::NODE_LOST
+        | reasons::NODE_CANNOT_START
         | reasons::JOB_DELETED
         | reasons::JOB_EXPIRED
         | reasons::JOB_FAILED => Part::Node,

@@ -225,6 +225,7 @@ fn retry(draft: &mut PlanBuilder<'_>, found: &Failure) {
     draft.status.times.stopping = None;
     for pair in &mut draft.status.pairs {
         pair.crashes = 0;
+        pair.ended_from_outside = 0;
         pair.last = None;
     }
     let what = &found.message;

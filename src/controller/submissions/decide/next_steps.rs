@@ -64,6 +64,7 @@ pub(super) fn infrastructure_for_participants(reason: &str) -> String {
         reasons::RESULTS_NOT_STORED => "The results could not be stored.",
         reasons::SIMULATION_CRASHED => "The simulator crashed.",
         reasons::NO_GPU => "The machine that ran the submission had no GPU for it.",
+        reasons::NODE_CANNOT_START => "The machine that was to run the submission could not start it.",
         reasons::GRAPHICS_DRIVER_MISSING => "The machine that ran the submission could not run the simulator.",
         reasons::START_DEADLINE => "The run could not be started in time.",
         reasons::SCHEDULE_DEADLINE => "No machine was free for the submission in time.",
