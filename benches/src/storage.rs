@@ -151,6 +151,7 @@ fn report(is_final: bool) -> Report {
         total: share,
         crashes: 0,
         state,
+        names_crash: false,
     };
     let file = |name: &str, size| {
         let stored = StoredFile {

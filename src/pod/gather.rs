@@ -361,6 +361,7 @@ impl Gatherer {
                     total,
                     crashes: seen.crashes(),
                     state: seen.state(),
+                    names_crash: worker.good.as_ref().is_some_and(Checkpoint::names_crash),
                 }
             })
             .collect()

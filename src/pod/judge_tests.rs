@@ -297,6 +297,21 @@ pub(super) mod seen_on_a_volume {
     }
 
     #[test]
+    fn a_crash_of_the_simulation_that_a_checkpoint_names_is_reported_of_its_pair() {
+        let mut volume = Volume::new();
+        put_checkpoint(volume.folder.path(), 1, &checkpoint(0, 2, 2));
+        let named = checkpoint(2, 2, 2).replacen(
+            r#""status":"Completed""#,
+            r#""status":"Failed - Simulation crashed""#,
+            2,
+        );
+        put_checkpoint(volume.folder.path(), 2, &named);
+        let (gathered, _) = volume.round();
+        let found: Vec<bool> = gathered.pairs.iter().map(|pair| pair.names_crash).collect();
+        assert_eq!(found, [false, true]);
+    }
+
+    #[test]
     fn a_round_writes_nothing_to_the_volume() {
         let mut volume = Volume::new();
         put_checkpoint(volume.folder.path(), 1, &checkpoint(0, 2, 2));

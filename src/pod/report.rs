@@ -136,6 +136,9 @@ pub struct ReportPair {
     pub crashes: u32,
     /// What it does.
     pub state: PairState,
+    /// Its checkpoint has a record that names a crash of the simulation; not from an older operator's Pod.
+    #[serde(default, skip_serializing_if = "std::ops::Not::not")]
+    pub names_crash: bool,
 }
 
 /// What has become of the lines for CloudWatch.

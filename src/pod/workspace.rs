@@ -339,6 +339,7 @@ fn first_report(run: &Run, pod_uid: &str) -> Result<Report, WorkspaceError> {
         total: slice.routes().saturating_mul(plan.repetitions),
         crashes: 0,
         state: PairState::Waiting,
+        names_crash: false,
     });
     Ok(Report {
         schema: SCHEMA,

@@ -243,6 +243,7 @@ async fn report(world: &World, run: &str, name: &str, done: u32) {
             total: ROUTES,
             crashes: 0,
             state: PairState::Running,
+            names_crash: false,
         }],
         score: Some(score),
         route_completion: None,

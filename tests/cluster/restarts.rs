@@ -4,6 +4,7 @@
 //! All other tests would. So these run alone and only when they are named, as `make test` does after the others.
 
 mod interruption;
+mod limits;
 
 use std::path::Path;
 use std::process::Stdio;

@@ -21,6 +21,7 @@ pub const ROUTES_OF_PAIR: u16 = 5;
 pub const FASTER: u32 = 20;
 /// Below what the kernel gives away by itself, so that a simulator that comes back finds its port free.
 const PORTS: std::ops::Range<u16> = 12_000..28_000;
+const PORT_STEP: u16 = 20;
 
 /// The programs under test.
 pub struct Programs {
@@ -258,7 +259,8 @@ fn run(endpoint: &str, bucket: &str, id: &str, format: LeaderboardVersion) -> Ru
 fn free_ports(random: &mut fastrand::Rng) -> Vec<u16> {
     let mut ports = Vec::new();
     while ports.len() < usize::from(PAIRS) {
-        let port = random.u16(PORTS);
+        // A simulator has ports behind its own.
+        let port = random.u16(PORTS).next_multiple_of(PORT_STEP);
         if !ports.contains(&port) && TcpListener::bind(("127.0.0.1", port)).is_ok() {
             ports.push(port);
         }

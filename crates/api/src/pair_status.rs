@@ -39,6 +39,17 @@ pub struct PairStatus {
     /// How its last container ended.
     #[serde(default, skip_serializing_if = "Option::is_none")]
     pub last: Option<Box<LastEnd>>,
+    /// How often its containers were ended from outside and started again, which is no crash.
+    #[serde(default, rename = "endedFromOutside", skip_serializing_if = "is_zero")]
+    pub ended_from_outside: i32,
+    /// Its simulator has failed in this attempt: by its own container's word, or by the kubelet's.
+    #[serde(default, rename = "simulatorFailed", skip_serializing_if = "std::ops::Not::not")]
+    pub simulator_failed: bool,
+}
+
+#[expect(clippy::trivially_copy_pass_by_ref, reason = "serde hands out references")]
+fn is_zero(number: &i32) -> bool {
+    *number == 0
 }
 
 /// What ended a round of a pair.
@@ -60,6 +71,10 @@ pub enum EndReason {
     StartError,
     /// The kubelet could not start the agent's container, because of the node.
     NodeCannotStart,
+    /// The agents left no process in the Pod to start the agent or the simulator again.
+    NoProcess,
+    /// Agent and simulator were ended from outside: their sandbox was made anew, or their node started again. It is no crash.
+    EndedFromOutside,
     /// The agent's verdict blames a simulator that has not failed.
     BlamesSimulator,
     /// The simulator followed its agent, whose own end is not known.

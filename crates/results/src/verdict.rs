@@ -3,7 +3,7 @@
 
 use crate::checkpoint::Record;
 use crate::json::Text;
-use crate::names::{CRASHED, FINISHED, INVALID, REJECTED, SENSORS_INVALID, SIMULATION_CRASHED, STARTED};
+use crate::names::{CRASHED, FINISHED, INVALID, REJECTED, SENSORS_INVALID, STARTED};
 use crate::{Checkpoint, Format, Plan};
 
 /// How a run ended, whatever the format calls it.
@@ -115,7 +115,7 @@ impl Verdict {
 /// The last route whose status names a crash or wrong sensors decides, as in the original.
 fn telling(sorted: &[&Record]) -> Option<Outcome> {
     sorted.iter().rev().find_map(|record| {
-        if record.status.contains(SIMULATION_CRASHED) {
+        if record.names_crash() {
             Some(Outcome::Crashed)
         } else {
             record.status.contains(SENSORS_INVALID).then_some(Outcome::Rejected)

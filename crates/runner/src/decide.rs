@@ -8,6 +8,7 @@
 //! the two counts meet again however far apart the containers restart.
 
 use leaderboard_runner::protocol::Side;
+use leaderboard_runner::verdict::{CODE_NO_PROCESS, CODE_NODE_REFUSED};
 
 /// How far this container has come.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
@@ -96,6 +97,10 @@ pub(crate) enum Cause {
     GraphicsDriverMissing,
     /// With the exit code of a shell that cannot start a command.
     CannotStart(i32),
+    /// The node refuses what the command needs to start: files, memory, a disk that works.
+    NodeRefused,
+    /// No process is left for the command.
+    NoProcess,
     /// The status folder cannot be written, so nothing can be agreed.
     Mute,
 }
@@ -271,8 +276,13 @@ pub(crate) fn conclude(side: Side, cause: Cause, complete: bool, seen: &Seen) ->
         | Cause::NotReady
         | Cause::ServerSilent
         | Cause::PortTaken
-        | Cause::CannotStart(_) => {
-            let ran = !matches!(cause, Cause::NotReady | Cause::CannotStart(_));
+        | Cause::CannotStart(_)
+        | Cause::NodeRefused
+        | Cause::NoProcess => {
+            let ran = !matches!(
+                cause,
+                Cause::NotReady | Cause::CannotStart(_) | Cause::NodeRefused | Cause::NoProcess
+            );
             if side == Side::Simulator && seen.peer_done {
                 SIMULATOR_DONE
             } else if side == Side::Agent && ran && complete {
@@ -284,10 +294,11 @@ pub(crate) fn conclude(side: Side, cause: Cause, complete: bool, seen: &Seen) ->
             } else if seen.cancel {
                 silent(hold(Hold::Cancel), CODE_OVER)
             } else {
-                let code = if let Cause::CannotStart(code) = cause {
-                    code
-                } else {
-                    CODE_CRASHED
+                let code = match cause {
+                    Cause::CannotStart(code) => code,
+                    Cause::NodeRefused => CODE_NODE_REFUSED,
+                    Cause::NoProcess => CODE_NO_PROCESS,
+                    _ => CODE_CRASHED,
                 };
                 Conclusion {
                     mark: Some(EndMark::Crash),

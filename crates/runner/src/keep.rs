@@ -14,6 +14,8 @@ use std::path::{Path, PathBuf};
 use std::time::{Duration, Instant};
 
 use crate::checkpoint::{self, MAX_BYTES, Unreadable};
+use crate::kernel;
+use thiserror::Error;
 
 /// Behind inotify, for whatever it misses.
 const SLOW_LOOK: Duration = Duration::from_secs(1);
@@ -40,6 +42,21 @@ pub(crate) struct Keeper {
     complained: bool,
 }
 
+/// Why the command would start at the first route, although there is a whole checkpoint.
+#[derive(Debug, Error)]
+#[error("the checkpoint {torn}, and the last whole one cannot be put back: {why}")]
+pub(crate) struct NotPutBack {
+    torn: &'static str,
+    why: Failure,
+}
+
+impl NotPutBack {
+    /// Whether its node is the cause, and not what lies in the folder.
+    pub(crate) fn is_nodes(&self) -> bool {
+        matches!(&self.why, Failure::Io(error) if kernel::is_nodes(error))
+    }
+}
+
 impl Keeper {
     pub(crate) fn new(checkpoint: PathBuf, kept: PathBuf) -> Self {
         let now = Instant::now();
@@ -56,7 +73,7 @@ impl Keeper {
 
     /// Before the command starts: what is whole is kept, and what is torn or gone is replaced by what was kept. An error shows why
     /// that cannot be: the command would start at the first route.
-    pub(crate) fn prepare(&mut self) -> Result<(), String> {
+    pub(crate) fn prepare(&mut self) -> Result<(), NotPutBack> {
         let torn = match checkpoint::read(&self.checkpoint) {
             Err(Unreadable::Missing) => "is gone",
             Err(Unreadable::Malformed { .. }) => "was left half written",
@@ -77,9 +94,7 @@ impl Keeper {
                 ));
                 Ok(())
             }
-            Err(error) => Err(format!(
-                "the checkpoint {torn}, and the last whole one cannot be put back: {error}"
-            )),
+            Err(why) => Err(NotPutBack { torn, why }),
         }
     }
 
@@ -283,7 +298,7 @@ mod tests {
         fs::remove_file(&folder.keeper.checkpoint).unwrap();
         // A folder in the way, as good as a full disk.
         fs::create_dir(folder.folder.path().join(".agent_results.json.tmp")).unwrap();
-        let why = folder.keeper.prepare().unwrap_err();
+        let why = folder.keeper.prepare().unwrap_err().to_string();
         assert!(
             why.starts_with("the checkpoint is gone, and the last whole one cannot be put back: "),
             "{why}"

@@ -9,7 +9,8 @@ use std::process::{Command, Stdio};
 
 use crate::checkpoint;
 use crate::decide::Cause;
-use crate::group::{self, Group, spawn_code};
+use crate::group::{self, Group};
+use crate::kernel;
 use crate::tee::Tee;
 use leaderboard_runner::args::{Job, Role};
 use leaderboard_runner::expand::expand;
@@ -31,7 +32,7 @@ impl CannotLaunch {
     /// The end that follows.
     pub(crate) fn cause(&self) -> Cause {
         match self {
-            Self::Spawn { source, .. } => Cause::CannotStart(spawn_code(source)),
+            Self::Spawn { source, .. } => kernel::of_spawn(source),
             Self::NoGraphics(NoGraphics::NoGpu) => Cause::NoGpu,
             Self::NoGraphics(NoGraphics::DriverMissing) => Cause::GraphicsDriverMissing,
         }

@@ -7,6 +7,7 @@ mod decide;
 mod group;
 mod keep;
 mod keep_output;
+mod kernel;
 mod launch;
 mod memory;
 mod own_folder;
@@ -27,11 +28,10 @@ use nix::sys::stat::{Mode, umask};
 use crate::run::Runner;
 use crate::wake::Signals;
 use leaderboard_runner::args::{self, Request};
+use leaderboard_runner::verdict::CODE_NODE_REFUSED;
 
 /// Wrong arguments (EX_USAGE).
 const CODE_USAGE: u8 = 64;
-/// The kernel refuses what the runner cannot do without (EX_OSERR).
-const CODE_KERNEL: u8 = 71;
 /// Bytes of a core dump, which is none. Not 0: the kernel then still starts a program that the node's core_pattern names.
 const CORE_BYTES: u64 = 1;
 
@@ -53,7 +53,7 @@ fn run(live: impl FnOnce(Signals) -> i32) -> ExitCode {
         Ok(signals) => signals,
         Err(error) => {
             say(format_args!("signals cannot be handled: {error}"));
-            return ExitCode::from(CODE_KERNEL);
+            return code(CODE_NODE_REFUSED);
         }
     };
     umask(Mode::from_bits_truncate(0o022));
@@ -68,7 +68,11 @@ fn run(live: impl FnOnce(Signals) -> i32) -> ExitCode {
             say(format_args!("{what}: {error}"));
         }
     }
-    ExitCode::from(u8::try_from(live(signals)).unwrap_or(1))
+    code(live(signals))
+}
+
+fn code(number: i32) -> ExitCode {
+    ExitCode::from(u8::try_from(number).unwrap_or(1))
 }
 
 fn limit_core() -> nix::Result<()> {

@@ -79,6 +79,8 @@ const fn what(end: &End<'_>) -> What {
         Cause::NoGpu | Cause::AgentHasNoGpu => What::NoGpu,
         Cause::GraphicsDriverMissing => What::GraphicsDriverMissing,
         Cause::CannotStart(_) | Cause::Mute => What::CannotStart,
+        Cause::NodeRefused => What::NodeRefused,
+        Cause::NoProcess => What::NoProcess,
         Cause::ChildEnded => match end.status {
             Some(Status::Exited(_)) => What::Exited,
             _ => What::Killed,
@@ -107,15 +109,25 @@ fn reason(end: &End<'_>) -> String {
             "the agent's container sees no GPU (no /dev/nvidia0 or any other number), and its Leaderboard gives it one; it was not begun"
                 .to_owned()
         }
-        Cause::PortTaken => "another process of the Pod listens on the server's port".to_owned(),
-        Cause::CannotStart(_) | Cause::Mute | Cause::NoGpu | Cause::GraphicsDriverMissing => {
-            end.detail.unwrap_or("the command could not be started").to_owned()
+        Cause::PortTaken => end.detail.unwrap_or("another process of the Pod has a port of the server").to_owned(),
+        Cause::CannotStart(_)
+        | Cause::NodeRefused
+        | Cause::NoProcess
+        | Cause::Mute
+        | Cause::NoGpu
+        | Cause::GraphicsDriverMissing => end.detail.unwrap_or("the command could not be started").to_owned(),
+        Cause::ChildEnded => {
+            let how = how_it_ended(end.status);
+            end.detail.map_or_else(|| how.clone(), |detail| format!("{how}; {detail}"))
         }
-        Cause::ChildEnded => match end.status {
-            Some(Status::Exited(code)) => format!("the command exited with code {code}"),
-            Some(Status::Killed(Some(signal))) => format!("the command died of signal {signal}"),
-            Some(Status::Killed(None)) | None => "the command ended in an unknown way".to_owned(),
-        },
+    }
+}
+
+fn how_it_ended(status: Option<Status>) -> String {
+    match status {
+        Some(Status::Exited(code)) => format!("the command exited with code {code}"),
+        Some(Status::Killed(Some(signal))) => format!("the command died of signal {signal}"),
+        Some(Status::Killed(None)) | None => "the command ended in an unknown way".to_owned(),
     }
 }
 

@@ -11,7 +11,7 @@ use std::os::fd::AsFd;
 use std::time::{Duration, Instant};
 
 use leaderboard_runner::protocol::{KEPT_CHECKPOINT, MAX_ROUNDS, Mark, Member, Progress, Side, StatusFile};
-use leaderboard_runner::verdict::Verdict;
+use leaderboard_runner::verdict::{CODE_NODE_REFUSED, Verdict};
 use nix::errno::Errno;
 use nix::poll::{PollFd, PollFlags, PollTimeout, poll};
 use nix::sys::signal::Signal;
@@ -23,7 +23,7 @@ use crate::launch;
 use crate::server;
 use crate::tee::Tee;
 use crate::wake::{Folders, Signals};
-use crate::{checkpoint, memory, own_folder, report, say};
+use crate::{checkpoint, kernel, memory, own_folder, report, say};
 use leaderboard_runner::args::{Job, Role};
 
 /// Behind inotify, for whatever it misses.
@@ -53,8 +53,8 @@ pub(crate) struct Runner {
     /// An agent's.
     keeper: Option<Keeper>,
     memory_kills: u64,
-    /// Another container listened on the server's port.
-    is_port_taken: bool,
+    /// A port of the server that another container has.
+    taken_port: Option<u16>,
     /// A simulator's server has answered once.
     has_answered: bool,
     detail: Option<String>,
@@ -90,7 +90,7 @@ impl Runner {
             tee: None,
             keeper,
             memory_kills: memory::kills(),
-            is_port_taken: false,
+            taken_port: None,
             has_answered: false,
             detail: None,
         }
@@ -102,6 +102,7 @@ impl Runner {
         let cause = self.live();
         let cause = self.of_the_server(cause);
         self.end_processes();
+        let cause = self.of_its_ports(cause);
         let conclusion = self.conclude(cause);
         let code = self.hold(conclusion);
         self.say(&format!("exit {code}"));
@@ -234,9 +235,13 @@ impl Runner {
         if self.me.side == Side::Agent {
             self.mark(Mark::Start(self.round))?;
         }
-        if let Some(Err(why)) = self.keeper.as_mut().map(Keeper::prepare) {
-            self.detail = Some(why);
-            return Err(Cause::CannotStart(decide::CODE_NOT_RESUMED));
+        if let Some(Err(error)) = self.keeper.as_mut().map(Keeper::prepare) {
+            self.detail = Some(error.to_string());
+            return Err(if error.is_nodes() {
+                Cause::NodeRefused
+            } else {
+                Cause::CannotStart(decide::CODE_NOT_RESUMED)
+            });
         }
         self.since = Instant::now();
         match launch::launch(&self.job, self.round) {
@@ -281,8 +286,13 @@ impl Runner {
     }
 
     fn write(&mut self, file: &StatusFile) -> Result<(), Cause> {
-        let created = file.create(&self.job.status);
-        created.map_err(|error| self.mute(format!("the status file {} cannot be created: {error}", file.name())))
+        let Err(error) = file.create(&self.job.status) else {
+            return Ok(());
+        };
+        let cause = self.mute(format!("the status file {} cannot be created: {error}", file.name()));
+        // Once the command has run, what the runner lacks can be the command's doing.
+        let is_nodes = self.group.is_none() && kernel::is_nodes(&error);
+        Err(if is_nodes { Cause::NodeRefused } else { cause })
     }
 
     fn mute(&mut self, detail: String) -> Cause {
@@ -370,7 +380,11 @@ impl Runner {
         Conclusion {
             mark: None,
             hold: Hold::Free,
-            code: decide::CODE_MUTE,
+            code: if cause == Cause::NodeRefused {
+                CODE_NODE_REFUSED
+            } else {
+                decide::CODE_MUTE
+            },
         }
     }
 

@@ -1,13 +1,13 @@
-//! The simulator's server as the network shows it: whose socket listens on its port, and whether it still answers. Called by
-//! `run`.
+//! The simulator's server as the network shows it: whose sockets have its ports, and whether it still answers. Called by `run`.
 //!
-//! All containers of a Pod share one network, so an agent can listen on the port of any simulator. A listener counts only if
-//! its socket belongs to a descendant of this process.
+//! All containers of a Pod share one network, so an agent can take the ports of any simulator. A listener counts only if its socket
+//! belongs to a descendant of this process.
 
 use std::collections::HashSet;
-use std::fs;
-use std::io::{self, ErrorKind, Read, Write};
-use std::net::{SocketAddr, TcpStream};
+use std::fs::{self, File};
+use std::io::{self, BufRead, BufReader, ErrorKind, Read, Write};
+use std::net::{Ipv4Addr, SocketAddr, TcpListener, TcpStream};
+use std::ops::RangeInclusive;
 use std::path::Path;
 use std::time::Duration;
 
@@ -15,8 +15,14 @@ use leaderboard_runner::protocol::{self, Mark, Pair, Side, StatusFile};
 
 /// CARLA's RPC `get_episode_settings`, in MessagePack: its main loop has to answer it, and it changes nothing.
 const REQUEST: &[u8] = b"\x94\x00\x00\xb4get_episode_settings\x90";
-/// The state of a listening socket in the kernel's tables.
+/// The kernel's tables of sockets.
+const TABLES: [&str; 2] = ["/proc/self/net/tcp", "/proc/self/net/tcp6"];
+/// The states there of a socket that listens, and of one of which nothing but its name is left.
 const LISTEN: &str = "0A";
+const TIME_WAIT: &str = "06";
+/// Ports that a server may take from its own on: CARLA's streaming server has the next one. The agent's traffic manager has the one
+/// behind these.
+const PORTS: u16 = 10;
 
 /// Who listens on a port.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
@@ -28,35 +34,92 @@ pub(crate) enum Listener {
     Foreign,
 }
 
+/// All ports that the server on this port may take.
+pub(crate) fn ports_of(port: u16) -> RangeInclusive<u16> {
+    port..=port.saturating_add(PORTS - 1)
+}
+
 /// Who listens on the port.
 pub(crate) fn listener(port: u16) -> Listener {
-    let tables = ["/proc/self/net/tcp", "/proc/self/net/tcp6"].map(|path| fs::read_to_string(path).ok());
-    if tables.iter().all(Option::is_none) {
-        return Listener::Own;
+    match sockets() {
+        None => Listener::Own,
+        Some(sockets) => of_port(port, &listening(sockets, port..=port)),
     }
-    let sockets: HashSet<String> = tables
-        .iter()
-        .flatten()
-        .flat_map(|table| listening(table, port))
-        .collect();
-    if sockets.is_empty() {
-        return Listener::Nobody;
+}
+
+/// The first of the ports on which a process of another container listens.
+pub(crate) fn foreign_listener(mut ports: RangeInclusive<u16>) -> Option<u16> {
+    let found = listening(sockets()?, ports.clone());
+    ports.find(|port| of_port(*port, &found) == Listener::Foreign)
+}
+
+/// The first of the ports that cannot be taken. Once no process of this container is left, another one's has it, whether it listens there
+/// or not: the kernel's tables do not show a socket that only has a name.
+pub(crate) fn held(mut ports: RangeInclusive<u16>) -> Option<u16> {
+    if !descendants().is_empty() {
+        return None;
     }
-    if descendants().iter().any(|pid| holds(*pid, &sockets)) {
+    let is_held = |port: u16| {
+        let taken = TcpListener::bind((Ipv4Addr::UNSPECIFIED, port));
+        taken.is_err_and(|error| error.kind() == ErrorKind::AddrInUse)
+    };
+    ports.find(|port| is_held(*port))
+}
+
+/// How many ends of connections to the port other processes have.
+pub(crate) fn connections(port: u16) -> usize {
+    let is_end = |socket: &Socket| socket.remote_port == port && socket.state != TIME_WAIT;
+    sockets().map_or(0, |sockets| sockets.filter(is_end).count())
+}
+
+/// The sockets that listen on one of the ports, with their ports.
+fn listening(sockets: impl Iterator<Item = Socket>, ports: RangeInclusive<u16>) -> Vec<(u16, String)> {
+    sockets
+        .filter(|socket| socket.state == LISTEN && ports.contains(&socket.local_port))
+        .map(|socket| (socket.local_port, socket.link))
+        .collect()
+}
+
+fn of_port(port: u16, listening: &[(u16, String)]) -> Listener {
+    let its = listening.iter().filter(|(of, _)| *of == port);
+    let links: HashSet<&str> = its.map(|(_, link)| link.as_str()).collect();
+    if links.is_empty() {
+        Listener::Nobody
+    } else if descendants().iter().any(|pid| holds(*pid, &links)) {
         Listener::Own
     } else {
         Listener::Foreign
     }
 }
 
-/// The sockets that listen on the port, as a process's links to its files name them.
-fn listening(table: &str, port: u16) -> impl Iterator<Item = String> {
-    table.lines().skip(1).filter_map(move |line| {
-        let mut fields = line.split_whitespace();
-        let (_, local_port) = fields.nth(1)?.rsplit_once(':')?;
-        let is_it = u16::from_str_radix(local_port, 16) == Ok(port) && fields.nth(1)? == LISTEN;
-        let inode = fields.nth(5)?;
-        is_it.then(|| format!("socket:[{inode}]"))
+/// One line of the kernel's tables.
+struct Socket {
+    local_port: u16,
+    remote_port: u16,
+    state: String,
+    /// Its name among a process's links to its files.
+    link: String,
+}
+
+/// All sockets, one after the other: an agent can open so many that they should not be in memory at once. None where the kernel hides them.
+fn sockets() -> Option<impl Iterator<Item = Socket>> {
+    let tables: Vec<File> = TABLES.iter().filter_map(|path| File::open(path).ok()).collect();
+    let lines = |table: File| BufReader::new(table).lines().map_while(Result::ok);
+    let some = !tables.is_empty();
+    some.then(|| tables.into_iter().flat_map(lines).filter_map(|line| socket(&line)))
+}
+
+/// The socket of a line; none of the heading.
+fn socket(line: &str) -> Option<Socket> {
+    let mut fields = line.split_whitespace();
+    let (_, local_port) = fields.nth(1)?.rsplit_once(':')?;
+    let (_, remote_port) = fields.next()?.rsplit_once(':')?;
+    let port = |digits: &str| u16::from_str_radix(digits, 16).ok();
+    Some(Socket {
+        local_port: port(local_port)?,
+        remote_port: port(remote_port)?,
+        state: fields.next()?.to_owned(),
+        link: format!("socket:[{}]", fields.nth(5)?),
     })
 }
 
@@ -92,7 +155,7 @@ fn parent_of_living(stat: &str) -> Option<u32> {
 }
 
 /// Whether a process has one of the sockets open. One whose files are hidden (it has changed its user) may have.
-fn holds(pid: u32, sockets: &HashSet<String>) -> bool {
+fn holds(pid: u32, sockets: &HashSet<&str>) -> bool {
     let entries = match fs::read_dir(Path::new("/proc").join(pid.to_string()).join("fd")) {
         Ok(entries) => entries,
         Err(error) => return error.kind() == ErrorKind::PermissionDenied,
@@ -187,10 +250,29 @@ mod tests {
                0: 0100007F:07D0 00000000:0000 0A 00000000:00000000 00:00000000 00000000  1000        0 4711 1 0000000000000000 100 0 0 10 0\n\
                1: 0100007F:07D0 0100007F:C350 01 00000000:00000000 00:00000000 00000000  1000        0 4712 1 0000000000000000 20 4 30 10 -1\n\
                2: 00000000:0834 00000000:0000 0A 00000000:00000000 00:00000000 00000000  1000        0 4713 1 0000000000000000 100 0 0 10 0\n";
-        let sockets = |port| listening(table, port).collect::<Vec<_>>();
-        assert_eq!(sockets(2000), ["socket:[4711]"]);
-        assert_eq!(sockets(2100), ["socket:[4713]"]);
-        assert!(sockets(2200).is_empty());
+        let all = || table.lines().filter_map(socket);
+        let at = |ports| listening(all(), ports);
+        assert_eq!(at(2000..=2000), [(2000, "socket:[4711]".to_owned())]);
+        assert_eq!(at(2100..=2109), [(2100, "socket:[4713]".to_owned())]);
+        assert!(at(2200..=2209).is_empty());
+        assert_eq!(all().filter(|socket| socket.remote_port == 50_000).count(), 1);
+    }
+
+    #[test]
+    fn the_ports_behind_a_servers_own_are_looked_at_and_the_traffic_managers_is_not() {
+        assert_eq!(ports_of(2100), 2100..=2109);
+        assert_eq!(ports_of(u16::MAX), u16::MAX..=u16::MAX);
+    }
+
+    #[test]
+    fn connections_are_counted_by_the_port_that_they_lead_to() {
+        let listener = TcpListener::bind(("127.0.0.1", 0)).unwrap();
+        let port = listener.local_addr().unwrap().port();
+        assert_eq!(connections(port), 0);
+        let _ends: Vec<_> = (0..3)
+            .map(|_| TcpStream::connect(("127.0.0.1", port)).unwrap())
+            .collect();
+        assert_eq!(connections(port), 3);
     }
 
     #[test]

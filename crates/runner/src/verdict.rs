@@ -13,6 +13,11 @@ use thiserror::Error;
 pub const MAX_BYTES: usize = 340;
 /// Nothing longer is parsed: what the version before wrote at most.
 const MAX_READ_BYTES: usize = 1000;
+/// Exit code of a runner to which its node has refused what it needs, before its command ran (EX_OSERR). It counts without a verdict, too,
+/// which takes an open file. Nothing of the image has run in this life of the container, so nothing of it can have brought that about.
+pub const CODE_NODE_REFUSED: i32 = 71;
+/// The same for want of a process (EX_TEMPFAIL), which the other containers of the Pod can use up.
+pub const CODE_NO_PROCESS: i32 = 75;
 /// Version of the document. Version 1 had no number and no round.
 pub const SCHEMA: u32 = 2;
 
@@ -37,7 +42,7 @@ pub enum What {
     NotReady,
     /// The agent crashed, and at that moment the simulator's server did not answer any more.
     ServerSilent,
-    /// Another process of the Pod listens on the port of the simulator's server.
+    /// Another process of the Pod has taken a port of the simulator's server.
     PortTaken,
     /// The simulator, or its agent, was to have a GPU and sees none. A simulator's word for both; of an agent it counts for nothing.
     NoGpu,
@@ -45,6 +50,10 @@ pub enum What {
     GraphicsDriverMissing,
     /// The command could not be started, or the status folder could not be written.
     CannotStart,
+    /// The node refused what the command needs to start: files, memory, a disk that works.
+    NodeRefused,
+    /// No process was left for the command.
+    NoProcess,
     /// Written first and replaced at the end: it stays when the runner is killed.
     SilentDeath,
     /// The simulator's agent is done: the orderly end of a simulator.

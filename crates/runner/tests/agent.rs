@@ -12,7 +12,7 @@ use std::process::{Command, Stdio};
 use std::time::{Duration, Instant};
 
 use leaderboard_runner::protocol::{Mark, StatusFile};
-use leaderboard_runner::verdict::What;
+use leaderboard_runner::verdict::{CODE_NODE_REFUSED, What};
 use nix::sys::signal::Signal;
 use support::{AGENT, COMPLETE, PARTIAL, Pod, SIMULATOR, lives};
 
@@ -298,6 +298,28 @@ fn a_command_that_cannot_be_started_is_reported_with_the_reason() {
         );
         assert!(pod.has(AGENT, Mark::Crash(round)));
     }
+}
+
+/// As on a node on which all files that may be open are: nothing of the image runs, and nothing of it can be the cause.
+#[test]
+fn a_command_for_which_there_are_no_files_is_never_its_images_fault() {
+    let (mut refused, mut ran) = (0, 0);
+    for files in 4..40 {
+        let mut pod = pod();
+        let limit = format!("ulimit -n {files}; exec \"$@\"");
+        pod.starter = ["sh", "-c", &limit, "sh"].map(str::to_owned).to_vec();
+        let begun = pod.path("work/begun");
+        let script = format!("touch {}; echo '{COMPLETE}' > $CHECKPOINT", begun.display());
+        let mut agent = pod.agent(&script);
+        let code = agent.code();
+        if begun.exists() {
+            ran += 1;
+        } else {
+            refused += 1;
+            assert_eq!(code, CODE_NODE_REFUSED, "{files} files: {}", agent.stderr());
+        }
+    }
+    assert!(refused > 3 && ran > 3, "{refused} times refused, {ran} times not");
 }
 
 #[test]

@@ -5,10 +5,10 @@
 mod support;
 
 use std::fs;
-use std::net::{TcpListener, TcpStream};
+use std::net::TcpStream;
 use std::time::{Duration, Instant};
 
-use leaderboard_runner::protocol::{MAX_ROUNDS, Mark, Member, Pair, StatusFile};
+use leaderboard_runner::protocol::{MAX_ROUNDS, Mark, StatusFile};
 use leaderboard_runner::verdict::What;
 use nix::sys::signal::Signal;
 use support::{AGENT, COMPLETE, PARTIAL, Pod, SIMULATOR};
@@ -219,61 +219,6 @@ fn a_server_that_does_not_answer_in_time_is_a_crash() {
     assert_eq!(simulator.code(), 1);
     assert_eq!(simulator.verdict().what, What::NotReady);
     assert_eq!(pod.files(SIMULATOR), ["simulator-1.crash0"]);
-}
-
-#[test]
-fn a_listener_of_another_container_is_no_readiness() {
-    let pod = Pod::new();
-    let _other = TcpListener::bind(("127.0.0.1", pod.port)).unwrap();
-    let options = ["--ready-seconds=1", "--peer-seconds=0"];
-    let mut simulator = pod.simulator_running(&["sleep", "1000"], &options);
-    assert_eq!(simulator.code(), 1);
-    assert_eq!(simulator.verdict().what, What::NotReady, "no agent has begun yet");
-    assert_eq!(pod.files(SIMULATOR), ["simulator-1.crash0"]);
-    let expected = format!("a process of another container listens on port {}", pod.port);
-    assert_eq!(
-        simulator.stderr().matches(&expected).count(),
-        1,
-        "{}",
-        simulator.stderr()
-    );
-}
-
-#[test]
-fn a_port_that_another_container_has_taken_is_reported() {
-    let pod = Pod::new();
-    let other = Member {
-        pair: Pair::new(2).unwrap(),
-        ..SIMULATOR
-    };
-    pod.write(StatusFile::Of(other, Mark::Start(0)));
-    let _other = TcpListener::bind(("127.0.0.1", pod.port)).unwrap();
-    let (server, port) = (pod.path("server.py"), pod.port.to_string());
-    let server = ["python3", server.to_str().unwrap(), &port];
-    let mut simulator = pod.simulator_running(&server, &["--peer-seconds=0"]);
-    assert_eq!(simulator.code(), 1);
-    let verdict = simulator.verdict();
-    assert_eq!((verdict.what, verdict.exit_code), (What::PortTaken, Some(1)));
-    assert_eq!(pod.files(SIMULATOR), ["simulator-1.crash0"]);
-}
-
-#[test]
-fn a_server_that_hangs_when_its_agent_crashes_is_reported() {
-    let pod = Pod::new();
-    let hangs = "import socket, sys, time
-server = socket.socket()
-server.setsockopt(socket.SOL_SOCKET, socket.SO_REUSEADDR, 1)
-server.bind(('127.0.0.1', int(sys.argv[1])))
-server.listen()
-time.sleep(1000)";
-    let server = ["python3", "-c", hangs, &pod.port.to_string()];
-    let (mut simulator, mut agent) = (
-        pod.simulator_running(&server, &["--answer-seconds=1"]),
-        pod.agent("exit 3"),
-    );
-    assert_eq!((simulator.code(), agent.code()), (1, 1));
-    assert_eq!(simulator.verdict().what, What::ServerSilent);
-    assert_eq!(agent.verdict().what, What::Exited);
 }
 
 #[test]

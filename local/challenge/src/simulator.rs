@@ -83,6 +83,10 @@ pub fn run(arguments: &[String]) -> Result<(), SimulatorError> {
     thread::sleep(start);
     let listener =
         TcpListener::bind((Ipv4Addr::LOCALHOST, port)).map_err(|source| SimulatorError::Listen { port, source })?;
+    // As CARLA's streaming server, which comes second.
+    let behind = if port == 0 { 0 } else { port.saturating_add(1) };
+    let _streaming = TcpListener::bind((Ipv4Addr::LOCALHOST, behind))
+        .map_err(|source| SimulatorError::Listen { port: behind, source })?;
     let address = listener
         .local_addr()
         .map_err(|source| SimulatorError::Listen { port, source })?;

@@ -299,6 +299,7 @@ async fn put(stage: &Stage, archive: &Archive, report: &mut Report) {
         total: ROUTES,
         crashes: 0,
         state: PairState::Running,
+        names_crash: false,
     }];
     if report.is_final && report.stopped.is_none() {
         report.entry_status = "Finished".into();

@@ -164,7 +164,8 @@ reasons! {
             "Make the agent faster, or ask the host for more time.",
             log: "the log of the agent of the first pair that was not done, else of the first pair";
         INVALID_RESULTS = "InvalidResults",
-            "A checkpoint was refused: malformed, implausible, or incomplete at the end.",
+            "A checkpoint was refused: malformed, implausible, or incomplete at the end; or it names a crash of the simulation that its \
+             simulator did not have.",
             "Check what the agent writes into its checkpoint, and submit again.",
             log: "the log of the agent whose checkpoint was refused";
         NOT_ELIGIBLE = "NotEligible",
@@ -214,7 +215,8 @@ reasons! {
     }
     Infrastructure {
         SIMULATION_CRASHED = "SimulationCrashed",
-            "A simulator crashed, or was not ready, more often than `retries.perPair` allows; or a route ended as crashed.",
+            "A simulator crashed, or was not ready, more often than `retries.perPair` allows; or the results name a crash of the simulation, \
+             and that pair's simulator has failed in this attempt.",
             "Look at the simulator's log, then resume the submission; it repeats the route it was at.",
             log: "the log of simulator `<n>`, read from its node before the Pod ends; else `simulator/console-<n>.log`";
         NO_GPU = "NoGPU",

@@ -100,6 +100,11 @@ impl Checkpoint {
         self.records.iter().take(count(self.done))
     }
 
+    /// Whether a record says that the simulation crashed. It is the agent's own word.
+    pub fn names_crash(&self) -> bool {
+        self.records.iter().any(Record::names_crash)
+    }
+
     /// Records whose scores do not follow from their infractions, one sentence each.
     pub fn warnings(&self) -> &[String] {
         &self.warnings

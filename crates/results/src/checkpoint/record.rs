@@ -2,7 +2,7 @@
 //! only, so anyone who holds a record holds numbers and counts.
 
 use crate::json::{Object, Value};
-use crate::names::{self, OFF_ROAD, Score};
+use crate::names::{self, OFF_ROAD, SIMULATION_CRASHED, Score};
 use crate::number::Number;
 use crate::{Format, RecordName, RecordProblem};
 
@@ -56,6 +56,11 @@ pub(crate) struct Record {
 type Problem = (RecordName, RecordProblem);
 
 impl Record {
+    /// Whether its status says that the simulation crashed.
+    pub(crate) fn names_crash(&self) -> bool {
+        self.status.contains(SIMULATION_CRASHED)
+    }
+
     /// `place`: where in the file, from 1.
     pub(crate) fn of(format: Format, place: usize, value: Value) -> Result<Self, Problem> {
         let unnamed = |problem| (RecordName::Place(place), problem);

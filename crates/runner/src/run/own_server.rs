@@ -1,4 +1,5 @@
-//! What only the network shows of a simulator's server, for `run`: whether it is this container's own, and whether it hangs.
+//! What only the network shows of a simulator's server, for `run`: whether it is this container's own, whether its ports are free, and
+//! whether it hangs.
 
 use std::time::{Duration, Instant};
 
@@ -6,34 +7,65 @@ use super::Runner;
 use crate::decide::{Cause, Phase};
 use crate::server::{self, Listener, Question};
 
+/// No client of CARLA has so many connections; a process that opens all it may exhausts the server.
+const MANY_CONNECTIONS: usize = 256;
+
 impl Runner {
     /// Whether it is this container's server that listens. Another container's listener is no readiness.
     pub(super) fn is_own_server(&mut self, port: u16) -> bool {
         let listener = server::listener(port);
-        if listener == Listener::Foreign && !self.is_port_taken {
-            self.is_port_taken = true;
-            self.say(&format!("a process of another container listens on port {port}"));
+        if listener == Listener::Foreign {
+            self.note_taken(port);
         }
         listener == Listener::Own
     }
 
-    /// What only the network shows of the end of a simulator: that its port is taken, or that its server hangs.
+    fn note_taken(&mut self, port: u16) {
+        if self.taken_port.replace(port).is_none() {
+            self.say(&format!("a process of another container has port {port}"));
+        }
+    }
+
+    /// What only the network shows of the end of a simulator, while its server may live.
     pub(super) fn of_the_server(&mut self, cause: Cause) -> Cause {
         let Some((port, answer)) = self.server() else {
             return cause;
         };
         match (self.phase, cause) {
             (Phase::Booting, Cause::ChildEnded | Cause::NotReady) => {
-                self.is_own_server(port);
-                if self.is_port_taken && server::may_agents_run(&self.job.status) {
-                    Cause::PortTaken
-                } else {
-                    cause
+                if let Some(port) = server::foreign_listener(server::ports_of(port)) {
+                    self.note_taken(port);
                 }
+                cause
+            }
+            (Phase::Running, Cause::ChildEnded) => {
+                let connections = server::connections(port);
+                if connections >= MANY_CONNECTIONS {
+                    self.detail = Some(format!("{connections} connections to its port were open"));
+                }
+                cause
             }
             (Phase::Running, Cause::PeerCrashed) if self.is_server_silent(port, answer) => Cause::ServerSilent,
             _ => cause,
         }
+    }
+
+    /// Whether a server failed to start because another container has one of its ports. Asked when its processes have ended: a port that
+    /// cannot be taken then is another container's, however busy the node is.
+    pub(super) fn of_its_ports(&mut self, cause: Cause) -> Cause {
+        let Some((port, _)) = self.server() else { return cause };
+        let has_failed = self.phase == Phase::Booting && matches!(cause, Cause::ChildEnded | Cause::NotReady);
+        if !has_failed || !server::may_agents_run(&self.job.status) {
+            return cause;
+        }
+        if let Some(port) = self.taken_port.or_else(|| server::held(server::ports_of(port))) {
+            self.note_taken(port);
+            self.detail = Some(format!(
+                "another process of the Pod has port {port}, which the server needs"
+            ));
+            return Cause::PortTaken;
+        }
+        cause
     }
 
     /// Whether the server hangs. One that ends while it is asked does not.

@@ -3,6 +3,7 @@
 use std::fmt::Write as _;
 
 use crate::endings::{ENDINGS, Gain};
+use crate::exhaust::LIMITS;
 use crate::objects::OBJECTS;
 use crate::table::SECTIONS;
 
@@ -44,6 +45,16 @@ submission would have got another attempt at the host's cost.
 |---|---|---|---|
 ";
 
+const LIMITS_HEAD: &str = "
+## Limits of the kernel that containers share
+
+The image uses such a limit up for half a minute, while another team's run goes on next to it. The end is that of the other run. These
+tests run alone, since every program of the machine feels them.
+
+| the agent's attempt | user | the end of another team's run | verdict |
+|---|---|---|---|
+";
+
 /// The whole page.
 pub fn text() -> String {
     let mut text = HEAD.to_owned();
@@ -69,6 +80,11 @@ pub fn text() -> String {
         };
         let (attack, user, expected) = (ending.attack, ending.image.user(), ending.expected);
         _ = writeln!(text, "| {attack} | {user} | {expected} | {verdict} |");
+    }
+    text.push_str(LIMITS_HEAD);
+    for limit in LIMITS {
+        let (attack, user, neighbor) = (limit.attack, limit.image.user(), limit.neighbor);
+        _ = writeln!(text, "| {attack} | {user} | {neighbor} | held |");
     }
     text
 }

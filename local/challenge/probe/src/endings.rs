@@ -9,6 +9,10 @@ pub enum Image {
     User,
     /// `challenge/agent:probe-env`: it moves the runner's termination message by a variable of its own.
     Variable,
+    /// `challenge/agent:probe-named`: it names its user.
+    Named,
+    /// `challenge/agent:probe-operator`: the user of the operator's own image.
+    Operator,
 }
 
 impl Image {
@@ -18,6 +22,8 @@ impl Image {
             Self::Root => "probe",
             Self::User => "probe-user",
             Self::Variable => "probe-env",
+            Self::Named => "probe-named",
+            Self::Operator => "probe-operator",
         }
     }
 
@@ -26,6 +32,8 @@ impl Image {
         match self {
             Self::Root => "root",
             Self::User | Self::Variable => "1000",
+            Self::Named => "agent",
+            Self::Operator => "65532",
         }
     }
 }
@@ -59,6 +67,7 @@ pub const VARIABLE: &str = "PROBE_ENDING";
 const CRASHED: &str = "Failed AgentCrashed (participant, charged); 1 Job";
 const INVALID: &str = "Failed InvalidResults (participant, charged); 1 Job";
 const FINISHED: &str = "Finished; 1 Job";
+const IMAGE: &str = "Failed ImageInvalid (participant, charged); 1 Job";
 
 const fn ending(id: &'static str, attack: &'static str, image: Image, expected: &'static str) -> Ending {
     Ending {
@@ -74,8 +83,21 @@ const fn ending(id: &'static str, attack: &'static str, image: Image, expected: 
 /// The agent crashes once, its forged start counts as another crash, and then it is an honest one.
 const TWICE: &str = r#"{"retries": {"perPair": 2}}"#;
 
+/// Both pairs run, and each may come back once.
+const TWO_PAIRS: &str = r#"{"pairs": 2, "retries": {"perPair": 1}}"#;
+const NOT_ROOT: &str = r#"{"agent": {"securityContext": {"runAsNonRoot": true}}}"#;
+
 /// All of them. Those that take longest come first.
 pub const ENDINGS: &[Ending] = &[
+    Ending {
+        change: TWO_PAIRS,
+        ..ending(
+            "port-behind",
+            "take the port behind that of another pair's simulator, as soon as that has crashed with its agent",
+            Image::User,
+            CRASHED,
+        )
+    },
     Ending {
         change: TWICE,
         ..ending(
@@ -174,6 +196,30 @@ pub const ENDINGS: &[Ending] = &[
         Image::Root,
         INVALID,
     ),
+    ending(
+        "named-crash",
+        "drive to the end, and then write into the results that the simulation crashed",
+        Image::User,
+        INVALID,
+    ),
+    Ending {
+        change: NOT_ROOT,
+        ..ending(
+            "root-refused",
+            "run as root where the Leaderboard sets `runAsNonRoot`",
+            Image::Root,
+            IMAGE,
+        )
+    },
+    Ending {
+        change: NOT_ROOT,
+        ..ending(
+            "user-named",
+            "name the user instead of giving its number where the Leaderboard sets `runAsNonRoot`",
+            Image::Named,
+            IMAGE,
+        )
+    },
     ending(
         "survivors",
         "leave processes that outlive the agent and write its last message",

@@ -8,6 +8,7 @@
 mod call;
 pub mod document;
 pub mod endings;
+pub mod exhaust;
 mod files;
 mod folders;
 mod identity;

@@ -4,7 +4,7 @@ use std::convert::Infallible;
 use std::env;
 use std::fs::{self, File, Permissions};
 use std::io::{self, Write as _};
-use std::net::{Ipv4Addr, SocketAddr, TcpStream};
+use std::net::{Ipv4Addr, SocketAddr, TcpListener, TcpStream};
 use std::os::unix::fs::{MetadataExt as _, PermissionsExt as _};
 use std::os::unix::process::CommandExt as _;
 use std::path::Path;
@@ -18,7 +18,7 @@ use nix::sys::stat::Mode;
 use nix::unistd::{Pid, mkfifo, setsid};
 
 use crate::call::{call, of};
-use crate::folders;
+use crate::{exhaust, folders};
 
 /// The honest agent of the image.
 const HONEST: &str = "/usr/bin/challenge-agent";
@@ -36,6 +36,8 @@ const SIMULATOR: u32 = 1000;
 const MARKER: &str = "/tmp/agent/probe-was-here";
 const FIRST_PORT: u16 = 2000;
 const PORT_STEP: u16 = 100;
+/// Where an agent listens that is about to take a port.
+const SIGN: u16 = 7777;
 /// How long whatever outlives the agent goes on, if nobody ends it.
 const LIFE: Duration = Duration::from_mins(1);
 const CRASHES: u32 = 1000;
@@ -54,10 +56,21 @@ pub fn pair() -> u16 {
 
 /// Carries out an ending; returns if the agent is to be an honest one from here on.
 pub fn run(id: &str, arguments: &[String]) -> io::Result<()> {
+    if (id, pair()) == ("port-behind", 2) {
+        return first_life(|| {
+            await_squatter();
+            Ok(())
+        });
+    }
     if pair() != 1 {
         return Ok(());
     }
+    if let Some(done) = exhaust::run(id) {
+        return done;
+    }
     match id {
+        "named-crash" => name_crash(arguments),
+        "port-behind" => squat(),
         "forge-message" => forge("notReady", protect),
         "forge-variable" => forge("notReady", || Ok(())),
         "forge-limit" => forge("notReady", silence),
@@ -108,6 +121,9 @@ pub fn run(id: &str, arguments: &[String]) -> io::Result<()> {
 
 /// What runs in the background, as `--background NAME`.
 pub fn background_work(name: &str) -> io::Result<()> {
+    if let Some(done) = exhaust::background_work(name) {
+        return done;
+    }
     let begun = Instant::now();
     match name {
         "survive" => survive(),
@@ -143,6 +159,59 @@ fn await_simulators_end() {
     let address = SocketAddr::from((Ipv4Addr::LOCALHOST, FIRST_PORT + PORT_STEP * (pair() - 1)));
     let begun = Instant::now();
     while TcpStream::connect(address).is_ok() && begun.elapsed() < LIFE {
+        thread::sleep(Duration::from_millis(20));
+    }
+}
+
+/// Drives as an honest agent does, and then writes into its first record that the simulation crashed.
+fn name_crash(arguments: &[String]) -> io::Result<()> {
+    let driven = Command::new(HONEST).args(arguments).status()?;
+    if !driven.success() {
+        return Err(io::Error::other(format!("the honest agent ended with {driven}")));
+    }
+    let changed = with_a_crash(&fs::read_to_string(CHECKPOINT)?);
+    fs::write(
+        CHECKPOINT,
+        changed.ok_or_else(|| io::Error::other("the checkpoint has no record"))?,
+    )?;
+    exit(0)
+}
+
+/// A whole checkpoint whose first record names a crash; its global record stays.
+fn with_a_crash(checkpoint: &str) -> Option<String> {
+    let records = checkpoint.find("\"records\"")?;
+    let changed = with_value(checkpoint, records, "\"status\"", "Failed - Simulation crashed")?;
+    let entry = changed.find("\"entry_status\"");
+    entry.map_or(Some(changed.clone()), |entry| {
+        with_value(&changed, entry, "\"entry_status\"", "Crashed")
+    })
+}
+
+/// The text with another value of the first such key from there on.
+fn with_value(text: &str, from: usize, key: &str, value: &str) -> Option<String> {
+    let after = from + text.get(from..)?.find(key)? + key.len();
+    let begin = after + text.get(after..)?.find('"')? + 1;
+    let end = begin + text.get(begin..)?.find('"')?;
+    Some(format!("{}{value}{}", text.get(..begin)?, text.get(end..)?))
+}
+
+/// Takes the port behind that of the second pair's simulator once it is free, and keeps it.
+fn squat() -> io::Result<()> {
+    let _sign = TcpListener::bind((Ipv4Addr::LOCALHOST, SIGN))?;
+    let begun = Instant::now();
+    let mut taken = None;
+    while begun.elapsed() < LIFE {
+        // It ends with its container, once the run has come to its end.
+        taken = taken.or_else(|| TcpListener::bind((Ipv4Addr::UNSPECIFIED, FIRST_PORT + PORT_STEP + 1)).ok());
+        thread::sleep(Duration::from_millis(1));
+    }
+    Err(io::Error::other(format!("port taken: {}", taken.is_some())))
+}
+
+/// Until the first pair's agent is about to take the port.
+fn await_squatter() {
+    let begun = Instant::now();
+    while TcpStream::connect((Ipv4Addr::LOCALHOST, SIGN)).is_err() && begun.elapsed() < LIFE {
         thread::sleep(Duration::from_millis(20));
     }
 }
@@ -256,4 +325,21 @@ fn replace(begun: Instant) -> io::Result<()> {
         thread::sleep(Duration::from_millis(100));
     }
     Ok(())
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn a_crash_is_written_into_the_first_record_alone() {
+        let whole = r#"{"_checkpoint": {"global_record": {"status": "Completed"}, "progress": [2, 2],
+            "records": [{"index": 0, "status": "Perfect"}, {"index": 1, "status": "Completed"}]}, "entry_status": "Finished"}"#;
+        let changed = with_a_crash(whole).unwrap();
+        let expected = whole
+            .replace("Perfect", "Failed - Simulation crashed")
+            .replace("Finished", "Crashed");
+        assert_eq!(changed, expected);
+        assert_eq!(with_a_crash("{}"), None);
+    }
 }

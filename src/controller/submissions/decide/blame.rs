@@ -10,10 +10,20 @@ use jiff::Timestamp;
 use super::words;
 use crate::controller::submissions::view::{ContainerView, EndView};
 use leaderboard_api::EndReason;
-use leaderboard_runner::verdict::What;
+use leaderboard_runner::verdict::{CODE_NO_PROCESS, CODE_NODE_REFUSED, What};
 
 /// How long the other side's end of a round is waited for. A runner ends within moments of its peer.
 pub(super) const PEER_SECONDS: i64 = 120;
+
+/// Exit codes of a container that was ended with all others of its Pod, as by a sandbox that is made anew: killed, or lost from sight.
+const FROM_OUTSIDE: [i32; 2] = [137, 255];
+/// The kubelet's and the runtime's words where a container cannot be started for want of processes. A Pod has a number of them, and its
+/// agents can use it up.
+const OF_PROCESSES: [&str; 3] = [
+    "resource temporarily unavailable",
+    "connection reset by peer",
+    "failed to create new os thread",
+];
 
 /// The last crash of a pair.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
@@ -31,29 +41,74 @@ pub(super) fn last_crash(
     agent: Option<&ContainerView>,
     now: Timestamp,
 ) -> Option<Crash> {
+    if let Some(crash) = from_outside(simulator, agent) {
+        return Some(crash);
+    }
     let agent = agent.and_then(|container| {
         let end = container.last.as_ref()?;
-        (is_crash(end) || is_false_claim(simulator, container, end)).then_some(end)
+        let is_its = is_crash(end) || is_false_claim(simulator, container, end);
+        is_its.then(|| (end, crash(of_agent(container, end), end)))
     });
-    let own_end = simulator.and_then(|container| container.last.as_ref());
+    let own_end = simulator.and_then(|container| {
+        let end = container.last.as_ref()?;
+        (!lacked_processes(container, end)).then_some(end)
+    });
     // A simulator that was ended from outside explains its own round, and nothing else.
     let explains = |end: &&EndView| match what(end) {
         Some(What::Cancelled) => false,
-        Some(What::Stopped) => agent.is_some_and(|agent| order(simulator, end, agent) == Order::SameRound),
+        Some(What::Stopped) => agent.is_some_and(|(agent, _)| order(simulator, end, agent) == Order::SameRound),
         Some(What::Finished) => true,
         _ => end.exit_code != 0,
     };
     match (own_end.filter(explains), agent) {
         (None, None) => None,
         (Some(end), None) if what(end) == Some(What::Finished) => None,
-        (Some(end), None) => Some(of_simulator_alone(end, now)),
-        (None, Some(agent)) => Some(of_agent_alone(simulator, agent, now)),
-        (Some(end), Some(agent)) => Some(match order(simulator, end, agent) {
-            Order::SameRound => of_both(end, agent),
-            Order::AgentIsLater => of_agent_alone(simulator, agent, now),
-            Order::SimulatorIsLater => of_simulator_alone(end, now),
+        (Some(end), None) => Some(of_simulator_alone(simulator, end, now)),
+        (None, Some((_, blamed))) => Some(of_agent_alone(simulator, blamed, now)),
+        (Some(end), Some((agent, blamed))) => Some(match order(simulator, end, agent) {
+            Order::SameRound => of_both(simulator, end, blamed),
+            Order::AgentIsLater => of_agent_alone(simulator, blamed, now),
+            Order::SimulatorIsLater => of_simulator_alone(simulator, end, now),
         }),
     }
+}
+
+/// Both sides were ended in one round, and by nobody of the Pod: its sandbox was made anew, or its node started again. An agent can end
+/// itself in whatever way, but not its simulator so.
+fn from_outside(simulator: Option<&ContainerView>, agent: Option<&ContainerView>) -> Option<Crash> {
+    fn ended(container: &ContainerView) -> Option<&EndView> {
+        let end = container.last.as_ref()?;
+        let goes_on = container.running || container.waiting.is_some();
+        let is_it = match what(end) {
+            // In a Pod that is being ended both are asked to end, and neither comes back.
+            Some(What::Stopped) => goes_on,
+            None | Some(What::SilentDeath) => FROM_OUTSIDE.contains(&end.exit_code) && end.reason != "OOMKilled",
+            _ => false,
+        };
+        (is_it && !end.is_start_error()).then_some(end)
+    }
+    let (own, agent) = (ended(simulator?)?, ended(agent?)?);
+    (by_times_and_rounds(own, agent) == Order::SameRound).then(|| crash(EndReason::EndedFromOutside, own))
+}
+
+/// Whether the kubelet could not start a simulator again that has run in this Pod, for want of processes. That is no failure of its own:
+/// it is waited for, and an agent that ends meanwhile is the cause.
+pub(super) fn lacked_processes(container: &ContainerView, end: &EndView) -> bool {
+    !is_of_first_life(container) && is_start_without_process(end)
+}
+
+fn is_start_without_process(end: &EndView) -> bool {
+    end.is_start_error() && end.why.as_deref().is_some_and(is_of_processes)
+}
+
+fn is_of_processes(words: &str) -> bool {
+    let words = words.to_lowercase();
+    OF_PROCESSES.iter().any(|sign| words.contains(sign))
+}
+
+/// Whether the last end of a container is that of its first life. The kubelet counts, so no agent changes it.
+fn is_of_first_life(container: &ContainerView) -> bool {
+    container.restarts <= i32::from(container.running)
 }
 
 /// Whether an end was a crash, and not one that was asked for.
@@ -77,6 +132,19 @@ fn is_false_claim(simulator: Option<&ContainerView>, agent: &ContainerView, end:
     }
 }
 
+/// Whether a crash was a failure of the simulator itself, which it was not if its Pod was being ended.
+pub(super) fn is_simulators_own(simulator: Option<&ContainerView>, crash: &Crash) -> bool {
+    let was_ended = simulator.and_then(|container| what(container.last.as_ref()?)) == Some(What::Stopped);
+    let is_its = matches!(
+        crash.cause,
+        EndReason::SimulatorCrashed
+            | EndReason::SimulatorNotReady
+            | EndReason::SimulatorSilent
+            | EndReason::SimulatorNotStarted
+    );
+    is_its && !was_ended
+}
+
 fn what(end: &EndView) -> Option<What> {
     end.verdict.as_ref().map(|verdict| verdict.what)
 }
@@ -90,11 +158,17 @@ enum Order {
 }
 
 fn order(simulator: Option<&ContainerView>, end: &EndView, agent: &EndView) -> Order {
-    // By the kubelet's times, whatever round the agent claims: a life that began after an end is of a later round.
-    let began_after = agent.began.zip(end.at).is_some_and(|(began, at)| began > at);
     // A runner writes a verdict as soon as it begins, so this life never began, and the one that runs now is another.
     let is_replaced = end.verdict.is_none() && simulator.is_some_and(|container| container.running);
-    if began_after || is_replaced {
+    if is_replaced {
+        return Order::AgentIsLater;
+    }
+    by_times_and_rounds(end, agent)
+}
+
+fn by_times_and_rounds(end: &EndView, agent: &EndView) -> Order {
+    // By the kubelet's times, whatever round the agent claims: a life that began after an end is of a later round.
+    if agent.began.zip(end.at).is_some_and(|(began, at)| began > at) {
         return Order::AgentIsLater;
     }
     let round = |end: &EndView| end.verdict.as_ref().and_then(|verdict| verdict.round);
@@ -106,44 +180,47 @@ fn order(simulator: Option<&ContainerView>, end: &EndView, agent: &EndView) -> O
     }
 }
 
-fn of_both(simulator: &EndView, agent: &EndView) -> Crash {
-    match what(simulator) {
-        Some(What::PeerCrashed | What::Finished) => crash(of_agent(agent), agent),
-        _ => crash(of_simulator(simulator), simulator),
+fn of_both(simulator: Option<&ContainerView>, end: &EndView, blamed: Crash) -> Crash {
+    match what(end) {
+        Some(What::PeerCrashed | What::Finished) => blamed,
+        _ => crash(of_simulator(simulator, end), end),
     }
 }
 
-fn of_simulator_alone(end: &EndView, now: Timestamp) -> Crash {
+fn of_simulator_alone(simulator: Option<&ContainerView>, end: &EndView, now: Timestamp) -> Crash {
     match what(end) {
         Some(What::PeerCrashed) => Crash {
-            is_settled: !is_awaited(end, now),
+            is_settled: !is_awaited(end.at, now),
             ..crash(EndReason::Unseen, end)
         },
-        _ => crash(of_simulator(end), end),
+        _ => crash(of_simulator(simulator, end), end),
     }
 }
 
-fn of_agent_alone(simulator: Option<&ContainerView>, agent: &EndView, now: Timestamp) -> Crash {
+fn of_agent_alone(simulator: Option<&ContainerView>, blamed: Crash, now: Timestamp) -> Crash {
     if simulator.is_none_or(cannot_be_started) {
-        return crash(EndReason::SimulatorNotStarted, agent);
+        return Crash {
+            cause: EndReason::SimulatorNotStarted,
+            ..blamed
+        };
     }
     Crash {
-        is_settled: !is_awaited(agent, now),
-        ..crash(of_agent(agent), agent)
+        is_settled: !is_awaited(blamed.at, now),
+        ..blamed
     }
 }
 
-/// Whether the kubelet cannot start it. The pause after a crash is none: its last end counts then.
+/// Whether the kubelet cannot start it. The pause after a crash is none: its last end counts then. One that has run is not kept away by
+/// its own fault where the Pod lacks processes.
 fn cannot_be_started(simulator: &ContainerView) -> bool {
-    let is_refused = |(reason, _): &(String, String)| reason != "CrashLoopBackOff";
+    let is_refused = |(reason, words): &(String, String)| reason != "CrashLoopBackOff" && !is_of_processes(words);
     let never_ran = simulator.last.is_none() && simulator.restarts == 0;
     !simulator.running && (never_ran || simulator.waiting.as_ref().is_some_and(is_refused))
 }
 
 /// Whether the other side's end may still be seen. A clock that was set back does not prolong this.
-fn is_awaited(end: &EndView, now: Timestamp) -> bool {
-    end.at
-        .is_some_and(|at| now.duration_since(at).as_secs().abs() < PEER_SECONDS)
+fn is_awaited(at: Option<Timestamp>, now: Timestamp) -> bool {
+    at.is_some_and(|at| now.duration_since(at).as_secs().abs() < PEER_SECONDS)
 }
 
 fn crash(cause: EndReason, end: &EndView) -> Crash {
@@ -155,8 +232,11 @@ fn crash(cause: EndReason, end: &EndView) -> Crash {
     }
 }
 
-fn of_simulator(end: &EndView) -> EndReason {
+fn of_simulator(simulator: Option<&ContainerView>, end: &EndView) -> EndReason {
+    let is_first = simulator.is_none_or(is_of_first_life);
     match what(end) {
+        // The agents can use up the Pod's processes once they run.
+        Some(What::NoProcess) if !is_first => EndReason::NoProcess,
         Some(What::NotReady) => EndReason::SimulatorNotReady,
         Some(What::ServerSilent) => EndReason::SimulatorSilent,
         Some(What::PortTaken) => EndReason::PortTaken,
@@ -167,8 +247,17 @@ fn of_simulator(end: &EndView) -> EndReason {
     }
 }
 
-/// The agent's own end. All of it is the agent's fault, but for the kubelet's words of a node that cannot start it.
-fn of_agent(end: &EndView) -> EndReason {
+/// What the agent's own end shows; all of it is the agent's fault, but what its node refused its runner before the agent's command ran. The
+/// exit code is the runner's, which no process of the agent has. Processes alone the other agents of the Pod can use up, once they run.
+fn of_agent(container: &ContainerView, end: &EndView) -> EndReason {
+    let is_first = is_of_first_life(container);
+    match end.exit_code {
+        CODE_NODE_REFUSED => return EndReason::NodeCannotStart,
+        CODE_NO_PROCESS if is_first => return EndReason::NodeCannotStart,
+        CODE_NO_PROCESS => return EndReason::NoProcess,
+        _ if !is_first && is_start_without_process(end) => return EndReason::NoProcess,
+        _ => {}
+    }
     let exit_code = end.verdict.as_ref().and_then(|verdict| verdict.exit_code);
     match what(end) {
         Some(

@@ -2,55 +2,87 @@
 //!
 //! Called by `live`, `failure` and `end`. Whose fault a crash was is decided by `blame`.
 
+use std::collections::BTreeSet;
+
 use jiff::Timestamp;
 use k8s_openapi::apimachinery::pkg::apis::meta::v1::Time;
-use leaderboard_runner::protocol::{Member, Pair};
+use leaderboard_runner::protocol::{Member, Pair, Side};
 
 use super::blame::{self, Crash};
 use super::failure::{infrastructure, participant};
 use super::next_steps::{Steps, for_both, in_the_log_of, of_participant, smaller};
 use super::plan_builder::{PlanBuilder, after};
-use crate::controller::submissions::report_digest::ReportDigest;
+use crate::controller::submissions::report_digest::{ReportDigest, clamp};
 use crate::controller::submissions::view::{ContainerView, PodView};
 use leaderboard_api::{EndReason, Failure, LastEnd, PairState, PairStatus, SubmissionStatus, reasons};
 
 /// Counts the crashes of each pair and remembers the last one: its Pod may be gone when the cause is looked for.
 pub(super) fn note(status: &mut SubmissionStatus, pod: &PodView, now: Timestamp) {
-    for container in &pod.containers {
-        let Some(id) = pair_of(&container.name) else {
-            continue;
-        };
-        let crashes = count(container);
-        if crashes > 0 {
+    let ids: BTreeSet<i32> = pod.containers.iter().filter_map(|c| pair_of(&c.name)).collect();
+    for id in ids {
+        let its = pod.containers.iter().filter(|c| pair_of(&c.name) == Some(id));
+        let counted = its.map(count).max().unwrap_or(0);
+        let crash = last_crash(pod, id, now);
+        if counted > 0 || crash.is_some() {
+            let simulator = pair_with(id).and_then(|pair| container(pod, pair.simulator()));
             let pair = pair_entry(status, id);
-            pair.crashes = pair.crashes.max(crashes);
-        }
-    }
-    for pair in &mut status.pairs {
-        if let Some(crash) = last_crash(pod, pair.id, now) {
-            pair.last = Some(Box::new(LastEnd {
-                reason: crash.cause,
-                exit_code: Some(crash.exit_code),
-                time: crash.at.map(Time),
-            }));
+            pair.simulator_failed |= crash.is_some_and(|crash| blame::is_simulators_own(simulator, &crash));
+            take(pair, counted, crash);
         }
     }
 }
 
-/// Ends of a container that were crashes. One that has ended counts at once, not only when it is started again.
+/// Takes in what was seen of a pair: how often its containers ended, by whatever, and the last crash.
+fn take(pair: &mut PairStatus, counted: i32, crash: Option<Crash>) {
+    if let Some(crash) = crash {
+        let last = LastEnd {
+            reason: crash.cause,
+            exit_code: Some(crash.exit_code),
+            time: crash.at.map(Time),
+        };
+        // The same end is seen in each reconcile. One side's may have been counted as a crash before the other's was seen.
+        if crash.cause == EndReason::EndedFromOutside && pair.last.as_deref() != Some(&last) {
+            pair.ended_from_outside = pair.ended_from_outside.saturating_add(1);
+            pair.crashes = pair.crashes.saturating_sub(1).max(0);
+        }
+        pair.last = Some(Box::new(last));
+    }
+    pair.crashes = pair.crashes.max(counted.saturating_sub(pair.ended_from_outside));
+}
+
+/// Ends of a container that were crashes. One that has ended counts at once, not only when it is started again. The kubelet also counts
+/// how often it could not start a simulator, whose runner knows its rounds.
 fn count(container: &ContainerView) -> i32 {
-    let end = container.last.as_ref().filter(|_| !container.running);
-    let is_new = end.is_some_and(blame::is_crash);
-    container.restarts.saturating_add(i32::from(is_new))
+    let Some(last) = container.last.as_ref() else {
+        return container.restarts;
+    };
+    let is_simulator = Member::parse(&container.name).is_some_and(|member| member.side == Side::Simulator);
+    if is_simulator && blame::lacked_processes(container, last) {
+        return 0;
+    }
+    let is_crash = blame::is_crash(last);
+    let ends = container
+        .restarts
+        .saturating_add(i32::from(is_crash && !container.running));
+    let round = last.verdict.as_ref().and_then(|verdict| verdict.round);
+    match round.filter(|_| is_simulator) {
+        Some(round) => ends.min(clamp(round).saturating_add(i32::from(is_crash))),
+        None => ends,
+    }
 }
 
 fn last_crash(pod: &PodView, id: i32, now: Timestamp) -> Option<Crash> {
-    let pair = u16::try_from(id).ok().and_then(Pair::new)?;
-    let container = |member: Member| {
-        let name = member.to_string();
-        pod.containers.iter().find(|container| container.name == name)
-    };
-    blame::last_crash(container(pair.simulator()), container(pair.agent()), now)
+    let pair = pair_with(id)?;
+    blame::last_crash(container(pod, pair.simulator()), container(pod, pair.agent()), now)
+}
+
+fn pair_with(id: i32) -> Option<Pair> {
+    u16::try_from(id).ok().and_then(Pair::new)
+}
+
+fn container(pod: &PodView, member: Member) -> Option<&ContainerView> {
+    let name = member.to_string();
+    pod.containers.iter().find(|container| container.name == name)
 }
 
 fn pair_of(container: &str) -> Option<i32> {
@@ -68,6 +100,8 @@ fn pair_entry(status: &mut SubmissionStatus, id: i32) -> &mut PairStatus {
         crashes: 0,
         state: PairState::Waiting,
         last: None,
+        ended_from_outside: 0,
+        simulator_failed: false,
     };
     let at = status.pairs.partition_point(|p| p.id < id);
     status.pairs.insert(at, fresh);
@@ -153,7 +187,7 @@ fn of_pair(pair: &PairStatus, cause: EndReason, node: Option<&str>) -> Failure {
     }
 }
 
-/// The node lacked something: to draw, or to start an agent.
+/// What the node lacked: to draw, or to start an agent.
 fn of_node(id: i32, times: &str, cause: EndReason, node: Option<&str>) -> Option<(&'static str, String)> {
     let node = node.map_or_else(|| "the node".to_owned(), |node| format!("node {node}"));
     match cause {
@@ -176,6 +210,10 @@ fn of_node(id: i32, times: &str, cause: EndReason, node: Option<&str>) -> Option
             format!(
                 "The container of agent {id} could not be started {times} on {node}; nothing of its image is the cause."
             ),
+        )),
+        EndReason::EndedFromOutside => Some((
+            reasons::JOB_FAILED,
+            format!("The containers of pair {id} were ended from outside the Pod on {node}."),
         )),
         _ => None,
     }
@@ -216,6 +254,11 @@ fn of_agent(id: i32, times: &str, cause: EndReason) -> (&'static str, String, St
             reasons::CANNOT_START,
             format!("Agent {id} could not be started: its command is missing in the image or not for this machine."),
             for_both(&of_participant(reasons::CANNOT_START)),
+        ),
+        EndReason::NoProcess => (
+            reasons::AGENT_CRASHED,
+            format!("Pair {id} failed {times}: the agents left the Pod no process to start it again."),
+            for_both("Let the agents start fewer processes and threads, and submit again."),
         ),
         EndReason::BlamesSimulator => (
             reasons::AGENT_CRASHED,

@@ -148,7 +148,7 @@ fn cause(draft: &PlanBuilder<'_>, report: Option<&ReportDigest>, job_end: Option
         return failure::invalid_results(why);
     }
     if let Some(report) = verdict {
-        return failure::not_eligible(&report.entry_status);
+        return failure::not_eligible(report, &draft.status.pairs);
     }
     match job_end {
         Some(end) => of_job(draft, end),
@@ -228,6 +228,7 @@ fn retry(draft: &mut PlanBuilder<'_>, found: &Failure) {
     draft.status.times.stopping = None;
     for pair in &mut draft.status.pairs {
         pair.crashes = 0;
+        pair.ended_from_outside = 0;
         pair.last = None;
     }
     let what = &found.message;

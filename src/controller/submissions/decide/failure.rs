@@ -4,10 +4,11 @@
 //! pairs are in `crashes`.
 
 use super::next_steps::{Steps, for_both, infrastructure_for_participants, of_infrastructure, of_participant};
+use crate::controller::submissions::report_digest::{ReportDigest, clamp};
 use crate::controller::submissions::view::ObservedNode;
 use crate::pod::run::Stop;
 use leaderboard_api::text::sentence;
-use leaderboard_api::{Failure, FailureClass, reasons};
+use leaderboard_api::{Failure, FailureClass, PairStatus, reasons};
 
 /// A failure that is the participant's: `what` happened, in one sentence, and what each reader does about it.
 pub(super) fn participant(reason: &str, what: &str, next: &Steps) -> Failure {
@@ -118,15 +119,36 @@ fn pair_named(why: &str) -> Option<i32> {
 }
 
 /// Results that are complete but do not count.
-pub(super) fn not_eligible(entry_status: &str) -> Failure {
-    if entry_status == "Crashed" {
-        return infrastructure(
+pub(super) fn not_eligible(report: &ReportDigest, pairs: &[PairStatus]) -> Failure {
+    if report.entry_status == "Crashed" {
+        return named_crash(report, pairs);
+    }
+    let what = format!("The run ended as {}, so its results do not count.", report.entry_status);
+    charged(reasons::NOT_ELIGIBLE, &what)
+}
+
+/// Results that name a crash of the simulation. The agent writes them, and knows its score by then, so a crash that no simulator had is
+/// its own. Evaluators repeat the route of a crash; one that does not keeps its record over the Jobs of an attempt.
+fn named_crash(report: &ReportDigest, pairs: &[PairStatus]) -> Failure {
+    let named = report.pairs.iter().filter(|pair| pair.names_crash);
+    let mut named = named.map(|pair| clamp(pair.id));
+    let first = named.clone().next();
+    let has_failed = |id: i32| pairs.iter().any(|pair| pair.id == id && pair.simulator_failed);
+    if let Some(id) = named.find(|id| !has_failed(*id)) {
+        let what = format!("The results of pair {id} name a crash of the simulation that its simulator did not have.");
+        return Failure {
+            pair: Some(id),
+            ..charged(reasons::INVALID_RESULTS, &what)
+        };
+    }
+    // One of an older operator's Pod names no pair.
+    Failure {
+        pair: first,
+        ..infrastructure(
             reasons::SIMULATION_CRASHED,
             "The simulation crashed during a route, so the results do not count.",
-        );
+        )
     }
-    let what = format!("The run ended as {entry_status}, so its results do not count.");
-    charged(reasons::NOT_ELIGIBLE, &what)
 }
 
 /// The stop that a failure calls for.

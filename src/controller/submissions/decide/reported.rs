@@ -20,7 +20,9 @@ pub(super) fn take(draft: &mut PlanBuilder<'_>, report: &ReportDigest) {
         .iter()
         .map(|pair| {
             let known = old.iter().find(|p| p.id == clamp(pair.id));
-            let told = if is_present { clamp(pair.crashes) } else { 0 };
+            // The runners' rounds count what ended them from outside, too.
+            let outside = known.map_or(0, |k| k.ended_from_outside);
+            let told = if is_present { clamp(pair.crashes) - outside } else { 0 };
             PairStatus {
                 id: clamp(pair.id),
                 done: clamp(pair.done),
@@ -28,6 +30,8 @@ pub(super) fn take(draft: &mut PlanBuilder<'_>, report: &ReportDigest) {
                 crashes: told.max(known.map_or(0, |k| k.crashes)),
                 state: pair.state,
                 last: known.and_then(|k| k.last.clone()),
+                ended_from_outside: outside,
+                simulator_failed: known.is_some_and(|k| k.simulator_failed),
             }
         })
         .collect();

@@ -157,6 +157,8 @@ mod tests {
             crashes: 1,
             state: PairState::Crashed,
             last: None,
+            ended_from_outside: 0,
+            simulator_failed: false,
         };
         let status = SubmissionStatus {
             pairs: vec![crashed],

@@ -427,6 +427,7 @@ pub fn report(done: u32) -> Report {
         total: 2,
         crashes: 0,
         state: PairState::Running,
+        names_crash: false,
     };
     Report {
         schema: 1,

@@ -153,7 +153,6 @@ fn each_end_without_that_has_its_class_and_reason() {
         assert_eq!((failure.class, failure.charged), (Participant, true), "{reason}");
     }
     for (report, reason) in [
-        (Some(ineligible("Crashed")), reasons::SIMULATION_CRASHED),
         (Some(refused(false)), reasons::RESULTS_NOT_STORED),
         // Routes are missing.
         (Some(report(3)), reasons::RESULTS_NOT_STORED),
@@ -162,6 +161,109 @@ fn each_end_without_that_has_its_class_and_reason() {
         let failure = completes_with(report, reason);
         assert_eq!((failure.class, failure.charged), (Infrastructure, false), "{reason}");
     }
+}
+
+/// The final report of a run whose pair 2 names a crash of the simulation in its results.
+fn names_a_crash() -> Report {
+    let mut told = Report {
+        eligible: false,
+        entry_status: "Crashed".into(),
+        ..final_report()
+    };
+    told.pairs[1].names_crash = true;
+    told
+}
+
+#[test]
+fn results_that_name_a_crash_that_no_simulator_had_are_the_participants() {
+    let failure = completes_with(Some(names_a_crash()), reasons::INVALID_RESULTS);
+    assert_eq!((failure.class, failure.pair), (Participant, Some(2)));
+    assert!(failure.charged);
+    assert_eq!(
+        failure.message,
+        "The results of pair 2 name a crash of the simulation that its simulator did not have. Check what the agent writes into its \
+         checkpoint, and submit again."
+    );
+    // Neither another pair's simulator, nor an agent that crashed, nor the end of a Pod is a witness.
+    for ends in [
+        vec![ended("simulator-1", 0, "exited", 1, 100)],
+        vec![ended("agent-2", 0, "exited", 1, 100)],
+        vec![
+            ended("simulator-2", 0, "stopped", 143, 100),
+            ended("agent-2", 0, "silentDeath", 137, 100),
+        ],
+    ] {
+        let mut world = World::local().running();
+        for end in ends {
+            world.see(end);
+        }
+        world.pass();
+        world.complete();
+        world.report(names_a_crash());
+        let failure = world.pass_to(Failed, reasons::INVALID_RESULTS).status.failure.unwrap();
+        assert!(failure.charged, "{failure:?}");
+    }
+}
+
+#[test]
+fn results_that_name_a_crash_that_the_simulator_had_are_nobodys_fault() {
+    for what in ["exited", "killed", "silentDeath", "notReady", "serverSilent"] {
+        let mut world = World::local().running();
+        world.leaderboard().retries.infrastructure = 0;
+        world.see(ended("simulator-2", 0, what, 1, 100));
+        world.pass();
+        // What it ended with later, and that another Pod of the Job has none of it, takes nothing back.
+        world.see_alone(ended("simulator-2", 1, "peerCrashed", 1, 200));
+        world.see_alone(ended("agent-2", 1, "exited", 1, 200));
+        world.pass();
+        world.view.pod = Some(pod(210));
+        world.see_agents();
+        world.pass();
+        world.complete();
+        world.report(names_a_crash());
+        let failure = world
+            .pass_to(Failed, reasons::SIMULATION_CRASHED)
+            .status
+            .failure
+            .unwrap();
+        assert_eq!(
+            (failure.class, failure.charged, failure.pair),
+            (Infrastructure, false, Some(2)),
+            "{what}"
+        );
+    }
+}
+
+#[test]
+fn a_crash_of_an_earlier_job_whose_record_is_kept_is_nobodys_fault() {
+    let mut world = World::local().running();
+    world.leaderboard().retries.infrastructure = 1;
+    world.see_alone(ended("simulator-2", 3, "exited", 1, 100));
+    world.pass_to(Running, reasons::STOPPING);
+    world.gets_another_job();
+    world.view.pod = Some(pod(200));
+    world.see_agents();
+    world.view.report = ObservedReport::NotRead;
+    world.pass_to(Running, reasons::RUNNING);
+    world.complete();
+    world.report(names_a_crash());
+    let failure = world
+        .pass_to(Failed, reasons::SIMULATION_CRASHED)
+        .status
+        .failure
+        .unwrap();
+    assert!(!failure.charged, "{failure:?}");
+}
+
+#[test]
+fn an_older_pod_that_names_no_pair_of_a_crash_is_believed() {
+    let told = Report {
+        eligible: false,
+        entry_status: "Crashed".into(),
+        ..final_report()
+    };
+    let failure = completes_with(Some(told), reasons::SIMULATION_CRASHED);
+    assert_eq!((failure.class, failure.charged), (Infrastructure, false));
 }
 
 #[test]

@@ -21,6 +21,7 @@ mod isolation;
 mod line;
 mod log;
 mod nodes;
+mod not_crashes;
 mod observe;
 mod phases;
 mod properties;
