@@ -12,7 +12,7 @@ const IDS: [&str; 3] = ["challenge_pk", "phase_pk", "submission_pk"];
 /// Longest id that is kept, in bytes.
 const LONGEST_ID: usize = 20;
 
-/// What is sent.
+/// A copy as it is sent.
 #[derive(Clone, Debug, PartialEq, Eq)]
 pub(super) struct DeadLetter {
     pub body: String,

@@ -284,7 +284,7 @@ mod tests {
     use crate::lock::lock;
     use crate::services::aws::Aws;
 
-    /// What a queue was sent, and how many of the next ones it finds too large.
+    /// The messages that a queue was sent, and how many of the next ones it finds too large.
     type Sent = Arc<Mutex<(VecDeque<Value>, usize)>>;
 
     async fn answer(State(sent): State<Sent>, body: Bytes) -> (StatusCode, &'static str) {

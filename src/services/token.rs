@@ -202,7 +202,7 @@ impl Token {
         format!("token-{:016x}", u64::from_be_bytes(start))
     }
 
-    /// Whose requests EvalAI counts it with, as far as the token itself claims: only EvalAI can verify that, so nothing but a budget may
+    /// The user with whose requests EvalAI counts it, as the token itself claims: only EvalAI can verify that, so nothing but a budget may
     /// depend on it. One that names no user is counted alone.
     pub fn claimed_user(&self) -> String {
         self.user

@@ -149,7 +149,7 @@ fn serve(uses: Uses<'_>, view: &LeaderboardView, plan: &LeaderboardPlan, known: 
     }
 }
 
-/// Whether EvalAI refuses the token that is used now.
+/// True while EvalAI refuses the token that is used now.
 fn is_refused(uses: Uses<'_>, leaderboard: &Leaderboard) -> bool {
     uses.external.hub.token_refused(&key_of(leaderboard)).is_some()
 }

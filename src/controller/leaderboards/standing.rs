@@ -69,7 +69,7 @@ pub(super) fn standing(
     }
 }
 
-/// That EvalAI does not answer. A run needs it only to start and to be published, so that its Leaderboard stays ready.
+/// Says that EvalAI does not answer. A run needs it only to start and to be published, so that its Leaderboard stays ready.
 fn silent(since: Timestamp, why: &str) -> String {
     format!(
         "EvalAI has not answered since {}: {} Runs go on, and what EvalAI is to get waits until it answers; new submissions start then.",
@@ -78,7 +78,7 @@ fn silent(since: Timestamp, why: &str) -> String {
     )
 }
 
-/// What is worth saying although results can be published: a server that is away, columns that stay empty, and a token that ends soon.
+/// Notes that are worth a line although results can be published: a server that is away, columns that stay empty, and a token that ends soon.
 fn note(silence: Option<String>, labels: &Labels, of_token: Option<String>) -> Option<String> {
     let of_labels = labels.problems.iter().map(|problem| capitalized(&problem.to_string()));
     let notes: Vec<String> = silence.into_iter().chain(of_labels).chain(of_token).collect();

@@ -85,7 +85,7 @@ struct State {
     purses: BTreeMap<Payer, Weak<Purse>>,
 }
 
-/// What one queue is for. The token is named by its digest: the user that it claims could be anybody's.
+/// Names one queue. The token is named by its digest: the user that it claims could be anybody's.
 #[derive(Clone, Debug, PartialEq, Eq, PartialOrd, Ord)]
 struct Account {
     server: String,
@@ -93,7 +93,7 @@ struct Account {
     token: [u8; 32],
 }
 
-/// Whose requests share a budget. A claimed user counts within a namespace alone, so that no namespace slows another.
+/// Names a budget. A claimed user counts within a namespace alone, so that no namespace slows another.
 #[derive(Clone, Debug, PartialEq, Eq, PartialOrd, Ord)]
 struct Payer {
     server: String,

@@ -25,7 +25,7 @@ const TOGETHER_SECONDS: i64 = 10;
 const RERUN_SECONDS: i64 = 60;
 /// What EvalAI calls a row that was cancelled.
 const CANCELLED: &str = "cancelled";
-/// What EvalAI calls a row with a result.
+/// EvalAI's word for a row with a result.
 const FINISHED: &str = "finished";
 /// Why an attempt does not begin.
 const NO_MESSAGE: &str = "no queue message announced it, and participants can edit the status there. Raise spec.attempt if it is to \

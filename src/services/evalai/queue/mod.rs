@@ -75,7 +75,7 @@ pub struct Timing {
     /// A submission that EvalAI does not have is asked for again after so long, before that counts: one answer may be of a server that is just
     /// being replaced, and would end a run.
     pub missing: Duration,
-    /// The same as `fresh` for `running`, and the read is made again once only.
+    /// Like `fresh`, for `running` alone; the read is made again once only.
     pub fresh_running: Duration,
 }
 

@@ -28,7 +28,7 @@ struct Inner {
     last: u64,
 }
 
-/// What a queue needs of the budget.
+/// A share as the other queues see it.
 #[derive(Debug)]
 struct Claim {
     /// Requests a minute; the smallest of all shares holds.
@@ -39,7 +39,7 @@ struct Claim {
     waits: Option<(Rank, u32)>,
 }
 
-/// What one queue draws with.
+/// The hand of one queue in the purse.
 #[derive(Debug)]
 pub struct Share {
     purse: Arc<Purse>,

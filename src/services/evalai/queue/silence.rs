@@ -22,7 +22,7 @@ pub(super) struct Silent {
 }
 
 impl Queue {
-    /// What every answer shows about the server.
+    /// Notes what each answer shows about the server.
     pub(super) fn note_silence(&mut self, answer: &Answer<()>, now: &Now) {
         let why = match answer {
             Answer::Unanswered(silence) => &silence.why,

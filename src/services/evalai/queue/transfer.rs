@@ -10,7 +10,7 @@ use super::sub::Sub;
 use super::{Busy, Now, Queue};
 use crate::services::evalai::types::Key;
 
-/// What leaves a queue with an object.
+/// All that leaves a queue with an object.
 #[derive(Debug)]
 pub struct Leaving {
     subs: Vec<Moved>,

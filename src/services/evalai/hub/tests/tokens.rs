@@ -1,4 +1,4 @@
-//! Which token a request carries, and whose budget it draws on.
+//! The token that a request carries, and the budget that it draws on.
 
 use std::collections::BTreeSet;
 
