@@ -250,7 +250,7 @@ async fn a_real_prometheus_reads_each_metric_and_evaluates_each_alert_and_each_p
     prometheus
         .until("count(leaderboard_submission_phase_duration_seconds_count)", "10")
         .await;
-    prometheus.until("count(leaderboard_sqs_messages_total)", "10").await;
+    prometheus.until("count(leaderboard_sqs_messages_total)", "11").await;
     live(&world, &queue).await;
     for (query, value) in SEEN {
         prometheus.until(query, value).await;

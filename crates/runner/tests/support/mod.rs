@@ -9,6 +9,7 @@ use std::net::TcpListener;
 use std::os::fd::AsFd;
 use std::path::{Path, PathBuf};
 use std::process::{Child, Command, ExitStatus, Stdio};
+use std::sync::atomic::{AtomicU32, Ordering};
 use std::sync::mpsc::{Receiver, channel};
 use std::time::{Duration, Instant};
 
@@ -67,6 +68,24 @@ pub const fn member(side: Side) -> Member {
 pub const SIMULATOR: Member = member(Side::Simulator);
 pub const AGENT: Member = member(Side::Agent);
 
+/// Below what the kernel gives away by itself: a Pod has its ports to itself, and here other programs connect.
+const PORTS: std::ops::Range<u16> = 20_000..32_000;
+/// A server has ports behind its own.
+const PORT_STEP: u16 = 10;
+
+/// The first of some ports that no other program has, and no other test of this one.
+fn free_ports() -> u16 {
+    static TAKEN: AtomicU32 = AtomicU32::new(0);
+    let all: Vec<u16> = PORTS.step_by(PORT_STEP.into()).collect();
+    loop {
+        let number = std::process::id().wrapping_add(TAKEN.fetch_add(1, Ordering::Relaxed));
+        let first = all[number as usize % all.len()];
+        if (first..first + PORT_STEP).all(|port| TcpListener::bind(("127.0.0.1", port)).is_ok()) {
+            return first;
+        }
+    }
+}
+
 impl Pod {
     pub fn new() -> Self {
         let folder = tempfile::tempdir().unwrap();
@@ -74,14 +93,9 @@ impl Pod {
             fs::create_dir(folder.path().join(name)).unwrap();
         }
         fs::write(folder.path().join("server.py"), SERVER).unwrap();
-        let port = TcpListener::bind(("127.0.0.1", 0))
-            .unwrap()
-            .local_addr()
-            .unwrap()
-            .port();
         Self {
             folder,
-            port,
+            port: free_ports(),
             environment: Vec::new(),
             options: vec!["--grace-seconds=2".to_owned()],
             starter: Vec::new(),
