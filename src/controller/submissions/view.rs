@@ -210,6 +210,8 @@ pub struct ContainerView {
     pub name: SharedText,
     pub restarts: i32,
     pub running: bool,
+    /// Its next life is counted among the restarts and does not run yet.
+    pub begins_anew: bool,
     /// When its present life began, while it runs.
     pub began: Option<Timestamp>,
     /// Reason and message, while it waits.
@@ -221,6 +223,11 @@ impl ContainerView {
     /// Whether it belongs to the Pod's own ones, which run before the agents.
     pub fn is_before_agents(&self) -> bool {
         names::INIT_CONTAINERS.contains(&self.name.as_str())
+    }
+
+    /// Whether the restarts count a life after the last end.
+    pub fn has_next_life(&self) -> bool {
+        self.running || self.begins_anew
     }
 }
 

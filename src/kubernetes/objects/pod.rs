@@ -1,5 +1,8 @@
 //! A Pod as it is cached: its names, its node, and how its containers fare.
 
+use std::borrow::Cow;
+use std::hash::{DefaultHasher, Hash, Hasher};
+
 use k8s_openapi::apimachinery::pkg::apis::meta::v1::Time;
 use kube::core::NamespaceResourceScope;
 use serde::{Deserialize, Deserializer};
@@ -65,19 +68,30 @@ pub struct Condition {
 }
 
 #[derive(Deserialize, Clone, Debug, Default, PartialEq)]
-#[serde(rename_all = "camelCase", default)]
+#[serde(from = "Seen")]
 pub struct ContainerStatus {
     pub name: Text,
     pub restart_count: i32,
+    /// The kubelet has made the container of the next life, and counts it, before that runs. It says that the container waits, as after an end.
+    pub begins_anew: bool,
     pub state: ContainerState,
     /// How the life before the present one ended.
-    #[serde(rename = "lastState", deserialize_with = "ended")]
     pub last_ended: Option<Box<Ended>>,
 }
 
+#[derive(Deserialize, Default)]
+#[serde(rename_all = "camelCase", default)]
+struct Seen {
+    name: Text,
+    restart_count: i32,
+    #[serde(rename = "containerID", deserialize_with = "digest")]
+    id: u64,
+    state: States,
+    last_state: States,
+}
+
 /// What a container does: one of the three that Kubernetes has.
-#[derive(Deserialize, Clone, Debug, Default, PartialEq)]
-#[serde(from = "States")]
+#[derive(Clone, Debug, Default, PartialEq)]
 pub enum ContainerState {
     #[default]
     Unknown,
@@ -118,6 +132,8 @@ pub struct Ended {
     pub message: Option<Box<str>>,
     pub started_at: Option<Time>,
     pub finished_at: Option<Time>,
+    #[serde(rename = "containerID", deserialize_with = "digest")]
+    id: u64,
 }
 
 fn conditions<'de, D: Deserializer<'de>>(deserializer: D) -> Result<Conditions, D::Error> {
@@ -142,8 +158,30 @@ pub(super) fn of_type<'de, T: Deserialize<'de>, D: Deserializer<'de>>(
     Ok(all.into_iter().flatten().find(is_it))
 }
 
-fn ended<'de, D: Deserializer<'de>>(deserializer: D) -> Result<Option<Box<Ended>>, D::Error> {
-    States::deserialize(deserializer).map(|states| states.terminated)
+/// A container's id as a number, which is enough to compare two; 0 without one.
+fn digest<'de, D: Deserializer<'de>>(deserializer: D) -> Result<u64, D::Error> {
+    let id = Option::<Cow<'_, str>>::deserialize(deserializer)?.unwrap_or_default();
+    if id.is_empty() {
+        return Ok(0);
+    }
+    let mut hasher = DefaultHasher::new();
+    id.hash(&mut hasher);
+    Ok(hasher.finish())
+}
+
+impl From<Seen> for ContainerStatus {
+    fn from(seen: Seen) -> Self {
+        let state = ContainerState::from(seen.state);
+        let last_ended = seen.last_state.terminated;
+        let is_of_another = |last: &Ended| ![last.id, 0].contains(&seen.id) && last.id != 0;
+        Self {
+            begins_anew: state.waiting().is_some() && last_ended.as_deref().is_some_and(is_of_another),
+            name: seen.name,
+            restart_count: seen.restart_count,
+            state,
+            last_ended,
+        }
+    }
 }
 
 impl From<States> for ContainerState {

@@ -108,7 +108,7 @@ fn is_of_processes(words: &str) -> bool {
 
 /// Whether the last end of a container is that of its first life. The kubelet counts, so no agent changes it.
 fn is_of_first_life(container: &ContainerView) -> bool {
-    container.restarts <= i32::from(container.running)
+    container.restarts <= i32::from(container.has_next_life())
 }
 
 /// Whether an end was a crash, and not one that was asked for.

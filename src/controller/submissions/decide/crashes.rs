@@ -63,7 +63,7 @@ fn count(container: &ContainerView) -> i32 {
     let is_crash = blame::is_crash(last);
     let ends = container
         .restarts
-        .saturating_add(i32::from(is_crash && !container.running));
+        .saturating_add(i32::from(is_crash && !container.has_next_life()));
     let round = last.verdict.as_ref().and_then(|verdict| verdict.round);
     match round.filter(|_| is_simulator) {
         Some(round) => ends.min(clamp(round).saturating_add(i32::from(is_crash))),

@@ -102,6 +102,7 @@ fn container(status: &ContainerStatus) -> ContainerView {
         name: status.name.clone(),
         restarts: status.restart_count,
         running: state.running().is_some(),
+        begins_anew: status.begins_anew,
         began: state
             .running()
             .and_then(|running| running.started_at.as_ref())
@@ -207,6 +208,24 @@ mod tests {
         assert_eq!(seen("contents", "Error", "disk full").why.as_deref(), Some("disk full"));
         let kubelets = seen("agent-1", "StartError", "exec: no such file");
         assert_eq!(kubelets.why.as_deref(), Some("exec: no such file"));
+    }
+
+    #[test]
+    fn a_life_that_is_counted_and_does_not_run_yet_is_no_end() {
+        let seen = |newest: &str, last: &str| {
+            let ended = json!({"terminated": {"exitCode": 255, "reason": "Error", "containerID": last}});
+            let pod = serde_json::from_value(json!({"metadata": {"name": "p"}, "status": {"containerStatuses": [{
+                "name": "agent-1", "image": "i", "imageID": "", "ready": false, "restartCount": 1, "containerID": newest,
+                "state": {"waiting": {"reason": "CrashLoopBackOff"}}, "lastState": ended,
+            }]}}));
+            let found = view(&pod.unwrap()).containers[0].clone();
+            assert_eq!((found.restarts, found.last.is_some()), (1, true));
+            found.begins_anew
+        };
+        assert!(seen("containerd://b", "containerd://a"));
+        for (newest, last) in [("containerd://a", "containerd://a"), ("", "containerd://a"), ("containerd://b", "")] {
+            assert!(!seen(newest, last), "{newest} {last}");
+        }
     }
 
     #[test]
