@@ -32,7 +32,6 @@ mod api {
     mod leader;
     mod log_groups;
     mod memory;
-    mod names;
     mod objects;
     mod operator;
     mod page;

@@ -27,10 +27,10 @@ PYTHON_TEST = re.compile(r"^    def (test_\w+)", re.MULTILINE)
 # The chart's test is no unittest: it checks by functions, each of which it names once.
 CHART_CHECK = re.compile(r"^ +check\(\".+\", lambda: (?:\w+\.)?(\w+)\(", re.MULTILINE)
 PAGE_CHECK = re.compile(r'^    "[^"]+": (\w+),$', re.MULTILINE)
-KINDS = ("held", "by policy", "inherent", "open")
+KINDS = ("held", "by policy", "inherent", "open", "struck")
 # How the sums are written in the text, so that it cannot contradict its table.
 SUMS = re.compile(
-    r"Of (\d+) attacks (\d+) are held, (\d+) are held by policy, (\d+) are inherent, and (\d+) are open\."
+    r"Of (\d+) attacks (\d+) are held, (\d+) are held by policy, (\d+) are inherent, (\d+) are open, and (\d+) are struck\."
 )
 
 

@@ -200,16 +200,6 @@ mod tests {
     }
 
     #[test]
-    fn where_the_operator_looks_names_up_no_pod_asks_any_server() {
-        let network =
-            json!({"dns": "Pinned", "dnsServers": ["10.0.0.10"], "egress": [{"cidr": "10.1.2.3/32", "ports": [443]}]});
-        assert_eq!(
-            policy(&network)["spec"]["egress"],
-            json!([{"to": [{"ipBlock": {"cidr": "10.1.2.3/32"}}], "ports": [{"protocol": "TCP", "port": 443}]}])
-        );
-    }
-
-    #[test]
     fn without_dns_and_addresses_nothing_gets_out() {
         assert_eq!(policy(&json!({"dns": "None"}))["spec"]["egress"], json!([]));
     }

@@ -16,11 +16,7 @@ use leaderboard_api::effective::key_prefix;
 
 /// The way to AWS for a program of this Pod.
 pub async fn aws(setting: &Setting, program: &str) -> Aws {
-    let base = match &setting.run.addresses {
-        Some(addresses) => Aws::load_with(program, addresses.clone()).await,
-        None => Aws::load(program).await,
-    };
-    for_run(base, setting)
+    for_run(Aws::load(program).await, setting)
 }
 
 /// The same from a way to AWS that is there already.

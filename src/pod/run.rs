@@ -4,7 +4,6 @@
 
 use serde::{Deserialize, Serialize};
 
-use crate::services::names::Addresses;
 use leaderboard_api::{Attempt, Enforcement, LeaderboardVersion, LogGroup, RunPlan, Verify};
 use leaderboard_results::Format;
 use leaderboard_runner::protocol::Pair;
@@ -87,9 +86,6 @@ pub struct Run {
     /// How `workspace` measures whether the Pod's NetworkPolicy is enforced; absent: not at all.
     #[serde(default, skip_serializing_if = "Option::is_none")]
     pub isolation: Option<Isolation>,
-    /// Where names lead that nobody in the Pod can look up; absent: they are looked up as usual.
-    #[serde(default, skip_serializing_if = "Option::is_none")]
-    pub addresses: Option<Addresses>,
 }
 
 /// What is to be measured, and what follows.

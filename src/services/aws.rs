@@ -4,7 +4,6 @@
 //! Endpoints with a bare host name get path-style buckets.
 
 use std::ffi::OsString;
-use std::sync::Arc;
 use std::time::Duration;
 
 use aws_config::retry::RetryConfig;
@@ -13,7 +12,6 @@ use aws_sdk_s3::config::{RequestChecksumCalculation, ResponseChecksumValidation}
 use aws_smithy_http_client::tls::{Provider, rustls_provider::CryptoMode};
 
 use super::meter::Meter;
-use super::names::{Addresses, Given, Names};
 use leaderboard_api::names::OPERATOR;
 
 /// Variable of the SDK that says when S3 is sent a checksum: `when_supported`, or `when_required` for stores that know none.
@@ -63,33 +61,19 @@ macro_rules! own {
 pub struct Aws {
     base: SdkConfig,
     meter: Meter,
-    names: Names,
 }
 
 impl Aws {
     /// Reads region and credentials from where AWS's SDKs look for them. Each request names the program, which CloudTrail then shows.
     pub async fn load(program: &str) -> Self {
-        Self::load_by(program, None).await
-    }
-
-    /// The same, asking no resolver: only these names have addresses. A certificate is compared with the name all the same.
-    pub async fn load_with(program: &str, addresses: Addresses) -> Self {
-        Self::load_by(program, Some(Given(Arc::new(addresses)))).await
-    }
-
-    async fn load_by(program: &str, names: Option<Given>) -> Self {
         let https = aws_smithy_http_client::Builder::new().tls_provider(Provider::Rustls(CryptoMode::Ring));
-        let http = match names {
-            Some(names) => https.build_with_resolver(names),
-            None => https.build_https(),
-        };
         let timeouts = aws_config::timeout::TimeoutConfig::builder()
             .connect_timeout(Duration::from_secs(5))
             .operation_attempt_timeout(ATTEMPT_TIMEOUT)
             .operation_timeout(OPERATION_TIMEOUT)
             .build();
         let mut loader = aws_config::defaults(BehaviorVersion::latest())
-            .http_client(http)
+            .http_client(https.build_https())
             .timeout_config(timeouts);
         if let Ok(name) = AppName::new(format!("{OPERATOR}-{program}")) {
             loader = loader.app_name(name);
@@ -102,19 +86,7 @@ impl Aws {
         Self {
             base,
             meter: Meter::default(),
-            names: Names::default(),
         }
-    }
-
-    /// The same way, with names that are looked up in another way for Pods.
-    #[must_use]
-    pub fn naming_by(self, names: Names) -> Self {
-        Self { names, ..self }
-    }
-
-    /// Looks names up for Pods.
-    pub fn names(&self) -> &Names {
-        &self.names
     }
 
     /// The same way, whose calls are counted.

@@ -6,20 +6,10 @@ use aws_sdk_sts::config::endpoint as sts_endpoint;
 use reqwest::Url;
 
 use super::aws::USUAL_REGION;
-use leaderboard_api::{LogGroup, Storage};
+use leaderboard_api::{LeaderboardSpec, LogGroup, Storage};
 use logs_endpoint::ResolveEndpoint as _;
 use s3_endpoint::ResolveEndpoint as _;
 use sts_endpoint::ResolveEndpoint as _;
-
-/// Where a service is.
-#[derive(Clone, Debug, PartialEq, Eq)]
-pub struct ServiceAddress {
-    /// The service, for people.
-    pub service: &'static str,
-    /// A name in small letters, or an address.
-    pub host: String,
-    pub port: u16,
-}
 
 /// The endpoint by a service's rules, or why there is none.
 macro_rules! endpoint {
@@ -37,41 +27,48 @@ macro_rules! endpoint {
     };
 }
 
-/// Where the bucket is, for a program in this region.
-pub async fn s3(storage: &Storage, region: Option<&str>) -> Result<ServiceAddress, String> {
+/// Hosts that `workspace` and `logcopy` of a Leaderboard's Pods connect to, in a Pod whose environment has this region: names in small letters,
+/// or addresses.
+pub async fn of_pods(spec: &LeaderboardSpec, region: Option<&str>) -> Result<Vec<String>, String> {
+    let region = region.or(spec.storage.region.as_deref());
+    let mut hosts = vec![s3(&spec.storage, region).await?];
+    if spec.has_role() {
+        hosts.push(sts(&spec.storage, region).await?);
+    }
+    if let Some(group) = &spec.log_group {
+        hosts.push(logs(group, region).await?);
+    }
+    Ok(hosts)
+}
+
+async fn s3(storage: &Storage, region: Option<&str>) -> Result<String, String> {
     let params = s3_endpoint::Params::builder()
         .bucket(&storage.bucket)
         .region(storage.region.as_deref().or(region).unwrap_or(USUAL_REGION))
         .set_endpoint(storage.endpoint.clone())
         .force_path_style(storage.endpoint.is_some());
-    place("S3", endpoint!(s3_endpoint, params))
+    host("S3", endpoint!(s3_endpoint, params))
 }
 
-/// Where STS is.
-pub async fn sts(storage: &Storage, region: Option<&str>) -> Result<ServiceAddress, String> {
+async fn sts(storage: &Storage, region: Option<&str>) -> Result<String, String> {
     let region = storage.region.as_deref().or(region).unwrap_or(USUAL_REGION);
     let params = sts_endpoint::Params::builder().region(region);
-    place("STS", endpoint!(sts_endpoint, params))
+    host("STS", endpoint!(sts_endpoint, params))
 }
 
-/// Where CloudWatch Logs is.
-pub async fn logs(group: &LogGroup, region: Option<&str>) -> Result<ServiceAddress, String> {
+async fn logs(group: &LogGroup, region: Option<&str>) -> Result<String, String> {
     let params = logs_endpoint::Params::builder()
         .region(group.region.as_deref().or(region).unwrap_or(USUAL_REGION))
         .set_endpoint(group.endpoint.clone());
-    place("CloudWatch Logs", endpoint!(logs_endpoint, params))
+    host("CloudWatch Logs", endpoint!(logs_endpoint, params))
 }
 
-fn place(service: &'static str, endpoint: Result<String, String>) -> Result<ServiceAddress, String> {
+fn host(service: &str, endpoint: Result<String, String>) -> Result<String, String> {
     let endpoint = endpoint.map_err(|why| format!("the endpoint of {service} is not known: {why}"))?;
     let unusable = || format!("the endpoint of {service} is no address of a server");
     let url = Url::parse(&endpoint).map_err(|_| unusable())?;
     let host = url.host_str().ok_or_else(unusable)?;
-    Ok(ServiceAddress {
-        service,
-        host: host.trim_matches(['[', ']']).to_lowercase(),
-        port: url.port_or_known_default().ok_or_else(unusable)?,
-    })
+    Ok(host.trim_matches(['[', ']']).to_lowercase())
 }
 
 #[cfg(test)]
@@ -90,39 +87,34 @@ mod tests {
 
     #[tokio::test]
     async fn a_bucket_is_where_the_client_of_s3_looks_for_it() {
-        for (more, region, host, port) in [
-            (json!({}), None, "results.s3.us-east-1.amazonaws.com", 443),
-            (json!({}), Some("eu-west-1"), "results.s3.eu-west-1.amazonaws.com", 443),
+        for (more, region, host) in [
+            (json!({}), None, "results.s3.us-east-1.amazonaws.com"),
+            (json!({}), Some("eu-west-1"), "results.s3.eu-west-1.amazonaws.com"),
             (
                 json!({"region": "cn-north-1"}),
                 Some("eu-west-1"),
                 "results.s3.cn-north-1.amazonaws.com.cn",
-                443,
             ),
             // A name with dots is no host of the certificate.
             (
                 json!({"bucket": "results.2026", "region": "eu-west-1"}),
                 None,
                 "s3.eu-west-1.amazonaws.com",
-                443,
             ),
             (
                 json!({"endpoint": "https://Bucket.vpce-1.s3.eu-west-1.vpce.amazonaws.com"}),
                 None,
                 "bucket.vpce-1.s3.eu-west-1.vpce.amazonaws.com",
-                443,
             ),
             (
                 json!({"endpoint": "http://minio.storage:9000"}),
                 None,
                 "minio.storage",
-                9000,
             ),
-            (json!({"endpoint": "http://10.0.0.5"}), None, "10.0.0.5", 80),
-            (json!({"endpoint": "https://[fd12::1]:8443"}), None, "fd12::1", 8443),
+            (json!({"endpoint": "http://10.0.0.5"}), None, "10.0.0.5"),
+            (json!({"endpoint": "https://[fd12::1]:8443"}), None, "fd12::1"),
         ] {
-            let place = s3(&storage(&more), region).await.unwrap();
-            assert_eq!((place.host.as_str(), place.port), (host, port), "{more}");
+            assert_eq!(s3(&storage(&more), region).await.unwrap(), host, "{more}");
         }
         for more in [json!({"endpoint": "nonsense"}), json!({"region": "no region"})] {
             let error = s3(&storage(&more), None).await.unwrap_err();
@@ -133,22 +125,15 @@ mod tests {
     #[tokio::test]
     async fn tokens_and_logs_have_their_own_places() {
         let at = |region: &str| storage(&json!({"region": region}));
-        let host = |place: Result<ServiceAddress, String>| place.unwrap().host;
-        assert_eq!(
-            host(sts(&at("eu-west-1"), Some("us-west-2")).await),
-            "sts.eu-west-1.amazonaws.com"
-        );
-        assert_eq!(
-            host(sts(&storage(&json!({})), Some("us-west-2")).await),
-            "sts.us-west-2.amazonaws.com"
-        );
+        let found = sts(&at("eu-west-1"), Some("us-west-2")).await.unwrap();
+        assert_eq!(found, "sts.eu-west-1.amazonaws.com");
+        let found = sts(&storage(&json!({})), Some("us-west-2")).await.unwrap();
+        assert_eq!(found, "sts.us-west-2.amazonaws.com");
         let group = |more: serde_json::Value| -> LogGroup { serde_json::from_value(more).unwrap() };
         let named = group(json!({"name": "g", "region": "eu-west-1"}));
-        assert_eq!(
-            host(logs(&named, Some("us-west-2")).await),
-            "logs.eu-west-1.amazonaws.com"
-        );
+        let found = logs(&named, Some("us-west-2")).await.unwrap();
+        assert_eq!(found, "logs.eu-west-1.amazonaws.com");
         let own = group(json!({"name": "g", "endpoint": "http://logs.internal:4566"}));
-        assert_eq!(host(logs(&own, None).await), "logs.internal");
+        assert_eq!(logs(&own, None).await.unwrap(), "logs.internal");
     }
 }

@@ -11,7 +11,6 @@ pub mod held_text;
 pub mod log_groups;
 pub mod logs;
 pub mod meter;
-pub mod names;
 pub mod public;
 pub mod queue;
 pub mod registry;

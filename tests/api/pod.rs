@@ -279,7 +279,6 @@ fn run(bucket: &str) -> Run {
         cancel_seconds: 20,
         log_group: None,
         isolation: None,
-        addresses: None,
     }
 }
 

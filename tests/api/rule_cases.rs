@@ -348,18 +348,12 @@ fn networks() -> Vec<Case> {
     let not_a_probe = "network.probe is not an address and port";
     let servers = |servers: &[&str]| json!({"network": {"dnsServers": servers}});
     let not_a_server = "network.dnsServers is neither an address nor a range";
-    let pinned = |egress: Value| json!({"network": {"dns": "Pinned", "egress": egress}});
     vec![
         case("is not a range of addresses", &to("2001:db8::/32"), &to("10.0.0.1")),
         case(
             not_a_server,
             &servers(&["10.0.0.10", "fd00::/64"]),
             &servers(&["10.0.0.10", "dns.example"]),
-        ),
-        case(
-            "Pinned needs network.egress",
-            &pinned(json!([{"cidr": "10.0.4.10/32"}])),
-            &pinned(json!([])),
         ),
         case(not_a_probe, &probe("192.0.2.1:443"), &probe("999.1.1.1:443")),
         case(not_a_probe, &probe("[2001:db8::1]:443"), &probe("192.0.2.1:65536")),

@@ -1,5 +1,4 @@
-//! A Pod that can ask nobody for a name (`network.dns: Pinned`), on a node: its own containers reach S3 by the addresses that the
-//! controller has looked up.
+//! A Pod that can ask no server for a name (`network.dns: None`), on a node: its own containers reach S3 by the host's aliases.
 
 use std::fs;
 use std::time::Duration;
@@ -14,11 +13,11 @@ use crate::processes;
 use crate::scene::{Scene, containers, scenario, state};
 
 /// A name that no resolver of the world knows.
-const NAME: &str = "s3.pinned.invalid";
+const NAME: &str = "s3.aliased.invalid";
 const LIMIT: Duration = Duration::from_mins(4);
 
 #[tokio::test]
-async fn a_pod_that_can_ask_nobody_stores_its_results_by_the_addresses_that_it_was_given() {
+async fn a_pod_that_can_ask_no_server_stores_its_results_by_the_hosts_aliases() {
     scenario("names", async |scene: &Scene| {
         let host = &scene.lab.host;
         let endpoint = scene.cloud.endpoint.replacen(host, NAME, 1);
@@ -27,15 +26,19 @@ async fn a_pod_that_can_ask_nobody_stores_its_results_by_the_addresses_that_it_w
             "pairs": 1,
             "routes": 2,
             "storage": {"endpoint": endpoint},
-            "network": {"dns": "Pinned"},
-            // A Pod must name a server: its own loopback, where nobody answers.
-            "podOverrides": {"spec": {"dnsPolicy": "None", "dnsConfig": {"nameservers": ["127.0.0.1"]}}},
+            "network": {"dns": "None"},
+            // A Pod must name a server: its own loopback, where no program answers.
+            "podOverrides": {"spec": {
+                "dnsPolicy": "None",
+                "dnsConfig": {"nameservers": ["127.0.0.1"]},
+                "hostAliases": [{"ip": host, "hostnames": [NAME]}],
+            }},
             // It drives on while its Pod's files are read.
             "agent": {"env": [{"name": "ROUTE_MS", "value": "3000"}]},
         });
         scene.leaderboard("lb", change).await;
         let _controller = controller_with_hosts(scene, &format!("127.0.0.1 localhost\n{host} {NAME}\n"));
-        scene.submit("pinned", "agent:standard").await;
+        scene.submit("aliased", "agent:standard").await;
         let pod = pod_with_logcopy(scene).await;
         let logcopy = processes::named(&pod, "logcopy", "leaderboard-ope", LIMIT).await;
         let read = |path: &str| fs::read_to_string(format!("/proc/{logcopy}/root{path}")).unwrap();
@@ -46,12 +49,12 @@ async fn a_pod_that_can_ask_nobody_stores_its_results_by_the_addresses_that_it_w
             .collect();
         assert_eq!(servers, ["127.0.0.1"], "{resolver}");
         let hosts = read("/etc/hosts");
-        assert!(!hosts.contains(NAME), "{hosts}");
+        assert!(hosts.contains(NAME), "{hosts}");
 
-        let ended = scene.settled("pinned", LIMIT).await;
+        let ended = scene.settled("aliased", LIMIT).await;
         assert_eq!(state(&ended), Some(State::Finished), "{:?}", ended.status);
-        assert_eq!(scene.jobs().await, ["pinned-1"]);
-        let keys = scene.cloud.keys("pinned").await;
+        assert_eq!(scene.jobs().await, ["aliased-1"]);
+        let keys = scene.cloud.keys("aliased").await;
         // What `workspace` writes, and what `logcopy` does.
         for key in ["logcopy/owner", "evalai/results.json"] {
             assert!(keys.contains_key(key), "{key}: {keys:?}");
@@ -62,7 +65,7 @@ async fn a_pod_that_can_ask_nobody_stores_its_results_by_the_addresses_that_it_w
 
 /// The Pod of the run, once its `logcopy` runs.
 async fn pod_with_logcopy(scene: &Scene) -> Pod {
-    let name = scene.first_pod("pinned", LIMIT).await.name_any();
+    let name = scene.first_pod("aliased", LIMIT).await.name_any();
     let runs = |pod: Option<&Pod>| {
         let all = pod.map(containers).unwrap_or_default();
         let state = all

@@ -252,7 +252,6 @@ fn run(endpoint: &str, bucket: &str, id: &str, format: LeaderboardVersion) -> Ru
         cancel_seconds: 20,
         log_group: None,
         isolation: None,
-        addresses: None,
     }
 }
 

@@ -35,8 +35,6 @@ pub enum Dns {
     /// The cluster's DNS, and the servers of `dnsServers`.
     #[default]
     Cluster,
-    /// Nobody. The operator looks the services' names up, and gives the addresses to its own containers.
-    Pinned,
     /// Nobody.
     None,
 }
@@ -45,7 +43,6 @@ pub enum Dns {
 #[derive(Serialize, Deserialize, KubeSchema, Clone, Debug, PartialEq, Eq)]
 #[x_kube(
     validation = Rule::new("self.policy == 'Managed' || self.enforcement != 'Require'").message("network.enforcement Require needs network.policy Managed, since the operator does not know what the cluster's own policies forbid; use Managed, or Warn"),
-    validation = Rule::new("!has(self.dns) || self.dns != 'Pinned' || self.policy != 'Managed' || (has(self.egress) && size(self.egress) > 0)").message("network.dns Pinned needs network.egress, since a Pod gets the addresses that it allows; name the addresses of the interface endpoints there"),
     validation = Rule::new("!has(self.probe) || (isIP(self.probe.substring(0, self.probe.lastIndexOf(':')).replace('[', '').replace(']', '')) && int(self.probe.substring(self.probe.lastIndexOf(':') + 1)) > 0 && int(self.probe.substring(self.probe.lastIndexOf(':') + 1)) < 65536)").message("network.probe is not an address and port such as 192.0.2.1:443 or [2001:db8::1]:443"),
     validation = Rule::new("!has(self.dnsServers) || self.dnsServers.all(s, isIP(s) || isCIDR(s))").message("an entry of network.dnsServers is neither an address nor a range such as 10.0.0.10 or 10.0.0.0/24")
 )]
@@ -68,7 +65,7 @@ pub struct Network {
     #[serde(default, skip_serializing_if = "Vec::is_empty")]
     #[schemars(length(max = 32))]
     pub egress: Vec<Egress>,
-    /// `Cluster`: names are looked up at the cluster's DNS, which are the Pods `k8s-app=kube-dns` in `kube-system`, and at `dnsServers`. `Pinned`: a Pod can look up none; before each Job the operator looks up the names of S3, STS and CloudWatch Logs, and gives `workspace` and `logcopy` those of their addresses that `egress` allows. A Pod keeps them until it ends, so use it for interface endpoints only, whose addresses are fixed. `None`: nowhere; `egress` alone counts, and `podOverrides.spec.hostAliases` names the services.
+    /// `Cluster`: names are looked up at the cluster's DNS, which are the Pods `k8s-app=kube-dns` in `kube-system`, and at `dnsServers`. `None`: a Pod can look up no name; `podOverrides.spec.hostAliases` gives the addresses of S3, STS and CloudWatch Logs. A Pod keeps them until it ends, so use interface endpoints, whose addresses are fixed. `Ready` lists each of these names that no alias gives.
     #[serde(default)]
     pub dns: Dns,
     /// Further DNS servers, as addresses or ranges. Default: where NodeLocal DNSCache answers.

@@ -78,14 +78,6 @@ fn leads_to(address: IpAddr) -> IpAddr {
     Ipv4Addr::new(a, b, c, d).into()
 }
 
-/// Whether an address is nobody's service: of the machine that asks, of many at once, or where clouds hand out credentials. One of IPv6
-/// that leads to such a one is another spelling of it.
-pub fn is_no_service(address: IpAddr) -> bool {
-    let address = leads_to(address);
-    let is_of_machine = address.is_loopback() || address.is_unspecified() || address.is_multicast();
-    is_of_machine || Range::alone(address).is_none_or(|alone| forbidden().any(|range| range.contains(alone)))
-}
-
 /// What no policy lets a Pod reach, whatever the host allows.
 pub fn forbidden() -> impl Iterator<Item = Range> {
     table(&FORBIDDEN)
@@ -210,38 +202,6 @@ mod tests {
         }
         for address in PRIVATE.split_whitespace() {
             assert!(!is_public(address.parse().unwrap()), "{address}");
-        }
-    }
-
-    #[test]
-    fn an_address_of_a_machine_or_of_metadata_is_no_service_in_any_spelling() {
-        for address in [
-            "127.0.0.1",
-            "0.0.0.0",
-            "224.0.0.1",
-            "169.254.169.254",
-            "169.254.170.23",
-            "168.63.129.16",
-            "::",
-            "::1",
-            "fe80::1",
-            "ff02::1",
-            "fd00:ec2::254",
-            "::ffff:127.0.0.1",
-            "::ffff:169.254.169.254",
-            "64:ff9b::169.254.169.254",
-        ] {
-            assert!(is_no_service(address.parse().unwrap()), "{address}");
-        }
-        for address in [
-            "10.0.0.5",
-            "52.216.1.1",
-            "100.64.0.1",
-            "fd12::1",
-            "2600:1f00::1",
-            "::ffff:10.0.0.5",
-        ] {
-            assert!(!is_no_service(address.parse().unwrap()), "{address}");
         }
     }
 

@@ -3,6 +3,7 @@
 //! Pure, on the Pods as they are created, so that every way to say a thing is covered: fields, tracks, `podOverrides`.
 
 use std::collections::BTreeSet;
+use std::net::IpAddr;
 
 use serde_json::Value;
 
@@ -128,6 +129,27 @@ fn has_ros(text: &str) -> bool {
     words.any(|word| ["ros", "ros1", "ros2"].contains(&word.to_ascii_lowercase().as_str()))
 }
 
+/// Names of services that Pods without a resolver need and that no alias gives. An error is the reason why a name is not known.
+pub(super) fn unnamed(tracks: &[TrackPods], hosts: Result<Vec<String>, String>) -> Option<String> {
+    let hosts = match hosts {
+        Ok(hosts) => hosts,
+        Err(why) => return Some(format!("With network.dns None, {why}; correct storage, logGroup or the region.")),
+    };
+    let gives = |pods: &TrackPods, host: &str| {
+        let mut names = list(&pods.template["spec"], "hostAliases").flat_map(|alias| list(alias, "hostnames"));
+        names.any(|name| name.as_str().is_some_and(|name| name.eq_ignore_ascii_case(host)))
+    };
+    let is_missing = |host: &String| host.parse::<IpAddr>().is_err() && tracks.iter().any(|pods| !gives(pods, host));
+    let missing: BTreeSet<String> = hosts.into_iter().filter(is_missing).collect();
+    (!missing.is_empty()).then(|| {
+        format!(
+            "Unnamed: network.dns is None, and no entry of podOverrides.spec.hostAliases gives the address of {}; no result can be stored \
+             without it.",
+            listed(missing)
+        )
+    })
+}
+
 fn agents(pod: &Value) -> impl Iterator<Item = &Value> {
     baseline::containers(pod).filter(|container| {
         let name = container["name"].as_str();
@@ -246,6 +268,23 @@ mod tests {
         // Alone in its Pod an agent meets nobody.
         let alone = with("env", json!([{"name": "ROS_DISTRO", "value": "humble"}]));
         assert!(notes(&[pods("sensors", alone, &json!([]))]).is_empty());
+    }
+
+    #[test]
+    fn a_name_that_no_alias_gives_is_listed_where_pods_have_no_resolver() {
+        let named = |names: Value| TrackPods {
+            track: "sensors".to_owned(),
+            template: json!({"spec": {"hostAliases": [{"ip": "10.0.4.10", "hostnames": names}]}}),
+        };
+        let hosts = || Ok(["b.s3.amazonaws.com", "sts.amazonaws.com", "10.0.0.5"].map(str::to_owned).to_vec());
+        let both = named(json!(["B.s3.amazonaws.com", "sts.amazonaws.com"]));
+        assert_eq!(unnamed(&[both], hosts()), None);
+        let found = unnamed(&[named(json!(["b.s3.amazonaws.com"]))], hosts()).unwrap();
+        assert!(found.contains("gives the address of sts.amazonaws.com; "), "{found}");
+        let found = unnamed(&[], hosts());
+        assert_eq!(found, None, "without a track there is no Pod");
+        let found = unnamed(&[], Err("the endpoint of S3 is not known".to_owned())).unwrap();
+        assert!(found.starts_with("With network.dns None, the endpoint of S3 is not known; "), "{found}");
     }
 
     #[test]

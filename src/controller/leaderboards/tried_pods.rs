@@ -6,13 +6,14 @@ use jiff::Timestamp;
 use kube::api::{ApiResource, DynamicObject, PostParams};
 use kube::{Api, Client, ResourceExt};
 
-use super::pod_notes::{TrackPods, notes};
+use super::pod_notes::{self, TrackPods, notes};
 use super::priority::{self, Asked};
 use crate::controller::settings::Settings;
 use crate::controller::submissions::job_spec::{self, JobInput};
 use crate::controller::submissions::pod_overlay;
 use crate::kubernetes::call;
-use leaderboard_api::{JobNumber, Leaderboard, Submission, Track, effective};
+use crate::services::endpoints;
+use leaderboard_api::{Dns, JobNumber, Leaderboard, Submission, Track, effective};
 
 /// What was found of a Leaderboard's Pods.
 #[derive(Clone, Default)]
@@ -43,10 +44,14 @@ pub(super) async fn try_pods(client: &Client, settings: &Settings, leaderboard: 
         template: template(job),
     });
     let pods: Vec<TrackPods> = pods.collect();
+    let hosts = match leaderboard.spec.network.dns {
+        Dns::None => endpoints::of_pods(&leaderboard.spec, settings.region.as_deref()).await,
+        Dns::Cluster => Ok(Vec::new()),
+    };
     let mut templates = jobs.iter().map(|(_, job)| template(job));
     let unclear = templates.find_map(|template| job_spec::unclear(&leaderboard.spec, &template));
     TriedPods {
-        notes: notes(&pods),
+        notes: notes(&pods).into_iter().chain(pod_notes::unnamed(&pods, hosts)).collect(),
         classes: priority::asked(&leaderboard.spec.tracks, &pods),
         refused: match (unclear, jobs.first()) {
             (Some(unclear), _) => Some(unclear),
@@ -94,7 +99,6 @@ fn sample_job(settings: &Settings, leaderboard: &Leaderboard, track: &Track) -> 
         number: JobNumber::default(),
         settings,
         failed_nodes: &[],
-        addresses: None,
         now: Timestamp::now(),
     }))
 }

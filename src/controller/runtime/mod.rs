@@ -256,7 +256,7 @@ impl Parts {
             settings: self.settings.clone(),
             stores: self.watches.stores(),
             memory: Memory::default(),
-            workers: Workers::start(aws, client, tasks, self.settings.region.as_deref(), answered),
+            workers: Workers::start(aws, client, tasks, answered),
             causes: self.causes(queues),
             teams: self.watches.teams.clone(),
             reruns: Reruns::default(),

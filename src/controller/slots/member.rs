@@ -127,6 +127,6 @@ fn needs_leaderboard(status: &SubmissionStatus) -> bool {
 
 /// Whether a change of its Leaderboard may let it start: it has no Job, or the one that it asked for may not be made.
 fn waits_for_leaderboard(status: &SubmissionStatus) -> bool {
-    let held = [reasons::NOT_ISOLATED, reasons::NAME_NOT_RESOLVED];
+    let held = [reasons::NOT_ISOLATED];
     status.job_name.is_none() || status.reason.as_deref().is_some_and(|reason| held.contains(&reason))
 }

@@ -11,7 +11,6 @@ use kube::{Client, Resource, ResourceExt};
 use serde_json::json;
 use tokio::time::Instant;
 
-use super::addresses;
 use super::decide::{Action, Event, Plan, StatusWrite, pinned};
 use super::external::ExternalSystems;
 use super::failure_log::LogDemand;
@@ -144,7 +143,6 @@ impl Actor<'_> {
             Action::LookUpImage(question) => workers.images.want(submission, question),
             Action::LookForForeignRun(question) => workers.foreign_runs.want(submission, *question),
             Action::ReadOtherResults(question) => workers.other_results.want(submission, *question),
-            Action::LookUpNames(question) => workers.addresses.want(submission, *question),
             Action::TakeOwnership => workers.archive.want_fence(submission, status),
             Action::KeepLog { places } => workers.archive.want_log(submission, status, log_demand(places, status)),
             Action::ReadTexts { of } => workers.archive.want_texts(submission, status, of),
@@ -272,7 +270,6 @@ impl Actor<'_> {
             image: pinned(&plan.image, status.image.as_ref()),
             ..plan.clone()
         };
-        let addresses = addresses::of_pod(&self.view.addresses, &leaderboard.spec.network);
         let object = job_spec::build_object(&JobInput {
             submission: self.submission(),
             leaderboard,
@@ -280,7 +277,6 @@ impl Actor<'_> {
             number,
             settings: self.uses.settings,
             failed_nodes: &status.failed_nodes,
-            addresses: addresses.as_ref(),
             now: self.view.now,
         });
         let name = names::job(&self.name(), number);

@@ -15,7 +15,7 @@ use super::*;
 use crate::controller::fixtures::{Cluster, Surroundings, leaderboard, surroundings, with_job};
 use crate::controller::submissions::team_history::TeamHistory;
 use crate::controller::submissions::view::{
-    ObservedAddresses, ObservedFence, ObservedImage, ObservedJob, ObservedLog, ObservedNode, ObservedReport,
+    ObservedFence, ObservedImage, ObservedJob, ObservedLog, ObservedNode, ObservedReport,
     ObservedRoutes, ObservedTexts, ObservedTraces, Turn,
 };
 use leaderboard_api::conditions::{self, Truth};
@@ -100,7 +100,6 @@ async fn bench(state: State) -> Bench {
         image: ObservedImage::NotAsked,
         traces: ObservedTraces::NotAsked,
         other_routes: ObservedRoutes::NotAsked,
-        addresses: ObservedAddresses::NotAsked,
         turn: Turn::Go,
         job: ObservedJob::Absent,
         job_refused: None,

@@ -5,7 +5,6 @@
 //! `job_spec` and `pod_overlay` build what is created in the cluster, `baseline` judges it; they know no client and no clock.
 
 pub mod act;
-pub mod addresses;
 pub mod archive;
 pub mod baseline;
 pub mod decide;

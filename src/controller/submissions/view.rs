@@ -6,7 +6,6 @@ use std::time::Duration;
 use jiff::Timestamp;
 use leaderboard_runner::verdict::Verdict;
 
-pub use super::addresses::ObservedAddresses;
 pub use super::foreign_runs::ObservedTraces;
 pub use super::images::ObservedImage;
 pub use super::other_results::ObservedRoutes;
@@ -33,8 +32,6 @@ pub struct View {
     pub traces: ObservedTraces,
     /// How many routes another program's run of it has; read only where a Leaderboard observes.
     pub other_routes: ObservedRoutes,
-    /// Where the names lead that its Pod cannot look up.
-    pub addresses: ObservedAddresses,
     /// Whether it may start now; only meaningful while it has no Job and all else is settled.
     pub turn: Turn,
     pub job: ObservedJob,

@@ -66,7 +66,6 @@ fn job(number: usize) -> Value {
         number: JobNumber::first(Attempt(1)),
         settings: &settings(),
         failed_nodes: &[],
-        addresses: None,
         now: jiff::Timestamp::now(),
     }));
     object["status"] = json!({"active": 1, "ready": 1, "startTime": "2026-01-01T00:00:00Z"});

@@ -118,7 +118,7 @@ pub async fn surroundings(cluster: Cluster, endpoint: &str) -> Surroundings {
         settings: settings(),
         stores: stores(cluster),
         memory: Memory::default(),
-        workers: Workers::start(&aws, &client, &tasks, None, || noting(&answering)),
+        workers: Workers::start(&aws, &client, &tasks, || noting(&answering)),
         causes: Causes::default(),
         teams,
         reruns: Reruns::default(),

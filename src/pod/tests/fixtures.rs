@@ -47,7 +47,6 @@ pub(crate) fn run() -> Run {
         cancel_seconds: 20,
         log_group: None,
         isolation: None,
-        addresses: None,
     }
 }
 

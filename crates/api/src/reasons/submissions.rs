@@ -79,12 +79,7 @@ reasons! {
             "A container cannot be set up: a Secret or a key is missing, or the Leaderboard's settings of its user contradict each other.",
             "Create what the message names, or correct the settings.",
             after_failure: "Fix this, then resume the submission.";
-        NAME_NOT_RESOLVED = "NameNotResolved",
-            "`network.dns` is `Pinned`, and the operator has no address for a service that the Pod's own containers need: the name \
-             cannot be looked up, or `network.egress` allows none of its addresses. No Job is created. The name is looked up again \
-             every 30 s.",
-            "Do what the message asks: correct the name, let the operator's own Pod resolve it, or name the addresses of the \
-             interface endpoint in `network.egress`. Without interface endpoints use `network.dns: Cluster`.";
+
         NOT_ISOLATED = "NotIsolated",
             "The NetworkPolicy of the Leaderboard is not in place, and no Job is created without it. As a failure: \
              `network.enforcement` is `Require`, and the Pod could reach what the policy forbids, or could not measure it.",

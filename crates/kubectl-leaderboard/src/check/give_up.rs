@@ -79,12 +79,11 @@ impl Patience {
     }
 
     fn is_for_a_person(&self) -> bool {
-        const LASTING: [&str; 6] = [
+        const LASTING: [&str; 5] = [
             reasons::LEADERBOARD_NOT_FOUND,
             reasons::LEADERBOARD_NOT_READY,
             reasons::TRACK_NOT_FOUND,
             reasons::NOT_ISOLATED,
-            reasons::NAME_NOT_RESOLVED,
             reasons::JOB_NAME_TAKEN,
         ];
         self.reason.as_deref().is_none_or(|reason| LASTING.contains(&reason))

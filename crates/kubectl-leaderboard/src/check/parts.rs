@@ -400,7 +400,7 @@ fn part_of(reason: &str, text: &str) -> Part {
         reasons::IMAGE_PULL | reasons::CONTAINER_CONFIG | reasons::PREPARING | reasons::START_DEADLINE => Part::Images,
         reasons::CANNOT_START if text.contains("imulator-") => Part::Simulator,
         reasons::CANNOT_START if text.contains("ontents") => Part::Contents,
-        reasons::NOT_ISOLATED | reasons::NAME_NOT_RESOLVED => Part::Network,
+        reasons::NOT_ISOLATED => Part::Network,
         reasons::SIMULATION_CRASHED | reasons::REPEATED_FAILURES => Part::Simulator,
         reasons::CANNOT_START
         | reasons::AGENT_CRASHED

@@ -8,7 +8,7 @@ use super::failure::{self, infrastructure};
 use super::isolation::Missing;
 use super::plan::Action;
 use super::plan_builder::{PlanBuilder, Terms, after};
-use super::{addresses, end, foreign, image, isolation, pin, restored, stored};
+use super::{end, foreign, image, isolation, pin, restored, stored};
 use crate::controller::submissions::view::{EvalaiInfo, Standing};
 use leaderboard_api::conditions::{self, Truth};
 use leaderboard_api::text::{LONGEST_NAME, one_line, sentence};
@@ -71,11 +71,6 @@ fn decide_run(draft: &mut PlanBuilder<'_>, terms: Terms<'_>) -> bool {
     }
     if let Some(missing) = isolation::missing(draft) {
         return wait_for_policy(draft, &missing);
-    }
-    match addresses::decide(draft, terms.leaderboard) {
-        addresses::Step::Go => {}
-        addresses::Step::Wait => return false,
-        addresses::Step::Refuse(message) => return refuse(draft, reasons::NAME_NOT_RESOLVED, &message),
     }
     let note = match image::decide(draft, terms.leaderboard, &image) {
         image::Step::Go(note) => note,

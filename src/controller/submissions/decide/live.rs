@@ -6,7 +6,7 @@ use std::time::Duration;
 use super::plan::{Action, EvalaiUpdate, TableUpdate};
 use super::plan_builder::{PlanBuilder, after};
 use super::{
-    accept, addresses, clock, crashes, disk, end, failure, interruption, isolation, line, reading, reported, requeue,
+    accept, clock, crashes, disk, end, failure, interruption, isolation, line, reading, reported, requeue,
     restored, start, stop,
 };
 use crate::controller::submissions::job_spec;
@@ -214,25 +214,20 @@ fn without_its_job(draft: &mut PlanBuilder<'_>) {
 
 /// Whether no Job may be made at the moment, because of its Leaderboard.
 fn is_held_up(draft: &mut PlanBuilder<'_>) -> bool {
-    let Some(leaderboard) = draft.leaderboard() else {
+    if draft.leaderboard().is_none() {
         let message = accept::no_leaderboard(draft);
         let message = draft.stall(reasons::LEADERBOARD_NOT_FOUND, &message);
         draft.show(reasons::LEADERBOARD_NOT_FOUND, message);
         draft.requeue_in(BACKSTOP);
         return true;
-    };
+    }
     if let Some(missing) = isolation::missing(draft) {
         draft.stall_with(reasons::NOT_ISOLATED, &missing.message);
         draft.show(reasons::NOT_ISOLATED, missing.message);
         draft.requeue_in(BACKSTOP);
         return true;
     }
-    match addresses::decide(draft, leaderboard) {
-        addresses::Step::Go => return false,
-        addresses::Step::Wait => {}
-        addresses::Step::Refuse(message) => draft.show(reasons::NAME_NOT_RESOLVED, message),
-    }
-    true
+    false
 }
 
 /// Whether Kubernetes may have removed the Job by its time to live, after an end that nobody has read.

@@ -8,7 +8,6 @@
 //! `words` whose fault a start is by what Kubernetes writes of it, `disk` whose disk was full.
 
 mod accept;
-mod addresses;
 mod after;
 mod allowance;
 mod blame;

@@ -7,7 +7,7 @@ use crate::controller::submissions::images::Question;
 use crate::controller::submissions::other_results;
 use crate::controller::submissions::report_digest::ReportId;
 use crate::controller::submissions::view::{LogPlace, ReportDemand};
-use crate::controller::submissions::{addresses, foreign_runs};
+use crate::controller::submissions::foreign_runs;
 use crate::pod::run::Stop;
 use leaderboard_api::{JobNumber, SubmissionStatus, names};
 
@@ -78,8 +78,6 @@ pub enum Action {
     LookForForeignRun(Box<foreign_runs::Question>),
     /// Read how many routes another program's run of the submission has.
     ReadOtherResults(Box<other_results::Question>),
-    /// Look the names up that its Pod cannot look up.
-    LookUpNames(Box<addresses::Question>),
     /// Create this Job.
     CreateJob(JobNumber),
     /// Delete a Job and its Pods with this grace period.

@@ -3,7 +3,7 @@
 use serde_json::{Value, json};
 
 use super::run_document;
-use super::tests::{Case, OPERATOR_IMAGE, addresses, container, containers, role};
+use super::tests::{Case, OPERATOR_IMAGE, container, containers, role};
 use crate::pod::run::ENV_ROLE_ARN;
 use crate::pod::run::Run;
 use leaderboard_api::{Attempt, names};
@@ -58,27 +58,6 @@ fn the_pairs_share_out_the_routes_of_the_plan() {
         job["spec"]["template"]["spec"]["containers"].as_array().unwrap().len(),
         6
     );
-}
-
-#[test]
-fn only_our_own_containers_are_given_addresses_and_by_a_variable_alone() {
-    let mut case = Case::new("V2", json!({}));
-    let without = case.json();
-    case.addresses = Some(addresses());
-    let job = case.json();
-    for found in containers(&job) {
-        let name = found["name"].as_str().unwrap();
-        assert_eq!(found.to_string().contains("10.0.4.10"), is_own(found), "{name}");
-        if is_own(found) {
-            let run: Run = serde_json::from_str(value(found, "LEADERBOARD_RUN").unwrap()).unwrap();
-            assert_eq!(run.addresses, Some(addresses()));
-        } else {
-            assert_eq!(found, container(&without, name));
-        }
-    }
-    let pod = &job["spec"]["template"]["spec"];
-    assert_eq!(pod["volumes"], without["spec"]["template"]["spec"]["volumes"]);
-    assert!(pod["hostAliases"].is_null() && pod["dnsConfig"].is_null());
 }
 
 #[test]

@@ -43,7 +43,6 @@ use crate::controller::gpu_claims::source;
 use crate::controller::objects::owner_reference;
 use crate::controller::settings::Settings;
 use crate::pod::run::{Isolation, Run, SCHEMA};
-use crate::services::names::Addresses;
 pub use gpu_count::gpus;
 use leaderboard_api::{
     Attempt, Deadlines, Enforcement, FailedNode, JobNumber, Leaderboard, LeaderboardSpec, PolicySource, RunPlan,
@@ -77,8 +76,6 @@ pub struct JobInput<'a> {
     pub settings: &'a Settings,
     /// Nodes that have failed earlier Jobs of the attempt.
     pub failed_nodes: &'a [FailedNode],
-    /// Where the names lead that the Pod's own containers need; none: they look them up themselves.
-    pub addresses: Option<&'a Addresses>,
     /// When it is made.
     pub now: Timestamp,
 }
@@ -150,7 +147,6 @@ fn run_document(input: &JobInput<'_>) -> Run {
         cancel_seconds: unsigned(spec.deadlines.cancel_seconds),
         log_group: spec.log_group.clone(),
         isolation: isolation(input.leaderboard, input.now),
-        addresses: input.addresses.cloned(),
     }
 }
 

@@ -20,7 +20,6 @@ pub(super) struct Case {
     pub(super) number: JobNumber,
     pub(super) settings: Settings,
     pub(super) failed_nodes: Vec<FailedNode>,
-    pub(super) addresses: Option<Addresses>,
 }
 
 impl Case {
@@ -75,7 +74,6 @@ impl Case {
                 concurrency: 16,
             },
             failed_nodes: Vec::new(),
-            addresses: None,
         }
     }
 
@@ -87,7 +85,6 @@ impl Case {
             number: self.number,
             settings: &self.settings,
             failed_nodes: &self.failed_nodes,
-            addresses: self.addresses.as_ref(),
             now: "2026-11-01T12:00:00Z".parse().unwrap(),
         }
     }
@@ -114,13 +111,6 @@ pub(super) fn container<'a>(job: &'a Value, name: &str) -> &'a Value {
 
 pub(super) fn role() -> Value {
     json!({"serviceAccountName": "submission-worker", "roleARN": "arn:aws:iam::123456789012:role/results"})
-}
-
-/// What a Pod of a Leaderboard with `network.dns: Pinned` is given.
-pub(super) fn addresses() -> Addresses {
-    let found = ["10.0.4.10", "10.0.5.10"].map(|text| text.parse().unwrap()).to_vec();
-    let hosts = ["logs", "results.s3", "sts"].map(|host| format!("{host}.eu-west-1.amazonaws.com"));
-    hosts.into_iter().map(|host| (host, found.clone())).collect()
 }
 
 fn golden(name: &str, case: &Case) {
@@ -163,7 +153,6 @@ fn the_job_of_leaderboard_2_is_as_committed() {
     );
     case.number.attempt = Attempt(3);
     case.number.retry = 1;
-    case.addresses = Some(addresses());
     golden("v2.json", &case);
 }
 

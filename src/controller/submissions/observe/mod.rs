@@ -61,7 +61,6 @@ pub fn observe(uses: Uses<'_>, submission: Arc<Submission>, is_policy_in_place: 
         image: workers.images.observe(&submission),
         traces: workers.foreign_runs.observe(&submission),
         other_routes: workers.other_results.observe(&submission),
-        addresses: workers.addresses.observe(&submission),
         job_refused: refusal(uses, &submission, &job),
         turn: uses.slots.turn(&submission, leaderboard.as_deref()),
         node: node.state,

@@ -4,7 +4,6 @@ use kube::Client;
 
 use super::lookups::Lookups;
 use crate::controller::objects::Wake;
-use crate::controller::submissions::addresses::Addresses;
 use crate::controller::submissions::archive::ArchiveWorkers;
 use crate::controller::submissions::foreign_runs::ForeignRuns;
 use crate::controller::submissions::images::Images;
@@ -20,7 +19,6 @@ pub struct Workers {
     pub images: Images,
     pub foreign_runs: ForeignRuns,
     pub other_results: OtherResults,
-    pub addresses: Addresses,
 }
 
 impl Workers {
@@ -29,7 +27,6 @@ impl Workers {
         aws: &Aws,
         client: &Client,
         tasks: &Tasks,
-        region: Option<&str>,
         wake: impl Fn() -> Wake<Submission>,
     ) -> Self {
         Self {
@@ -38,7 +35,6 @@ impl Workers {
             images: Images::start(aws, client.clone(), tasks, wake()),
             foreign_runs: ForeignRuns::start(aws, tasks, wake()),
             other_results: OtherResults::start(aws, tasks, wake()),
-            addresses: Addresses::start(aws.names(), region.map(str::to_owned), tasks, wake()),
         }
     }
 
@@ -48,6 +44,5 @@ impl Workers {
         self.images.forget(uid);
         self.foreign_runs.forget(uid);
         self.other_results.forget(uid);
-        self.addresses.forget(uid);
     }
 }

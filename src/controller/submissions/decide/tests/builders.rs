@@ -13,7 +13,7 @@ use crate::controller::submissions::foreign_runs::{Looked, Traces, Unread};
 use crate::controller::submissions::report_digest::ReportDigest;
 use crate::controller::submissions::team_history::TeamHistory;
 use crate::controller::submissions::view::{
-    ContainerView, EndView, EvalaiEnd, EvalaiInfo, EvalaiView, JobEnd, JobView, ObservedAddresses, ObservedFence,
+    ContainerView, EndView, EvalaiEnd, EvalaiInfo, EvalaiView, JobEnd, JobView, ObservedFence,
     ObservedImage, ObservedJob, ObservedLog, ObservedNode, ObservedReport, ObservedRoutes, ObservedTexts,
     ObservedTraces, PodView, RecordView, Stage, Standing, Texts, Turn, View,
 };
@@ -120,7 +120,6 @@ impl World {
                 traces: ObservedTraces::Answered(Arc::new(looked(at(0), Ok(Traces::default())))),
                 // The results of another program; the tests of one that observes set it otherwise.
                 other_routes: ObservedRoutes::NotAsked,
-                addresses: ObservedAddresses::NotAsked,
                 turn: Turn::Go,
                 job: ObservedJob::Absent,
                 job_refused: None,

@@ -1,7 +1,6 @@
 //! Tables and properties of `decide`, by stage of life. Every reconcile of every table also obeys `rules`.
 
 mod accept;
-mod addresses;
 mod after;
 mod allowance;
 mod blame;

@@ -201,7 +201,6 @@ fn status_is_whole(plan: &Plan) {
                 | Action::AskEvalai
                 | Action::LookUpImage(_)
                 | Action::LookForForeignRun(_)
-                | Action::LookUpNames(_)
         )
     };
     if *status == SubmissionStatus::default() && plan.actions.iter().any(waits) {
