@@ -152,7 +152,6 @@ def work(controller: str, namespace: str) -> list[Access]:
         *may(controller, "list watch create patch", "networking.k8s.io/networkpolicies", namespace),
         *may(controller, "get list create patch delete", "resource.k8s.io/resourceclaimtemplates", namespace),
         *may(controller, "get", "coordination.k8s.io/leases", namespace, "another"),
-        *may(controller, "create", "authorization.k8s.io/selfsubjectaccessreviews", ""),
     ]
 
 

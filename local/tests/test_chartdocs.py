@@ -70,7 +70,6 @@ mod tests { struct Fake { a: Gauge, } }
 RIGHTS = {
     "Pods' logs": "pods/log",
     "Finalizers of both kinds": "finalizers",
-    "Access reviews of its own": "selfsubjectaccessreviews",
 }
 RULE = re.compile(r"^    resources: \[(.+)\]\n    verbs: \[(.+)\]$", re.MULTILINE)
 

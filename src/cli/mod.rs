@@ -8,6 +8,7 @@ mod offline;
 #[cfg(test)]
 mod pages_tests;
 mod preflight;
+pub mod rights;
 mod serve;
 
 use std::process::ExitCode;

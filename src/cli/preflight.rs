@@ -9,10 +9,11 @@ use clap::Args;
 use kube::Client;
 use tokio::time::{Instant, sleep};
 
-use super::{Scope, serve};
-use crate::controller::runtime;
-use crate::controller::runtime::leader::Identity;
+use super::rights::Rights;
+use super::serve;
+use crate::controller::runtime::KINDS;
 use crate::kubernetes::Namespaces;
+use crate::kubernetes::preflight::{access_missing, kinds_missing};
 use crate::observability::logging::Format;
 use leaderboard_api::client_errors;
 
@@ -29,8 +30,12 @@ pub(super) struct Preflight {
     /// A namespace to serve; may be given several times, or with commas. All namespaces if there is none.
     #[arg(long = "namespace", env = "LEADERBOARD_NAMESPACES", value_delimiter = ',')]
     namespaces: Vec<String>,
-    #[command(flatten)]
-    scope: Scope,
+    /// Rights to ask for, as JSON: rules of RBAC in the lists `served` (each namespace to serve), `cluster`, and `own` (this Pod's namespace).
+    #[arg(long, env = "LEADERBOARD_RIGHTS", default_value = "{}")]
+    rights: Rights,
+    /// This Pod's namespace.
+    #[arg(long, env = "POD_NAMESPACE", default_value = "default")]
+    own_namespace: String,
     /// A Service of this Pod's namespace whose programs have to be ready; may be given several times.
     #[arg(long = "ready", value_name = "SERVICE")]
     services: Vec<String>,
@@ -77,8 +82,9 @@ impl Preflight {
     /// A sentence for each thing that is missing.
     async fn missing(&self, client: &Client, http: &reqwest::Client) -> Vec<String> {
         let namespaces = Namespaces::of(self.namespaces.iter().cloned());
-        let lease = self.scope.lease(Identity::of_pod("preflight", ""));
-        let mut missing = runtime::missing(client, &namespaces, self.scope.cluster_rights, &lease).await;
+        let needs = self.rights.needs(&namespaces, &self.own_namespace);
+        let mut missing: Vec<String> = kinds_missing(client, &KINDS).await.into_iter().collect();
+        missing.extend(access_missing(client, &needs).await);
         for service in &self.services {
             let unready = match address(service, |name| env::var(name).ok()) {
                 Ok(address) => unready(http, address).await,

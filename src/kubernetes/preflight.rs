@@ -1,7 +1,6 @@
-//! What a process asks of the cluster before it works: that our kinds are served, and that it may do what it has to.
+//! Questions to the API server about itself: whether it serves our kinds, and whether it grants rights.
 //!
-//! Called at the start. Does not give up: CRDs and roles may be applied after the operator. The log and readiness show what
-//! is missing.
+//! Controller and bridge wait for the kinds at their start, because the definitions may be applied after the operator. `helm test` asks for both.
 
 use std::fmt;
 use std::time::Duration;
@@ -19,14 +18,10 @@ use leaderboard_api::{GROUP, VERSION};
 
 /// Name of the check for our kinds.
 const KINDS_CHECK: &str = "custom resources";
-/// Name of the check for permissions.
-const ACCESS_CHECK: &str = "permissions";
 /// For any one request.
 const CALL_LIMIT: Duration = Duration::from_secs(10);
 /// Between checks of the kinds.
 const KINDS_PAUSE: Duration = Duration::from_secs(2);
-/// Between checks of the permissions.
-const ACCESS_PAUSE: Duration = Duration::from_secs(30);
 /// Requests at once.
 const AT_ONCE: usize = 8;
 
@@ -60,13 +55,10 @@ impl fmt::Display for Need<'_> {
     }
 }
 
-/// Registers both checks, so that the process is not ready before they are answered.
+/// Registers the check for the kinds, so that the process is not ready before it is answered.
 pub fn register(telemetry: &Observability) {
-    for check in [KINDS_CHECK, ACCESS_CHECK] {
-        telemetry
-            .readiness
-            .set(check, Err("the API server has not been asked yet".to_owned()));
-    }
+    let unasked = Err("the API server has not been asked yet".to_owned());
+    telemetry.readiness.set(KINDS_CHECK, unasked);
 }
 
 /// Waits until the API server serves our kinds. False: the process was stopped meanwhile.
@@ -116,22 +108,6 @@ pub async fn kinds_missing(client: &Client, plurals: &[&str]) -> Option<String> 
             missing.join(", ")
         )
     })
-}
-
-/// Asks until everything is allowed, and reports what is not. Runs as a task of its own: much may work meanwhile.
-pub async fn watch_access(client: Client, needs: &[Need<'_>], telemetry: &Observability) {
-    loop {
-        let missing = access_missing(&client, needs).await;
-        if missing.is_empty() {
-            return telemetry.readiness.set(ACCESS_CHECK, Ok(()));
-        }
-        let missing = missing.join("; ");
-        tracing::error!(missing, "permissions are missing");
-        telemetry.readiness.set(ACCESS_CHECK, Err(missing));
-        if !pause(ACCESS_PAUSE, telemetry).await {
-            return;
-        }
-    }
 }
 
 /// A sentence for each need that is not met, in the order of needs.

@@ -8,10 +8,10 @@ use kube::runtime::wait::await_condition;
 use kube::{Api, Client, Config};
 use leaderboard_api::{Leaderboard, conditions};
 use leaderboard_operator::allowed::Allowed;
-use leaderboard_operator::controller::runtime;
-use leaderboard_operator::controller::runtime::leader::{self, Identity};
+use leaderboard_operator::cli::rights::Rights;
 use leaderboard_operator::controller::settings::Settings;
 use leaderboard_operator::kubernetes::Namespaces;
+use leaderboard_operator::kubernetes::preflight::access_missing;
 use serde_json::{Value, json};
 use tokio::time::timeout;
 
@@ -24,17 +24,17 @@ use crate::support::apiserver::server;
 const CHART: &str = include_str!("../../charts/leaderboard-operator/templates/controller-rbac.yaml");
 /// A right applies a moment after it was given, and the API server reports nothing then: it is asked this often.
 const POLL: std::time::Duration = std::time::Duration::from_millis(50);
+const SERVED: &str = r#"{{- define "operator.controller.rules" }}"#;
+const CLUSTER: &str = r#"{{- define "operator.controller.clusterRules" }}"#;
+const OWN: &str = r#"{{- define "operator.controller.ownRules" }}"#;
 const GROUP: &str = "rbac.authorization.k8s.io";
 
-/// The rules between the template's line that begins so and the next `{{- end }}` or `---`.
+/// The rules between the template's line that begins so and the next `{{- end }}`.
 fn rules(begin: &str) -> Vec<PolicyRule> {
     let (_, rest) = CHART
         .split_once(begin)
         .unwrap_or_else(|| panic!("the template has no {begin}"));
-    let lines = rest
-        .lines()
-        .skip(1)
-        .take_while(|line| !line.starts_with("{{- end }}") && *line != "---");
+    let lines = rest.lines().skip(1).take_while(|line| !line.starts_with("{{- end }}"));
     let text: Vec<String> = lines
         .map(|line| line.replace(r#"{{ include "operator.fullname" . }}"#, LEASE_NAME))
         .collect();
@@ -69,10 +69,9 @@ async fn grant(client: &Client, namespace: &str, name: &str, user: &str, rules: 
 async fn installed(client: &Client, release: &str, namespaces: &[&str]) -> Config {
     let user = format!("controller-of-{release}");
     for namespace in namespaces {
-        let of_runs = rules(r#"{{- define "operator.controller.rules" }}"#);
-        grant(client, namespace, "controller", &user, &of_runs).await;
+        grant(client, namespace, "controller", &user, &rules(SERVED)).await;
     }
-    grant(client, release, "lease", &user, &rules("\nrules:")).await;
+    grant(client, release, "lease", &user, &rules(OWN)).await;
     let secret = json!([{"apiGroups": [""], "resources": ["secrets"], "resourceNames": ["evalai"], "verbs": ["get"]}]);
     grant(
         client,
@@ -83,7 +82,7 @@ async fn installed(client: &Client, release: &str, namespaces: &[&str]) -> Confi
     )
     .await;
     let params = PostParams::default();
-    let of_cluster = role(&user, &rules(r#"{{- define "operator.controller.clusterRules" }}"#));
+    let of_cluster = role(&user, &rules(CLUSTER));
     let roles: Api<ClusterRole> = Api::all(client.clone());
     roles
         .create(&params, &serde_json::from_value(of_cluster).unwrap())
@@ -150,8 +149,10 @@ async fn the_preflight_lacks_nothing_with_the_charts_rights_and_names_what_is_ta
     until_known(&config, &[release]).await;
     let client = Client::try_from(config).unwrap();
     let served = Namespaces::of([release.to_owned()]);
-    let lease = leader::Settings::new(release, LEASE_NAME, Identity::of_pod("preflight", ""));
-    let missing = async || runtime::missing(&client, &served, true, &lease).await;
+    let rules = json!({"served": rules(SERVED), "cluster": rules(CLUSTER), "own": rules(OWN)});
+    let rights: Rights = rules.to_string().parse().unwrap();
+    let needs = rights.needs(&served, release);
+    let missing = async || access_missing(&client, &needs).await;
     let granted = async {
         while !missing().await.is_empty() {
             tokio::time::sleep(POLL).await;
@@ -163,13 +164,13 @@ async fn the_preflight_lacks_nothing_with_the_charts_rights_and_names_what_is_ta
     let bindings: Api<RoleBinding> = Api::namespaced(world.client.clone(), release);
     bindings.delete("lease", &DeleteParams::default()).await.unwrap();
     let taken = async {
-        while missing().await.len() < 2 {
+        while missing().await.len() < 3 {
             tokio::time::sleep(POLL).await;
         }
     };
     timeout(LIMIT, taken).await.expect("the rights are taken away");
-    // Reading Leases is part of another role too.
-    let lines = ["create leases", "update leases"].map(|verb| format!("may not {verb} of coordination.k8s.io"));
+    let lines =
+        ["create leases", "get leases", "update leases"].map(|verb| format!("may not {verb} of coordination.k8s.io"));
     for (line, begin) in missing().await.iter().zip(&lines) {
         assert!(
             line.starts_with(begin) && line.contains(&format!("in namespace {release}")),

@@ -10,7 +10,6 @@ mod events;
 mod gpu_holders;
 mod inbox;
 pub mod leader;
-mod needs;
 mod queue;
 mod reconciles;
 mod sweep;
@@ -38,8 +37,8 @@ use crate::controller::submissions::observe::workers::Workers;
 use crate::controller::submissions::phases::Phase;
 use crate::controller::submissions::reruns::Reruns;
 use crate::kubernetes::objects::Event;
-use crate::kubernetes::preflight::{self, access_missing, await_kinds, kinds_missing, watch_access};
-use crate::kubernetes::{Namespaces, spawn_uncached};
+use crate::kubernetes::preflight::{self, await_kinds};
+use crate::kubernetes::spawn_uncached;
 use crate::observability::Observability;
 use crate::observability::tasks::TaskFailed;
 use crate::page::Page;
@@ -59,7 +58,7 @@ use watches::Watches;
 const DRAIN: Duration = Duration::from_secs(20);
 
 /// Plurals of the kinds that it works on.
-const KINDS: [&str; 2] = ["leaderboards", "submissions"];
+pub const KINDS: [&str; 2] = ["leaderboards", "submissions"];
 
 /// Why the controller ended.
 #[derive(thiserror::Error, Debug)]
@@ -101,8 +100,6 @@ pub async fn run(
         if !await_kinds(&clients.api, &KINDS, &telemetry).await {
             return Ok(());
         }
-        let rights = watch_rights(clients.api.clone(), settings.clone(), lease.clone(), telemetry.clone());
-        telemetry.tasks.may_end("permissions", rights);
         let watches = Watches::start(&clients.watch, &settings, &telemetry);
         telemetry.readiness.registered();
         let leader = leader::start(clients.lease, lease, &telemetry);
@@ -130,23 +127,6 @@ pub async fn run(
         failed = tasks.failed() => Err(failed.into()),
         result = work => result,
     }
-}
-
-/// What a controller of this scope lacks in the cluster, one sentence each.
-pub async fn missing(
-    client: &Client,
-    namespaces: &Namespaces,
-    has_cluster_rights: bool,
-    lease: &leader::Settings,
-) -> Vec<String> {
-    let kinds = kinds_missing(client, &KINDS).await;
-    let needs = needs::needs(namespaces, has_cluster_rights, lease);
-    kinds.into_iter().chain(access_missing(client, &needs).await).collect()
-}
-
-async fn watch_rights(client: Client, settings: Settings, lease: leader::Settings, telemetry: Observability) {
-    let needs = needs::needs(&settings.namespaces, settings.has_cluster_rights, &lease);
-    watch_access(client, &needs, &telemetry).await;
 }
 
 /// One client for calls, one whose dead connections end for watches, one without retries for the lease.
