@@ -151,7 +151,6 @@ def work(controller: str, namespace: str) -> list[Access]:
         *may(controller, "create patch", "events.k8s.io/events", namespace),
         *may(controller, "list watch create patch", "networking.k8s.io/networkpolicies", namespace),
         *may(controller, "get list create patch delete", "resource.k8s.io/resourceclaimtemplates", namespace),
-        *may(controller, "get", "coordination.k8s.io/leases", namespace, "another"),
     ]
 
 
@@ -229,15 +228,14 @@ def lease(controller: str) -> list[Access]:
     return [
         *may(controller, "create", "coordination.k8s.io/leases", SYSTEM),
         *may(controller, "get update", "coordination.k8s.io/leases", SYSTEM, RELEASE),
-        *may(controller, "get", "coordination.k8s.io/leases", SYSTEM, "another"),
+        *may_not(controller, "get", "coordination.k8s.io/leases", SYSTEM, "another"),
     ]
 
 
 # Of the ClusterRole, unless rbac.clusterRole is false.
 WHOLE = (
     *may(CONTROLLER, "get list watch", "nodes", ""),
-    *may(CONTROLLER, "get", "coordination.k8s.io/leases", "other", "another"),
-    *may_not(CONTROLLER, "list watch", "coordination.k8s.io/leases", ""),
+    *may_not(CONTROLLER, "get list watch", "coordination.k8s.io/leases", ""),
     *may_not(CONTROLLER, "list", "pods", ""),
 )
 # One leaderboard's namespace, with the values' defaults.

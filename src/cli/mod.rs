@@ -118,8 +118,7 @@ struct Controller {
 /// What a controller has rights to besides its namespaces.
 #[derive(Args, Debug)]
 struct Scope {
-    /// Whether the operator may read nodes, and Leases in all namespaces. Without it a lost node is noticed later, and another
-    /// installation only where this one serves.
+    /// Whether the operator may read nodes. Without it a lost node is noticed later.
     #[arg(long, env = "LEADERBOARD_CLUSTER_RIGHTS", default_value_t = true, action = clap::ArgAction::Set)]
     cluster_rights: bool,
     /// Namespace of the Lease: the operator's own.

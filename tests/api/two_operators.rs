@@ -3,15 +3,21 @@
 
 use k8s_openapi::api::batch::v1::Job;
 use k8s_openapi::api::coordination::v1::Lease;
+use k8s_openapi::api::events::v1::Event;
 use kube::ResourceExt;
-use kube::api::{DeleteParams, Patch, PatchParams, PostParams};
+use kube::api::{ListParams, Patch, PatchParams};
 use kube::runtime::wait::await_condition;
-use leaderboard_api::{Leaderboard, Submission};
+use leaderboard_api::{Leaderboard, Submission, reasons};
 use serde_json::json;
 use tokio::time::timeout;
 
+use std::time::Duration;
+
 use super::bridge::LIMIT;
 use super::world::World;
+
+/// Between two looks at the events.
+const POLL: Duration = Duration::from_millis(50);
 
 /// Which image of the operator made a Job.
 fn made_by(job: &Job) -> Vec<String> {
@@ -41,7 +47,7 @@ async fn until_driven_by(world: &World, leaderboard: &str, operator: &str) {
 }
 
 #[tokio::test(flavor = "multi_thread", worker_threads = 2)]
-async fn of_two_operators_in_one_namespace_one_makes_the_jobs_and_the_other_takes_over() {
+async fn of_two_operators_in_one_namespace_one_makes_the_jobs_until_a_person_hands_the_leaderboard_over() {
     let world = World::new().await;
     let first = world.installation("first", "operator:1");
     until_held(&world, "first", true).await;
@@ -62,8 +68,9 @@ async fn of_two_operators_in_one_namespace_one_makes_the_jobs_and_the_other_take
 
     drop(first);
     until_held(&world, "first", false).await;
-    let leases = world.api::<Lease>();
-    leases.delete("first", &DeleteParams::default()).await.unwrap();
+    let hand_over = Patch::Merge(json!({"status": {"operator": null}}));
+    let boards = world.api::<Leaderboard>();
+    boards.patch_status("lb", &PatchParams::default(), &hand_over).await.unwrap();
     until_driven_by(&world, "lb", "second").await;
     let (_, name) = world.submit("lb", 1).await;
     let makers = made_by(&world.job(&name, 0).await);
@@ -74,16 +81,10 @@ async fn of_two_operators_in_one_namespace_one_makes_the_jobs_and_the_other_take
 }
 
 #[tokio::test(flavor = "multi_thread", worker_threads = 2)]
-async fn what_another_installation_drives_is_left_alone_while_its_lease_is_held() {
+async fn what_another_installation_drives_is_left_alone_and_an_event_has_the_command_that_hands_it_over() {
     let world = World::new().await;
     world.leaderboard("theirs", 1, "Hosts").await;
     world.leaderboard("ours", 2, "Hosts").await;
-    let lease = json!({
-        "metadata": {"name": "other"},
-        "spec": {"holderIdentity": "somebody", "leaseDurationSeconds": 3600, "leaseTransitions": 1},
-    });
-    let lease: Lease = serde_json::from_value(lease).unwrap();
-    world.api().create(&PostParams::default(), &lease).await.unwrap();
     let boards = world.api::<Leaderboard>();
     let claim = Patch::Merge(json!({"status": {"operator": format!("{}/other", world.namespace)}}));
     let claimed = boards
@@ -101,8 +102,21 @@ async fn what_another_installation_drives_is_left_alone_while_its_lease_is_held(
     let submission = world.api::<Submission>().get(&left).await.unwrap();
     assert_eq!(submission.status, None);
 
-    let leases = world.api::<Lease>();
-    leases.delete("other", &DeleteParams::default()).await.unwrap();
+    let is_reported = |event: &Event| {
+        let note = event.note.as_deref().unwrap_or_default();
+        event.reason.as_deref() == Some(reasons::OTHER_OPERATOR)
+            && note.contains("patch leaderboard theirs --subresource=status --type=merge -p '{\"status\":{\"operator\":null}}'")
+    };
+    let events = world.api::<Event>();
+    let reported = async {
+        while !events.list(&ListParams::default()).await.unwrap().iter().any(is_reported) {
+            tokio::time::sleep(POLL).await;
+        }
+    };
+    timeout(LIMIT, reported).await.expect("an event reports it");
+
+    let hand_over = Patch::Merge(json!({"status": {"operator": null}}));
+    boards.patch_status("theirs", &PatchParams::default(), &hand_over).await.unwrap();
     world.job(&left, 0).await;
     until_driven_by(&world, "theirs", "operator").await;
 }

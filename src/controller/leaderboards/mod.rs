@@ -7,7 +7,6 @@
 mod check;
 pub mod claims;
 pub mod decide;
-mod foreign;
 pub mod isolation;
 pub mod looks;
 pub mod operator;
@@ -28,6 +27,7 @@ use std::time::Duration;
 
 use jiff::Timestamp;
 use kube::Client;
+use kube::runtime::events::Recorder;
 use tokio::sync::mpsc::UnboundedSender;
 use tokio::time::Instant;
 
@@ -53,6 +53,7 @@ const FIRST_LOOK: Duration = Duration::from_secs(2);
 #[derive(Clone, Copy)]
 pub struct Uses<'a> {
     pub policies: Policies<'a>,
+    pub recorder: &'a Recorder,
     pub settings: &'a Settings,
     pub slots: &'a SlotAllocator,
     pub teams: &'a Teams,
@@ -72,7 +73,7 @@ pub enum Reconciled {
 /// One reconcile.
 pub async fn reconcile(leaderboard: Arc<Leaderboard>, uses: Uses<'_>) -> Result<Reconciled, CallError> {
     let Policies { client, state, .. } = uses.policies;
-    match operator::ours(client, state, Arc::clone(&leaderboard), &uses.settings.operator).await? {
+    match operator::ours(client, uses.recorder, state, Arc::clone(&leaderboard), &uses.settings.operator).await? {
         Ok(ours) => drive(ours, uses).await.map(Reconciled::Done),
         Err(wait) => {
             uses.external.retire(&leaderboard);

@@ -1,32 +1,29 @@
 //! Which installation of the operator drives a Leaderboard: `status.operator` names it, and every other one leaves that Leaderboard
 //! and its Submissions alone.
 //!
-//! An installation is named by its Lease, `<namespace>/<name>`. It claims a Leaderboard that nobody drives before it does anything
-//! else for it, by a write that fails if another one was faster. It takes over from one whose Lease is gone, or has not changed for
-//! long. Clocks are not compared: what counts is how long this process has observed the same Lease.
+//! An installation is named by its Lease, `<namespace>/<name>`. It claims a Leaderboard that has no name yet before it does anything
+//! else for it, by a write that fails if another one was faster. A person hands a Leaderboard over by removing the name.
 
 use std::sync::Arc;
 use std::time::Duration;
 
-use k8s_openapi::api::coordination::v1::Lease;
 use kube::api::Patch;
-use kube::{Api, Client, ResourceExt};
+use kube::runtime::events::{Event, EventType, Recorder};
+use kube::{Api, Client, Resource, ResourceExt};
 use serde_json::json;
-use tokio::time::Instant;
 
-use super::foreign::Foreign;
 use super::state::{LeaderboardState, SOONEST};
 use crate::controller::objects::{key_of, uid_of};
 use crate::controller::writes::patch_by;
 use crate::kubernetes::{CallError, call};
 use leaderboard_api::{Leaderboard, names, reasons};
 
-/// The Lease of another installation is read this often.
+/// When a Leaderboard of another installation is looked at again, in the cache alone: a changed status is no event.
 const LOOK_AGAIN: Duration = Duration::from_secs(10);
+/// When a Submission of such a Leaderboard is decided on again.
+const OF_ANOTHER: Duration = Duration::from_mins(1);
 /// A Submission waits so long for the claim of its Leaderboard, which also wakes those that are pending.
 const UNCLAIMED: Duration = Duration::from_secs(2);
-/// A Submission of another installation's Leaderboard is decided on again after this long.
-const OF_ANOTHER: Duration = Duration::from_mins(1);
 
 /// Who drives a Leaderboard.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
@@ -63,62 +60,51 @@ pub fn left_alone(leaderboard: Option<&Leaderboard>, us: &str) -> Option<Duratio
     }
 }
 
-/// The Leaderboard, if this installation drives it, else when to ask again. One that nobody drives any more is taken over.
+/// The Leaderboard, if this installation drives it, else when to look again. One without a name is claimed.
 pub(super) async fn ours(
     client: &Client,
+    recorder: &Recorder,
     state: &LeaderboardState,
     leaderboard: Arc<Leaderboard>,
     us: &str,
 ) -> Result<Result<Arc<Leaderboard>, Duration>, CallError> {
     match driver(&leaderboard, us) {
-        Driver::Us => return Ok(Ok(leaderboard)),
-        Driver::Nobody => {}
+        Driver::Us => Ok(Ok(leaderboard)),
+        Driver::Nobody => claim(client, &leaderboard, us).await,
         Driver::Other(other) => {
-            if is_driven(client, state, &leaderboard, other).await {
-                return Ok(Err(LOOK_AGAIN));
+            let uid = uid_of(leaderboard.as_ref());
+            let is_known = state.read(&uid, |entry| entry.other.as_deref() == Some(other));
+            if !is_known {
+                report(recorder, &leaderboard, other, us).await;
+                state.change(&uid, |entry| entry.other = Some(other.to_owned()));
             }
-            let leaderboard = key_of(leaderboard.as_ref()).to_string();
-            tracing::info!(
-                leaderboard,
-                other,
-                "the other installation is gone, and this one takes the Leaderboard over"
-            );
+            Ok(Err(LOOK_AGAIN))
         }
     }
-    claim(client, &leaderboard, us).await
 }
 
-/// Whether another installation holds its Lease, as far as it can be known.
-async fn is_driven(client: &Client, state: &LeaderboardState, leaderboard: &Leaderboard, other: &str) -> bool {
-    let uid = uid_of(leaderboard);
-    let (namespace, name) = other.split_once('/').unwrap_or_default();
-    let api: Api<Lease> = Api::namespaced(client.clone(), namespace);
-    let known = state.read(&uid, |entry| entry.foreign.clone());
-    let is_new = known.as_ref().is_none_or(|known| known.operator != other);
-    let lease = match call("the Lease", other, api.get_opt(name)).await {
-        Ok(Some(lease)) => lease,
-        Ok(None) => return false,
-        Err(error) => {
-            let leaderboard = key_of(leaderboard).to_string();
-            tracing::warn!(leaderboard, %error, "the Lease of the installation that drives this Leaderboard cannot be read");
-            return true;
-        }
+/// Says once in the log and by an event who drives it, and how a person hands it over.
+async fn report(recorder: &Recorder, leaderboard: &Leaderboard, other: &str, us: &str) {
+    let key = key_of(leaderboard);
+    let note = format!(
+        "Installation {us} leaves this Leaderboard and its submissions alone: installation {other} drives it. If that one is uninstalled, \
+         hand the Leaderboard over: kubectl -n {} patch leaderboard {} --subresource=status --type=merge -p '{{\"status\":{{\"operator\":null}}}}'",
+        leaderboard.namespace().unwrap_or_default(),
+        leaderboard.name_any(),
+    );
+    tracing::warn!(leaderboard = %key, other, reason = reasons::OTHER_OPERATOR, "{note}");
+    let event = Event {
+        type_: EventType::Warning,
+        reason: reasons::OTHER_OPERATOR.to_owned(),
+        note: Some(note),
+        action: "LeaveAlone".to_owned(),
+        secondary: None,
     };
-    let now = Instant::now();
-    let found = Foreign::of(other, &lease, now).after(known.as_ref());
-    let is_given_up = found.is_given_up(now);
-    state.change(&uid, |entry| entry.foreign = Some(found));
-    if is_new {
-        let leaderboard = key_of(leaderboard).to_string();
-        tracing::warn!(
-            leaderboard,
-            other,
-            reason = reasons::OTHER_OPERATOR,
-            "not ready here: another installation of the operator drives this Leaderboard, and this one leaves it and its \
-             submissions alone; uninstall one of the two, or let them serve different namespaces"
-        );
+    let reference = leaderboard.object_ref(&());
+    let published = recorder.publish(&event, &reference);
+    if let Err(error) = call("an event", &key.to_string(), published).await {
+        tracing::warn!(leaderboard = %key, "{error}");
     }
-    !is_given_up
 }
 
 /// Writes our name, unless the Leaderboard has changed since it was read, by another installation perhaps.
@@ -145,37 +131,6 @@ async fn claim(
 #[cfg(test)]
 mod tests {
     use super::*;
-
-    fn lease(version: &str, seconds: i32) -> Lease {
-        let lease = json!({"metadata": {"resourceVersion": version}, "spec": {"leaseDurationSeconds": seconds}});
-        serde_json::from_value(lease).unwrap()
-    }
-
-    #[test]
-    fn a_lease_is_given_up_when_it_has_not_changed_for_long() {
-        let begin = Instant::now();
-        let at = |second| begin + Duration::from_secs(second);
-        let first = Foreign::of("a/b", &lease("1", 15), begin).after(None);
-        let read = |operator, version, seconds, second| {
-            let found = Foreign::of(operator, &lease(version, seconds), at(second)).after(Some(&first));
-            found.is_given_up(at(second))
-        };
-        for (operator, version, seconds, second, is_given_up) in [
-            ("a/b", "1", 15, 29, false),
-            ("a/b", "1", 15, 30, true),
-            ("a/b", "2", 15, 30, false),
-            ("a/c", "1", 15, 30, false),
-            ("a/b", "1", 60, 119, false),
-            ("a/b", "1", 60, 120, true),
-            ("a/b", "1", -1, 30, true),
-        ] {
-            assert_eq!(
-                read(operator, version, seconds, second),
-                is_given_up,
-                "{operator} {version} {seconds} {second}"
-            );
-        }
-    }
 
     #[test]
     fn only_the_named_installation_acts() {

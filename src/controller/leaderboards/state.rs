@@ -7,7 +7,6 @@ use std::time::Duration;
 use jiff::Timestamp;
 use tokio::time::Instant;
 
-use super::foreign::Foreign;
 use super::probe::Probe;
 use crate::lock::lock;
 use crate::pod::workspace::WorkspaceVerdict;
@@ -82,8 +81,8 @@ pub(super) struct Entry {
     pub(super) measured: Option<(Option<i64>, WorkspaceVerdict)>,
     /// What its Pods have found.
     pub(super) found: Option<Found>,
-    /// The Lease of the installation that drives it, where that is another one.
-    pub(super) foreign: Option<Foreign>,
+    /// The other installation that drives it, once that was reported.
+    pub(super) other: Option<String>,
 }
 
 impl LeaderboardState {

@@ -81,6 +81,7 @@ impl Context {
     pub fn for_leaderboards(&self) -> leaderboards::Uses<'_> {
         leaderboards::Uses {
             policies: self.policies(),
+            recorder: &self.recorder,
             settings: &self.settings,
             slots: &self.slots,
             teams: &self.teams,

@@ -18,10 +18,10 @@ reasons! {
             "The operator asks bucket, table, queues and the place of EvalAI's token for the first time, and not all have answered yet.",
             "Wait: what does not answer is named after ten seconds, an entry of Secrets Manager after a minute.";
         OTHER_OPERATOR = "OtherOperator",
-            "Only in the log and the metrics of an operator: another installation drives this Leaderboard, which `status.operator` \
-             names by its Lease. This one leaves the Leaderboard and its submissions alone, and takes over when that Lease is gone \
-             or has not been renewed for 30 s.",
-            "Uninstall one of the two, or let them serve different namespaces (`leaderboards` of the chart's values).";
+            "Only in an event, the log and the metrics of an operator: another installation drives this Leaderboard, which `status.operator` \
+             names by its Lease. This one leaves the Leaderboard and its submissions alone.",
+            "Let the two installations serve different namespaces (`leaderboards` of the chart's values), or uninstall one and hand the \
+             Leaderboard over by the command in the event.";
         TOKEN_MISSING = "TokenMissing",
             "EvalAI's token is not where `evalai.token` points.",
             "Create the Secret, or correct the reference.";
