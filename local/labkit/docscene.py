@@ -26,7 +26,7 @@ NOT_OURS = {
     "timeSlicing:": "a file of NVIDIA's device plugin",
 }
 # First lines of values of the chart that stand in other pages than its own.
-VALUES = ("networkPolicy:\n",)
+VALUES = ("networkPolicy:\n", "controller:\n")
 # What the rest of the example cannot stand next to, by page.
 INSTEAD: dict[str, dict[str, Any]] = {
     "docs/evalai.md": {"queue": None, "evalai": {"token": {"secretsManager": None}}},
