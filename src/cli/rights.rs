@@ -31,8 +31,14 @@ impl FromStr for Rights {
 impl Rights {
     /// Each right by itself.
     pub fn needs<'a>(&'a self, served: &'a Namespaces, own: &'a str) -> Vec<Need<'a>> {
-        let served = served.each().into_iter().flat_map(|namespace| all(&self.served, namespace));
-        served.chain(all(&self.cluster, None)).chain(all(&self.own, Some(own))).collect()
+        let served = served
+            .each()
+            .into_iter()
+            .flat_map(|namespace| all(&self.served, namespace));
+        served
+            .chain(all(&self.cluster, None))
+            .chain(all(&self.own, Some(own)))
+            .collect()
     }
 }
 
@@ -76,7 +82,11 @@ mod tests {
         .parse()
         .unwrap();
         let served = Namespaces::of(["one", "two"].map(str::to_owned));
-        let asked: Vec<String> = rights.needs(&served, "system").iter().map(ToString::to_string).collect();
+        let asked: Vec<String> = rights
+            .needs(&served, "system")
+            .iter()
+            .map(ToString::to_string)
+            .collect();
         assert_eq!(
             asked,
             [
@@ -97,6 +107,11 @@ mod tests {
     #[test]
     fn a_list_that_has_no_place_is_refused() {
         assert!(Rights::from_str(r#"{"clusters": []}"#).is_err());
-        assert!(Rights::from_str("{}").unwrap().needs(&Namespaces::All, "system").is_empty());
+        assert!(
+            Rights::from_str("{}")
+                .unwrap()
+                .needs(&Namespaces::All, "system")
+                .is_empty()
+        );
     }
 }

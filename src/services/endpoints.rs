@@ -106,11 +106,7 @@ mod tests {
                 None,
                 "bucket.vpce-1.s3.eu-west-1.vpce.amazonaws.com",
             ),
-            (
-                json!({"endpoint": "http://minio.storage:9000"}),
-                None,
-                "minio.storage",
-            ),
+            (json!({"endpoint": "http://minio.storage:9000"}), None, "minio.storage"),
             (json!({"endpoint": "http://10.0.0.5"}), None, "10.0.0.5"),
             (json!({"endpoint": "https://[fd12::1]:8443"}), None, "fd12::1"),
         ] {

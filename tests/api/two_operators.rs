@@ -70,7 +70,10 @@ async fn of_two_operators_in_one_namespace_one_makes_the_jobs_until_a_person_han
     until_held(&world, "first", false).await;
     let hand_over = Patch::Merge(json!({"status": {"operator": null}}));
     let boards = world.api::<Leaderboard>();
-    boards.patch_status("lb", &PatchParams::default(), &hand_over).await.unwrap();
+    boards
+        .patch_status("lb", &PatchParams::default(), &hand_over)
+        .await
+        .unwrap();
     until_driven_by(&world, "lb", "second").await;
     let (_, name) = world.submit("lb", 1).await;
     let makers = made_by(&world.job(&name, 0).await);
@@ -105,18 +108,29 @@ async fn what_another_installation_drives_is_left_alone_and_an_event_has_the_com
     let is_reported = |event: &Event| {
         let note = event.note.as_deref().unwrap_or_default();
         event.reason.as_deref() == Some(reasons::OTHER_OPERATOR)
-            && note.contains("patch leaderboard theirs --subresource=status --type=merge -p '{\"status\":{\"operator\":null}}'")
+            && note.contains(
+                "patch leaderboard theirs --subresource=status --type=merge -p '{\"status\":{\"operator\":null}}'",
+            )
     };
     let events = world.api::<Event>();
     let reported = async {
-        while !events.list(&ListParams::default()).await.unwrap().iter().any(is_reported) {
+        while !events
+            .list(&ListParams::default())
+            .await
+            .unwrap()
+            .iter()
+            .any(is_reported)
+        {
             tokio::time::sleep(POLL).await;
         }
     };
     timeout(LIMIT, reported).await.expect("an event reports it");
 
     let hand_over = Patch::Merge(json!({"status": {"operator": null}}));
-    boards.patch_status("theirs", &PatchParams::default(), &hand_over).await.unwrap();
+    boards
+        .patch_status("theirs", &PatchParams::default(), &hand_over)
+        .await
+        .unwrap();
     world.job(&left, 0).await;
     until_driven_by(&world, "theirs", "operator").await;
 }

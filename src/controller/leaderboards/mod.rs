@@ -73,7 +73,15 @@ pub enum Reconciled {
 /// One reconcile.
 pub async fn reconcile(leaderboard: Arc<Leaderboard>, uses: Uses<'_>) -> Result<Reconciled, CallError> {
     let Policies { client, state, .. } = uses.policies;
-    match operator::ours(client, uses.recorder, state, Arc::clone(&leaderboard), &uses.settings.operator).await? {
+    match operator::ours(
+        client,
+        uses.recorder,
+        state,
+        Arc::clone(&leaderboard),
+        &uses.settings.operator,
+    )
+    .await?
+    {
         Ok(ours) => drive(ours, uses).await.map(Reconciled::Done),
         Err(wait) => {
             uses.external.retire(&leaderboard);

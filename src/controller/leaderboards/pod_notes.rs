@@ -133,7 +133,11 @@ fn has_ros(text: &str) -> bool {
 pub(super) fn unnamed(tracks: &[TrackPods], hosts: Result<Vec<String>, String>) -> Option<String> {
     let hosts = match hosts {
         Ok(hosts) => hosts,
-        Err(why) => return Some(format!("With network.dns None, {why}; correct storage, logGroup or the region.")),
+        Err(why) => {
+            return Some(format!(
+                "With network.dns None, {why}; correct storage, logGroup or the region."
+            ));
+        }
     };
     let gives = |pods: &TrackPods, host: &str| {
         let mut names = list(&pods.template["spec"], "hostAliases").flat_map(|alias| list(alias, "hostnames"));
@@ -276,7 +280,11 @@ mod tests {
             track: "sensors".to_owned(),
             template: json!({"spec": {"hostAliases": [{"ip": "10.0.4.10", "hostnames": names}]}}),
         };
-        let hosts = || Ok(["b.s3.amazonaws.com", "sts.amazonaws.com", "10.0.0.5"].map(str::to_owned).to_vec());
+        let hosts = || {
+            Ok(["b.s3.amazonaws.com", "sts.amazonaws.com", "10.0.0.5"]
+                .map(str::to_owned)
+                .to_vec())
+        };
         let both = named(json!(["B.s3.amazonaws.com", "sts.amazonaws.com"]));
         assert_eq!(unnamed(&[both], hosts()), None);
         let found = unnamed(&[named(json!(["b.s3.amazonaws.com"]))], hosts()).unwrap();
@@ -284,7 +292,10 @@ mod tests {
         let found = unnamed(&[], hosts());
         assert_eq!(found, None, "without a track there is no Pod");
         let found = unnamed(&[], Err("the endpoint of S3 is not known".to_owned())).unwrap();
-        assert!(found.starts_with("With network.dns None, the endpoint of S3 is not known; "), "{found}");
+        assert!(
+            found.starts_with("With network.dns None, the endpoint of S3 is not known; "),
+            "{found}"
+        );
     }
 
     #[test]

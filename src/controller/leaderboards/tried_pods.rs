@@ -51,7 +51,10 @@ pub(super) async fn try_pods(client: &Client, settings: &Settings, leaderboard: 
     let mut templates = jobs.iter().map(|(_, job)| template(job));
     let unclear = templates.find_map(|template| job_spec::unclear(&leaderboard.spec, &template));
     TriedPods {
-        notes: notes(&pods).into_iter().chain(pod_notes::unnamed(&pods, hosts)).collect(),
+        notes: notes(&pods)
+            .into_iter()
+            .chain(pod_notes::unnamed(&pods, hosts))
+            .collect(),
         classes: priority::asked(&leaderboard.spec.tracks, &pods),
         refused: match (unclear, jobs.first()) {
             (Some(unclear), _) => Some(unclear),

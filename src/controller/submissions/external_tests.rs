@@ -15,8 +15,8 @@ use super::*;
 use crate::controller::fixtures::{Cluster, Surroundings, leaderboard, surroundings, with_job};
 use crate::controller::submissions::team_history::TeamHistory;
 use crate::controller::submissions::view::{
-    ObservedFence, ObservedImage, ObservedJob, ObservedLog, ObservedNode, ObservedReport,
-    ObservedRoutes, ObservedTexts, ObservedTraces, Turn,
+    ObservedFence, ObservedImage, ObservedJob, ObservedLog, ObservedNode, ObservedReport, ObservedRoutes,
+    ObservedTexts, ObservedTraces, Turn,
 };
 use leaderboard_api::conditions::{self, Truth};
 use leaderboard_api::{Attempt, State};

@@ -6,8 +6,8 @@ use std::time::Duration;
 use super::plan::{Action, EvalaiUpdate, TableUpdate};
 use super::plan_builder::{PlanBuilder, after};
 use super::{
-    accept, clock, crashes, disk, end, failure, interruption, isolation, line, reading, reported, requeue,
-    restored, start, stop,
+    accept, clock, crashes, disk, end, failure, interruption, isolation, line, reading, reported, requeue, restored,
+    start, stop,
 };
 use crate::controller::submissions::job_spec;
 use crate::controller::submissions::report_digest::ReportDigest;

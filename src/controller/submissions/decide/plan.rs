@@ -3,11 +3,11 @@
 use std::time::Duration;
 
 use crate::controller::slots::turns::InLine;
+use crate::controller::submissions::foreign_runs;
 use crate::controller::submissions::images::Question;
 use crate::controller::submissions::other_results;
 use crate::controller::submissions::report_digest::ReportId;
 use crate::controller::submissions::view::{LogPlace, ReportDemand};
-use crate::controller::submissions::foreign_runs;
 use crate::pod::run::Stop;
 use leaderboard_api::{JobNumber, SubmissionStatus, names};
 

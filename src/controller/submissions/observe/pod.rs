@@ -223,7 +223,11 @@ mod tests {
             found.begins_anew
         };
         assert!(seen("containerd://b", "containerd://a"));
-        for (newest, last) in [("containerd://a", "containerd://a"), ("", "containerd://a"), ("containerd://b", "")] {
+        for (newest, last) in [
+            ("containerd://a", "containerd://a"),
+            ("", "containerd://a"),
+            ("containerd://b", ""),
+        ] {
             assert!(!seen(newest, last), "{newest} {last}");
         }
     }

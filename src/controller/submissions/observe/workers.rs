@@ -23,12 +23,7 @@ pub struct Workers {
 
 impl Workers {
     /// Starts them. What `wake` makes is called for each submission that has its answer.
-    pub fn start(
-        aws: &Aws,
-        client: &Client,
-        tasks: &Tasks,
-        wake: impl Fn() -> Wake<Submission>,
-    ) -> Self {
+    pub fn start(aws: &Aws, client: &Client, tasks: &Tasks, wake: impl Fn() -> Wake<Submission>) -> Self {
         Self {
             archive: ArchiveWorkers::new(aws.clone(), client.clone(), tasks.clone(), wake()),
             lookups: Lookups::start(client.clone(), tasks, wake()),

@@ -13,9 +13,9 @@ use crate::controller::submissions::foreign_runs::{Looked, Traces, Unread};
 use crate::controller::submissions::report_digest::ReportDigest;
 use crate::controller::submissions::team_history::TeamHistory;
 use crate::controller::submissions::view::{
-    ContainerView, EndView, EvalaiEnd, EvalaiInfo, EvalaiView, JobEnd, JobView, ObservedFence,
-    ObservedImage, ObservedJob, ObservedLog, ObservedNode, ObservedReport, ObservedRoutes, ObservedTexts,
-    ObservedTraces, PodView, RecordView, Stage, Standing, Texts, Turn, View,
+    ContainerView, EndView, EvalaiEnd, EvalaiInfo, EvalaiView, JobEnd, JobView, ObservedFence, ObservedImage,
+    ObservedJob, ObservedLog, ObservedNode, ObservedReport, ObservedRoutes, ObservedTexts, ObservedTraces, PodView,
+    RecordView, Stage, Standing, Texts, Turn, View,
 };
 use crate::pod::report::{Report, ReportPair};
 use crate::pod::run::Stop;

@@ -41,7 +41,11 @@ fn a_crash_counts_once_while_its_container_is_about_to_begin_again() {
             });
         }
         world.go_to(101);
-        let reason = if begins_anew { reasons::RUNNING } else { reasons::STOPPING };
+        let reason = if begins_anew {
+            reasons::RUNNING
+        } else {
+            reasons::STOPPING
+        };
         let plan = world.pass_to(Running, reason);
         assert_eq!(plan.status.pairs[0].crashes, if begins_anew { 3 } else { 4 });
     }

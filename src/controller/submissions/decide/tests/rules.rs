@@ -197,10 +197,7 @@ fn status_is_whole(plan: &Plan) {
     let waits = |action: &Action| {
         matches!(
             action,
-            Action::JoinLine(_)
-                | Action::AskEvalai
-                | Action::LookUpImage(_)
-                | Action::LookForForeignRun(_)
+            Action::JoinLine(_) | Action::AskEvalai | Action::LookUpImage(_) | Action::LookForForeignRun(_)
         )
     };
     if *status == SubmissionStatus::default() && plan.actions.iter().any(waits) {
