@@ -269,7 +269,7 @@ mod tests {
             let expected = format!("the agents of the track {track} meet on one ROS1 master (11311)");
             assert!(found.iter().all(|note| note.contains(&expected)), "{found:?}");
         }
-        // Alone in its Pod an agent meets nobody.
+        // One agent alone in its Pod meets no other.
         let alone = with("env", json!([{"name": "ROS_DISTRO", "value": "humble"}]));
         assert!(notes(&[pods("sensors", alone, &json!([]))]).is_empty());
     }

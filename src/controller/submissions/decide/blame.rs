@@ -73,7 +73,7 @@ pub(super) fn last_crash(
     }
 }
 
-/// Both sides were ended in one round, and by nobody of the Pod: its sandbox was made anew, or its node started again. An agent can end
+/// Both sides were ended in one round, and by no process of the Pod: its sandbox was made anew, or its node started again. An agent can end
 /// itself in whatever way, but not its simulator so.
 fn from_outside(simulator: Option<&ContainerView>, agent: Option<&ContainerView>) -> Option<Crash> {
     fn ended(container: &ContainerView) -> Option<&EndView> {

@@ -4,6 +4,7 @@ mod accept;
 mod after;
 mod allowance;
 mod blame;
+mod blame_of_neither;
 mod builders;
 mod check;
 mod clock;

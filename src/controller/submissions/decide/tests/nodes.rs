@@ -1,10 +1,11 @@
-//! Nodes that are lost, silent or late under a run.
+//! Nodes that admit no Pod, end one, or are lost, silent or late under a run.
 
 use super::builders::*;
 use crate::controller::submissions::decide::Action;
-use crate::controller::submissions::view::{ObservedNode, PodView};
+use crate::controller::submissions::view::{ObservedNode, ObservedReport, PodView};
+use leaderboard_api::FailureClass::Infrastructure;
 use leaderboard_api::State::{Pending, Running};
-use leaderboard_api::{Attempt, JobNumber, reasons};
+use leaderboard_api::{Attempt, FailedNode, JobNumber, reasons};
 
 #[test]
 fn a_node_that_does_not_come_back_is_given_up_and_another_job_made() {
@@ -153,4 +154,45 @@ fn a_kubelet_that_comes_back_in_time_keeps_its_pod() {
     world.go_to(500);
     let plan = world.pass_to(Running, reasons::REPLACING);
     assert_eq!(plan.status.failure, None);
+}
+
+#[test]
+fn a_pod_that_its_node_does_not_admit_ends_its_job_with_the_kubelets_words() {
+    let words = "Pod was rejected: Allocate failed due to requested number of devices unavailable for nvidia.com/gpu. Requested: 1, \
+                 Available: 0, which is unexpected";
+    let mut world = World::local().with_pod();
+    for jobs in [1, 2] {
+        world.view.pod = Some(pod(0));
+        world.pod().ended_by_node = Some(("UnexpectedAdmissionError".into(), words.into()));
+        let plan = world.pass_to(Pending, reasons::STOPPING);
+        assert!(has(&plan, |a| matches!(a, Action::DeleteJob { .. })));
+        let failure = plan.status.failure.unwrap();
+        assert_eq!(failure.class, Infrastructure);
+        assert_eq!(
+            failure.message,
+            format!("On node node-a the kubelet did not admit the Pod (UnexpectedAdmissionError): {words}.")
+        );
+        world.job_gone();
+        let plan = world.pass_to(Pending, reasons::REPLACING);
+        let node_name = "node-a".into();
+        assert_eq!(plan.status.failed_nodes, [FailedNode { node_name, jobs }]);
+        world.wait(60);
+        assert!(creates(&world.pass()));
+        world.see_job();
+        world.view.report = ObservedReport::NotRead;
+    }
+}
+
+#[test]
+fn a_pod_that_its_kubelet_ended_shows_why_and_its_job_makes_another() {
+    for reason in ["OutOfcpu", "NodeShutdown"] {
+        let mut world = World::local().with_pod();
+        world.pod().ended_by_node = Some((reason.into(), "Pod was rejected: no more of it".into()));
+        let plan = world.pass_to(Pending, reasons::REPLACING);
+        let message = plan.status.message.unwrap();
+        let begin =
+            format!("On node node-a the kubelet ended the Pod ({reason}): Pod was rejected: no more of it. A new Pod");
+        assert!(message.starts_with(&begin), "{message}");
+        assert_eq!(plan.status.failure, None);
+    }
 }

@@ -4,7 +4,7 @@ use std::time::Duration;
 
 use super::builders::*;
 use crate::controller::submissions::decide::{Action, EvalaiUpdate};
-use crate::controller::submissions::view::{ContainerView, ObservedReport};
+use crate::controller::submissions::view::ContainerView;
 use crate::pod::run::Stop;
 use leaderboard_api::FailureClass::{self, Infrastructure, Participant};
 use leaderboard_api::State::{Failed, Pending, Running};
@@ -244,47 +244,6 @@ fn a_node_that_cannot_start_a_container_is_named_and_remembered() {
     assert!(message.contains("It was tried for 1800 s on node node-a."), "{message}");
     let node_name = "node-a".into();
     assert_eq!(plan.status.failed_nodes, [FailedNode { node_name, jobs: 1 }]);
-}
-
-#[test]
-fn a_pod_that_its_node_does_not_admit_ends_its_job_with_the_kubelets_words() {
-    let words = "Pod was rejected: Allocate failed due to requested number of devices unavailable for nvidia.com/gpu. Requested: 1, \
-                 Available: 0, which is unexpected";
-    let mut world = World::local().with_pod();
-    for jobs in [1, 2] {
-        world.view.pod = Some(pod(0));
-        world.pod().ended_by_node = Some(("UnexpectedAdmissionError".into(), words.into()));
-        let plan = world.pass_to(Pending, reasons::STOPPING);
-        assert!(has(&plan, |a| matches!(a, Action::DeleteJob { .. })));
-        let failure = plan.status.failure.unwrap();
-        assert_eq!(failure.class, Infrastructure);
-        assert_eq!(
-            failure.message,
-            format!("On node node-a the kubelet did not admit the Pod (UnexpectedAdmissionError): {words}.")
-        );
-        world.job_gone();
-        let plan = world.pass_to(Pending, reasons::REPLACING);
-        let node_name = "node-a".into();
-        assert_eq!(plan.status.failed_nodes, [FailedNode { node_name, jobs }]);
-        world.wait(60);
-        assert!(creates(&world.pass()));
-        world.see_job();
-        world.view.report = ObservedReport::NotRead;
-    }
-}
-
-#[test]
-fn a_pod_that_its_kubelet_ended_shows_why_and_its_job_makes_another() {
-    for reason in ["OutOfcpu", "NodeShutdown"] {
-        let mut world = World::local().with_pod();
-        world.pod().ended_by_node = Some((reason.into(), "Pod was rejected: no more of it".into()));
-        let plan = world.pass_to(Pending, reasons::REPLACING);
-        let message = plan.status.message.unwrap();
-        let begin =
-            format!("On node node-a the kubelet ended the Pod ({reason}): Pod was rejected: no more of it. A new Pod");
-        assert!(message.starts_with(&begin), "{message}");
-        assert_eq!(plan.status.failure, None);
-    }
 }
 
 #[test]
