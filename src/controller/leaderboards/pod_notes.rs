@@ -7,8 +7,6 @@ use std::net::IpAddr;
 
 use serde_json::Value;
 
-use crate::controller::submissions::baseline;
-
 /// Pods of one track.
 pub(super) struct TrackPods {
     pub(super) track: String,
@@ -17,24 +15,10 @@ pub(super) struct TrackPods {
 
 /// One sentence or two for each thing.
 pub(super) fn notes(tracks: &[TrackPods]) -> Vec<String> {
-    [weak(tracks), secrets(tracks), unbounded(tracks), ros(tracks)]
+    [secrets(tracks), unbounded(tracks), ros(tracks)]
         .into_iter()
         .flatten()
         .collect()
-}
-
-fn weak(tracks: &[TrackPods]) -> Option<String> {
-    let found: BTreeSet<String> = tracks
-        .iter()
-        .flat_map(|pods| baseline::weaknesses(&pods.template))
-        .collect();
-    (!found.is_empty()).then(|| {
-        format!(
-            "Weaker than Pod Security baseline: {}. The namespace has to allow the level privileged, and what breaks out of such a \
-             container is on the node; remove it, or keep nodes for these Pods alone.",
-            listed(found)
-        )
-    })
 }
 
 fn secrets(tracks: &[TrackPods]) -> Option<String> {
@@ -155,7 +139,8 @@ pub(super) fn unnamed(tracks: &[TrackPods], hosts: Result<Vec<String>, String>) 
 }
 
 fn agents(pod: &Value) -> impl Iterator<Item = &Value> {
-    baseline::containers(pod).filter(|container| {
+    let lists = ["initContainers", "containers"].map(|field| list(pod, field));
+    lists.into_iter().flatten().filter(|container| {
         let name = container["name"].as_str();
         name.is_some_and(|name| name.starts_with("agent-"))
     })
@@ -296,15 +281,5 @@ mod tests {
             found.starts_with("With network.dns None, the endpoint of S3 is not known; "),
             "{found}"
         );
-    }
-
-    #[test]
-    fn what_is_weaker_than_baseline_is_named_with_its_container() {
-        let privileged = with("securityContext", json!({"privileged": true}));
-        let volumes = json!([{"name": "x11", "hostPath": {"path": "/tmp/.X11-unix"}}]);
-        let found = notes(&[pods("a", privileged, &volumes)]);
-        assert_eq!(found.len(), 1);
-        let expected = "Weaker than Pod Security baseline: Pod: hostPath /tmp/.X11-unix, agents: privileged. ";
-        assert!(found[0].starts_with(expected), "{found:?}");
     }
 }

@@ -2,11 +2,10 @@
 //!
 //! It observes (`observe`: caches and memory), decides (`decide`: pure) and acts (`act`). What it needs of S3 the workers of
 //! `archive` read and write next to it.
-//! `job_spec` and `pod_overlay` build what is created in the cluster, `baseline` judges it; they know no client and no clock.
+//! `job_spec` and `pod_overlay` build what is created in the cluster; they know no client and no clock.
 
 pub mod act;
 pub mod archive;
-pub mod baseline;
 pub mod decide;
 pub mod external;
 pub mod failure_log;
