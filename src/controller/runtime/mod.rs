@@ -261,7 +261,7 @@ impl Parts {
         context
     }
 
-    /// Why Jobs have no Pod and Pods no node, as events show. Without the right to them no reason is shown, and `/readyz` names it.
+    /// Why Jobs have no Pod and Pods no node, as events show. Without the right to them no reason is shown, and the log names it.
     fn causes(&self, queues: &Queues) -> Causes {
         let causes = Causes::default();
         let objects = Objects {

@@ -33,7 +33,7 @@ pub(super) fn missing(draft: &PlanBuilder<'_>) -> Option<Missing> {
         ),
         None => format!(
             "The NetworkPolicy of Leaderboard {name} is not in place yet; the submission goes on once it is. If this lasts, look \
-             at the Leaderboard's condition Isolated, and at /readyz of the controller for a missing right."
+             at the Leaderboard's condition Isolated; `helm test` names a missing right."
         ),
     };
     Some(Missing { message, is_refused })
