@@ -76,19 +76,27 @@ fn a_port_behind_the_servers_own_that_another_container_has_taken_is_reported() 
 /// No table of the kernel shows such a socket.
 #[test]
 fn a_port_that_another_container_has_without_listening_is_reported_when_the_server_is_not_ready() {
-    let pod = Pod::new();
     let holds = "import socket, sys
 held = socket.socket()
 held.bind(('0.0.0.0', int(sys.argv[1])))
 print('held', flush=True)
 sys.stdin.read()";
-    let mut holder = Command::new("python3")
-        .args(["-c", holds, &pod.port.to_string()])
-        .stdin(Stdio::piped())
-        .stdout(Stdio::piped())
-        .spawn()
-        .unwrap();
-    holder.stdout.as_mut().unwrap().read_exact(&mut [0; 5]).unwrap();
+    // A port that was used a moment ago can be listened on, and not held like this.
+    let held = (0..20).find_map(|_| {
+        let pod = Pod::new();
+        let mut holder = Command::new("python3")
+            .args(["-c", holds, &pod.port.to_string()])
+            .stdin(Stdio::piped())
+            .stdout(Stdio::piped())
+            .spawn()
+            .unwrap();
+        let is_held = holder.stdout.as_mut().unwrap().read_exact(&mut [0; 5]).is_ok();
+        if !is_held {
+            holder.wait().unwrap();
+        }
+        is_held.then_some((pod, holder))
+    });
+    let (pod, mut holder) = held.expect("one of the ports can be held");
     let mut simulator = not_ready_while_agents_run(&pod);
     assert_eq!(simulator.code(), 1);
     let found = simulator.verdict().what;
