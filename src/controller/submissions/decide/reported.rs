@@ -12,25 +12,21 @@ pub(super) fn take(draft: &mut PlanBuilder<'_>, report: &ReportDigest) {
     draft.status.progress = Some(report.progress());
     let is_complete = report.is_final && report.done == report.total;
     draft.status.score = report.score(is_complete).or(draft.status.score.take());
-    // Until the present Pod's first round the report is its predecessor's, whose crashes are forgiven or counted already.
-    let is_present = draft.view.pod.as_ref().is_some_and(|p| p.uid == report.pod_uid);
     let old = std::mem::take(&mut draft.status.pairs);
     draft.status.pairs = report
         .pairs
         .iter()
         .map(|pair| {
             let known = old.iter().find(|p| p.id == clamp(pair.id));
-            // The runners' rounds count what ended them from outside, too.
-            let outside = known.map_or(0, |k| k.ended_from_outside);
-            let told = if is_present { clamp(pair.crashes) - outside } else { 0 };
             PairStatus {
                 id: clamp(pair.id),
                 done: clamp(pair.done),
                 total: clamp(pair.total),
-                crashes: told.max(known.map_or(0, |k| k.crashes)),
+                // The kubelet counts them: a report can know of a crash before its end shows whose fault it was.
+                crashes: known.map_or(0, |k| k.crashes),
                 state: pair.state,
                 last: known.and_then(|k| k.last.clone()),
-                ended_from_outside: outside,
+                ended_from_outside: known.map_or(0, |k| k.ended_from_outside),
                 simulator_failed: known.is_some_and(|k| k.simulator_failed),
             }
         })
