@@ -1,6 +1,8 @@
-//! Ends of a pair that are neither side's crash: its sandbox was made anew, its node or its Pod lacks what a start needs.
+//! What looks like a further crash of a pair and is none, or neither side's: an end that was counted, a sandbox made anew, a node or a Pod that
+//! lacks what a start needs.
 
 use super::builders::*;
+use crate::controller::submissions::view::ContainerView;
 use leaderboard_api::FailureClass::{Infrastructure, Participant};
 use leaderboard_api::State::Running;
 use leaderboard_api::reasons;
@@ -118,4 +120,49 @@ fn agents_that_leave_no_process_to_start_one_of_them_again_are_charged() {
         "{}",
         failure.message
     );
+}
+
+#[test]
+fn a_crash_that_only_the_report_knows_ends_no_run_by_the_cause_of_the_one_before() {
+    let mut world = World::local().running();
+    world.see_alone(ended("simulator-1", 0, "exited", 1, 100));
+    let mut told = report(1);
+    told.pairs[0].crashes = 4;
+    world.report(told);
+    world.go_to(101);
+    let plan = world.pass_to(Running, reasons::RUNNING);
+    assert_eq!(plan.status.pairs[0].crashes, 1);
+    // The last ends come: another container had the port.
+    world.see_alone(ended("simulator-1", 3, "portTaken", 1, 102));
+    world.go_to(103);
+    let plan = world.pass_to(Running, reasons::STOPPING);
+    let failure = plan.status.failure.unwrap();
+    assert_eq!(
+        (failure.reason.as_str(), failure.class),
+        (reasons::AGENT_CRASHED, Participant)
+    );
+}
+
+/// On a busy node the kubelet reports a container that it has made and not begun as one that waits after its end.
+#[test]
+fn a_crash_counts_once_while_its_container_is_about_to_begin_again() {
+    for begins_anew in [true, false] {
+        let mut world = World::local().running();
+        for (name, verdict) in [("agent-1", "exited"), ("simulator-1", "peerCrashed")] {
+            world.see_alone(ContainerView {
+                restarts: 3,
+                begins_anew,
+                waiting: Some(("CrashLoopBackOff".into(), String::new())),
+                ..ended(name, if begins_anew { 2 } else { 3 }, verdict, 1, 100)
+            });
+        }
+        world.go_to(101);
+        let reason = if begins_anew {
+            reasons::RUNNING
+        } else {
+            reasons::STOPPING
+        };
+        let plan = world.pass_to(Running, reason);
+        assert_eq!(plan.status.pairs[0].crashes, if begins_anew { 3 } else { 4 });
+    }
 }
