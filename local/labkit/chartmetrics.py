@@ -2,6 +2,7 @@
 
 import re
 from collections.abc import Iterator, Mapping
+from dataclasses import dataclass
 from pathlib import Path
 
 from .errors import LabError
@@ -11,22 +12,21 @@ FOLDER = Path("src/observability/metrics")
 # What Prometheus adds to every sample of a target.
 TARGET_LABELS = frozenset({"namespace", "job", "pod", "container", "instance", "endpoint"})
 SUFFIXES = {
-    "Counter": ("_total",),
-    "Histogram": ("_bucket", "_sum", "_count"),
-    "Gauge": ("",),
-    "LeaderGauge": ("",),
-    "FloatCounter": ("_total",),
-    "FloatGauge": ("",),
-    "Info": ("_info",),
+    "counter": ("_total",),
+    "histogram": ("_bucket", "_sum", "_count"),
+    "gauge": ("",),
+    "info": ("_info",),
 }
-STRUCT = re.compile(r"struct (\w+) \{(.*?)\n\}", re.DOTALL)
-FIELD = re.compile(r"^\s+(?:pub )?(\w+): (.+),$", re.MULTILINE)
+# By the method that registers them.
+KINDS = {"counters": "counter", "gauges": "gauge", "timings": "histogram", "hours": "histogram", "days": "histogram"}
 IMPLEMENTATION = re.compile(r"^impl (\w+) \{(.*?)^\}", re.DOTALL | re.MULTILINE)
-REGISTRATION = re.compile(r"(\w+): (?:zero|add)\(\s*r,\s*\"(\w+)\"")
-INFO = re.compile(r"\.register\(\s*\"(\w+)\",\s*\"[^\"]*\",\s*Info::new\((\w+)\)")
-PREFIX = re.compile(r"= [\w.:]*with_prefix\(\"(\w+)\"\)")
-OTHER_PREFIX = re.compile(r"(\w+)::new\(\w+\.sub_registry_with_prefix\(\"(\w+)\"\)\)")
-PROGRAM = re.compile(r"(\w+)::new\((controller|bridge)\)")
+PROGRAM = re.compile(r"(\w+)::new\(&mut (controller|bridge)\)")
+REGISTERED = re.compile(r"\br\.(\w+)\(\s*\"(\w+)\",\s*(?:\[([^\]]*)\],\s*)?\"([^\"]*)\"")
+OF_LEADER = re.compile(r"= Gauge\(\s*\"(\w+)\",\s*\[([^\]]*)\],\s*\"([^\"]*)\"")
+SCRAPED = re.compile(r"\bto\.(counter|gauge)\(\s*\"(\w+)\",\s*\"([^\"]*)\"")
+INFO = re.compile(r"Info::new\(\[(.*?)\]\);\s*\w+\.register\(\"(\w+)\", \"([^\"]*)\"", re.DOTALL)
+QUOTED = re.compile(r"\"(\w+)\"")
+PREFIX = "leaderboard_"
 NAME = re.compile(r"\b(?:leaderboard|process)_\w+")
 SELECTED = re.compile(r"\b((?:leaderboard|process)_\w+)\{([^}]*)\}")
 MATCHER = re.compile(r"(\w+)\s*(?:=~|!~|!=|=)\s*\"([^\"]*)\"")
@@ -42,45 +42,41 @@ def source_of(repository: Path) -> str:
     return "\n".join(file.read_text().partition("\n#[cfg(test)]")[0] for file in files)
 
 
+@dataclass(frozen=True)
+class Family:
+    """One metric: its name without the suffix of its kind, its labels, the program that exports it, and its meaning."""
+
+    name: str
+    kind: str
+    labels: frozenset[str]
+    program: str
+    text: str
+
+
+def families(source: str) -> Iterator[Family]:
+    """All that are registered."""
+    program_of = dict(PROGRAM.findall(source))
+    for owner, body in IMPLEMENTATION.findall(source):
+        for method, name, labels, text in REGISTERED.findall(body):
+            if method not in KINDS:
+                raise LabError(f"{name} is registered by {method}: chartmetrics.py knows no such method")
+            program = program_of.get(owner, "both")
+            yield Family(PREFIX + name, KINDS[method], frozenset(QUOTED.findall(labels)), program, text)
+    for name, labels, text in OF_LEADER.findall(source):
+        yield Family(PREFIX + name, "gauge", frozenset(QUOTED.findall(labels)), "controller", text)
+    for kind, name, text in SCRAPED.findall(source):
+        yield Family(name, kind, frozenset(), "both", text)
+    for labels, name, text in INFO.findall(source):
+        yield Family(PREFIX + name, "info", frozenset(re.findall(r"\(\"(\w+)\",", labels)), "both", text)
+
+
 def exported(source: str) -> Exported:
     """The names that /metrics shows, with the labels of each."""
-    structs = {name: dict(FIELD.findall(body)) for name, body in STRUCT.findall(source)}
-    prefix, others = PREFIX.search(source), dict(OTHER_PREFIX.findall(source))
-    if prefix is None:
-        raise LabError("the source of the metrics names no prefix: chartmetrics.py must follow it")
-    found: dict[str, frozenset[str]] = {}
-    for owner, body in IMPLEMENTATION.findall(source):
-        for field, name in REGISTRATION.findall(body):
-            kind, labels = shape(structs[owner][field], structs)
-            for suffix in SUFFIXES[kind]:
-                more = {"le"} if suffix == "_bucket" else set()
-                found[f"{others.get(owner, prefix[1])}_{name}{suffix}"] = frozenset(labels | more)
-    for name, variable in INFO.findall(source):
-        labels = structs[variable.capitalize()]
-        found[f"{prefix[1]}_{name}_info"] = frozenset(labels)
-    return found
-
-
-def programs(source: str) -> dict[str, str]:
-    """The one program that exports a family, by the family's name; those of both are left out."""
-    of_owner = dict(PROGRAM.findall(source))
     return {
-        name: of_owner[owner]
-        for owner, body in IMPLEMENTATION.findall(source)
-        if owner in of_owner
-        for _, name in REGISTRATION.findall(body)
+        family.name + suffix: family.labels | ({"le"} if suffix == "_bucket" else set())
+        for family in families(source)
+        for suffix in SUFFIXES[family.kind]
     }
-
-
-def shape(written: str, structs: Mapping[str, Mapping[str, str]]) -> tuple[str, set[str]]:
-    """The kind of a metric and its labels, from the type of its field."""
-    family = re.fullmatch(r"(?:Family<(\w+), (\w+)>|(Timings)<(\w+)>|(\w+))", written)
-    if family is None:
-        raise LabError(f"{written}: chartmetrics.py knows no such type of a metric")
-    labels, kind, timings, timing_labels, plain = family.groups()
-    if timings:
-        return "Histogram", set(structs[timing_labels])
-    return (kind, set(structs[labels])) if kind else (plain, set())
 
 
 def faults(query: str, metrics: Exported, literals: frozenset[str]) -> Iterator[str]:

@@ -29,40 +29,25 @@ bridge:
   replicas: 1
 """
 SOURCE = """
-#[derive(EncodeLabelSet)]
-struct Kind {
-    kind: String,
-}
-#[derive(EncodeLabelSet)]
-struct Build {
-    version: &'static str,
-}
-struct Parts {
-    total: Family<Kind, Counter>,
-    seconds: Timings<Kind>,
-    leads: Gauge,
-}
+const LEADS: Gauge<0> = Gauge(
+    "leads",
+    [],
+    "1 or 0",
+);
 impl Parts {
-    fn new(r: &mut Registry) -> Self {
+    fn new(r: &mut Families<'_>) -> Self {
         Self {
-            total: zero(r, "parts", "All"),
-            seconds: add(r, "part_seconds", "Long", timings()),
-            leads: zero(
-                r,
-                "leads",
-                "1 or 0",
-            ),
+            total: r.counters("parts", ["kind"], "All"),
+            seconds: r.timings("part_seconds", ["kind"], "Long"),
         }
     }
 }
 impl Metrics {
     pub fn new() -> Self {
-        let mut registry = Registry::with_prefix("leaderboard");
-        r.register("build", "The program", Info::new(build));
+        let build = Info::new([("version", env!("CARGO_PKG_VERSION"))]);
+        both.register("build", "The program", build);
     }
 }
-#[cfg(test)]
-mod tests { struct Fake { a: Gauge, } }
 """
 
 

@@ -9,53 +9,32 @@ from labkit.errors import LabError
 
 REPOSITORY = Path(__file__).resolve().parents[2]
 SOURCE = """
-struct Kind {
-    kind: String,
-}
-
-struct Build {
-    version: String,
-}
-
-struct Watches {
-    errors: Family<Kind, Counter>,
-    seconds: Timings<Kind>,
-    open: Gauge,
-}
+pub const OPEN: Gauge<0> = Gauge("watches_open", [], "Watches that are open");
 
 impl Watches {
-    fn new(r: &mut Registry) -> Self {
+    fn new(r: &mut Families<'_>) -> Self {
         Self {
-            errors: zero(r, "watch_errors", "Errors of a watch"),
-            seconds: add(
-                r,
+            errors: r.counters("watch_errors", ["kind"], "Errors of a watch"),
+            seconds: r.timings(
                 "watch_seconds",
+                ["kind"],
                 "Duration of a watch",
-                timings(),
             ),
-            open: zero(r, "watches_open", "Watches that are open"),
         }
     }
 }
 
-struct Process {
-    cpu: FloatCounter,
-}
-
-impl Process {
-    fn new(r: &mut Registry) -> Self {
-        Self {
-            cpu: zero(r, "cpu_seconds", "Time of the process"),
-        }
+impl Collector for Process {
+    fn encode(&self, encoder: DescriptorEncoder<'_>) -> fmt::Result {
+        to.counter("process_cpu_seconds", "Time of the process", seconds)
     }
 }
 
 impl Metrics {
     fn new() {
-        let process = Process::new(registry.sub_registry_with_prefix("process"));
-        let both = registry.sub_registry_with_prefix("leaderboard");
-        both.register("build", "The running program", Info::new(build));
-        Self { watches: Watches::new(bridge) }
+        let build = Info::new([("version", VERSION)]);
+        both.register("build", "The running program", build);
+        Self { watches: Watches::new(&mut bridge) }
     }
 }
 """
@@ -70,7 +49,7 @@ class Table(unittest.TestCase):
                 "| `leaderboard_build_info` | info | `version` | both | The running program |",
                 "| `leaderboard_watch_errors_total` | counter | `kind` | bridge | Errors of a watch |",
                 "| `leaderboard_watch_seconds` | histogram | `kind` | bridge | Duration of a watch |",
-                "| `leaderboard_watches_open` | gauge |  | bridge | Watches that are open |",
+                "| `leaderboard_watches_open` | gauge |  | controller | Watches that are open |",
                 "| `process_cpu_seconds_total` | counter |  | both | Time of the process |",
             ],
         )

@@ -177,7 +177,13 @@ impl Poller {
             if let MessageOutcome::Dead(reason) = &outcome {
                 outcome = self.dead_letter(&reader, message, reason, &readers).await;
             }
-            self.shared.telemetry.metrics.sqs_message(outcome.as_str());
+            self.shared
+                .telemetry
+                .metrics
+                .messages
+                .total
+                .of([outcome.as_str()])
+                .inc();
             held_back = held_back.saturating_add(u32::from(outcome.is_held_back()));
             match outcome {
                 MessageOutcome::Delete(_) | MessageOutcome::Dead(_) => deletes.push(message),
@@ -274,7 +280,12 @@ impl Poller {
             Ok(Outcome::Created | Outcome::Bumped(_)) => {
                 let waited = now_ms().saturating_sub(incoming.sent_ms);
                 let waited = Duration::from_millis(u64::try_from(waited).unwrap_or_default());
-                self.shared.telemetry.metrics.sqs_message_waited(waited);
+                self.shared
+                    .telemetry
+                    .metrics
+                    .messages
+                    .wait
+                    .observe(waited.as_secs_f64());
             }
             Ok(Outcome::Repeat | Outcome::NotNew) => {
                 tracing::debug!("a repeat");

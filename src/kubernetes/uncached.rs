@@ -60,7 +60,7 @@ async fn hand_on<K: Watchable>(
             // Without news a watch stays where it was, until the server has forgotten that.
             Err(error) if source::is_forgotten(&error) => probe.running(),
             Err(error) => {
-                metrics.failed();
+                metrics.errors.inc();
                 source::report(probe, &error);
                 let cause = client_errors::watch(&error);
                 tracing::warn!(watch = name, error = cause, "a watch has failed and is retried");

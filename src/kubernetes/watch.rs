@@ -337,7 +337,9 @@ impl<K: Watchable> Task<K> {
     fn note_unreadable(&self, change: impl FnOnce(&mut BTreeSet<Box<str>>)) {
         let mut keys = self.unreadable.keys();
         change(&mut keys);
-        self.metrics.unreadable(keys.len());
+        self.metrics
+            .unreadable
+            .set(i64::try_from(keys.len()).unwrap_or(i64::MAX));
     }
 
     /// The object, trimmed; if it can't be read, its key, and its name is logged.
@@ -361,7 +363,7 @@ impl<K: Watchable> Task<K> {
     }
 
     fn error(&mut self, source: usize, error: &Error) {
-        self.metrics.failed();
+        self.metrics.errors.inc();
         let from = &mut self.sources[source];
         source::report(&from.probe, error);
         if is_refusal(error) {

@@ -48,10 +48,26 @@ impl Meter {
     /// Counts every call in the metrics of the process.
     pub fn for_metrics(metrics: &Arc<Metrics>) -> Self {
         let metrics = Arc::clone(metrics);
-        Self::new(move |call| match call.service {
-            "evalai" => metrics.evalai_request(call.op, call.outcome, call.took),
-            service => metrics.cloud_call(service, call.op, call.outcome, call.took),
-        })
+        Self::new(
+            move |Call {
+                      service,
+                      op,
+                      outcome,
+                      took,
+                  }| {
+                let (evalai, shared) = (&metrics.evalai, &metrics.shared);
+                if *service == "evalai" {
+                    evalai.requests.of([*op, outcome]).inc();
+                    evalai.duration.of([*op]).observe(took.as_secs_f64());
+                } else {
+                    shared.cloud_calls.of([*service, op, outcome]).inc();
+                    shared
+                        .cloud_call_duration
+                        .of([*service, op])
+                        .observe(took.as_secs_f64());
+                }
+            },
+        )
     }
 
     /// A call begins. One that is dropped without an end, by a limit of time or a stop, was abandoned.

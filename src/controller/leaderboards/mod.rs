@@ -38,7 +38,7 @@ use super::writes::{apply_status, set_finalizer};
 use crate::controller::submissions::external::ExternalSystems;
 use crate::controller::submissions::team_history::Teams;
 use crate::kubernetes::CallError;
-use crate::observability::metrics::{LimitsState, Metrics};
+use crate::observability::metrics::leader::{self, Gauge, Samples};
 use decide::{LeaderboardPlan, LeaderboardView, decide};
 use isolation::Policies;
 use leaderboard_api::{Leaderboard, names};
@@ -59,7 +59,6 @@ pub struct Uses<'a> {
     pub teams: &'a Teams,
     pub external: &'a ExternalSystems,
     pub looks: &'a UnboundedSender<Look>,
-    pub metrics: &'a Metrics,
 }
 
 /// What a reconcile came to.
@@ -112,7 +111,6 @@ async fn drive(leaderboard: Arc<Leaderboard>, uses: Uses<'_>) -> Result<Duration
     if let Some(found) = &view.measured {
         isolation::remember(state, &leaderboard, found);
     }
-    show_limits(uses, &view, &known);
     serve(uses, &view, &plan, &known);
     let since = since.or_else(|| look(uses, &view, &known));
     if let Some(wanted) = plan.finalizer {
@@ -135,17 +133,21 @@ async fn drive(leaderboard: Arc<Leaderboard>, uses: Uses<'_>) -> Result<Duration
     Ok(policy.min(due).max(SOONEST).min(again))
 }
 
-/// Shows what it has left, in metrics.
-fn show_limits(uses: Uses<'_>, view: &LeaderboardView, probe: &Probe) {
-    let total = view.leaderboard.spec.concurrency.total;
-    let state = LimitsState {
-        slots_in_use: view.in_use,
-        slots: total.and_then(|total| usize::try_from(total).ok()),
-        rows_waiting: view.rows_waiting,
-        ..probe.limits()
+/// Shows what a Leaderboard has left: its slots, the time of its token, and what lies in its queues. Nothing is shown of what is not known.
+pub fn show_limits(samples: &mut Samples, uses: Uses<'_>, leaderboard: &Leaderboard) {
+    let name = key_of(leaderboard).to_string();
+    let mut show = |gauge: &Gauge<1>, value: Option<i64>| {
+        if let Some(value) = value {
+            samples.set(gauge, [&name], value);
+        }
     };
-    let name = key_of(view.leaderboard.as_ref()).to_string();
-    uses.metrics.set_limits(&name, state);
+    show(&leader::SLOTS_LIMIT, leaderboard.spec.concurrency.total.map(i64::from));
+    let rows = rows_waiting(uses, leaderboard).map(|rows| i64::try_from(rows).unwrap_or(i64::MAX));
+    show(&leader::ROWS_WAITING, rows);
+    if refusal::of(&uses.settings.allowed, leaderboard).is_none() {
+        let uid = uid_of(leaderboard);
+        uses.policies.state.read(&uid, |entry| entry.looked.known.show(show));
+    }
 }
 
 /// Hands the way to EvalAI to `external`. Of a Leaderboard that goes, or names what it may not, nothing more is sent there.

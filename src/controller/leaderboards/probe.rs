@@ -21,7 +21,7 @@ use crate::controller::objects::key_of;
 use crate::controller::settings::Settings;
 use crate::controller::stores::Stores;
 use crate::kubernetes::call;
-use crate::observability::metrics::LimitsState;
+use crate::observability::metrics::leader::{self, Gauge};
 use crate::pod::run::results_format;
 use crate::services::aws::Aws;
 use crate::services::evalai::Target;
@@ -167,14 +167,19 @@ impl Probe {
         self.dead_letters = dead.or(self.dead_letters).filter(|_| has_dead);
     }
 
-    /// For metrics.
-    pub(super) fn limits(&self) -> LimitsState {
+    /// Shows in metrics what is known of the token and the queues.
+    pub(super) fn show(&self, mut show: impl FnMut(&Gauge<1>, Option<i64>)) {
         let token = self.token.as_ref().and_then(|found| found.token.as_ref().ok());
-        LimitsState {
-            token_ends: token.and_then(|token| token.expires()),
-            queue: self.messages,
-            dead_letters: self.dead_letters,
-            ..LimitsState::default()
+        let ends = token.and_then(|token| token.expires());
+        show(&leader::TOKEN_EXPIRY, ends.map(Timestamp::as_second));
+        let (visible, in_flight) = self.messages.unzip();
+        let messages = [
+            (&leader::VISIBLE_MESSAGES, visible),
+            (&leader::IN_FLIGHT_MESSAGES, in_flight),
+            (&leader::DEAD_LETTERS, self.dead_letters),
+        ];
+        for (gauge, count) in messages {
+            show(gauge, count.map(|count| i64::try_from(count).unwrap_or(i64::MAX)));
         }
     }
 

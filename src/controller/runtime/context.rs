@@ -87,7 +87,6 @@ impl Context {
             teams: &self.teams,
             external: &self.external,
             looks: &self.looks,
-            metrics: &self.metrics,
         }
     }
 

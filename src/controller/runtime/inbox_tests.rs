@@ -180,9 +180,9 @@ async fn a_queue_shows_its_oldest_message_until_that_is_deleted_or_does_not_come
     for arrival in [&first, &second] {
         waiting.keep(arrival, sent_ms(arrival, NOW).unwrap());
     }
-    assert_eq!(oldest().as_deref(), Some("1799999940.0"));
+    assert_eq!(oldest().as_deref(), Some("1799999940"));
     waiting.forget(&first);
-    assert_eq!(oldest().as_deref(), Some("1800000000.0"));
+    assert_eq!(oldest().as_deref(), Some("1800000000"));
     let began = Instant::now();
     waiting.expired().await;
     assert_eq!(oldest(), None);

@@ -5,9 +5,8 @@
 
 pub mod backoff;
 pub mod context;
-mod counts;
 mod events;
-mod gpu_holders;
+mod gauges;
 mod inbox;
 pub mod leader;
 mod queue;
@@ -18,6 +17,7 @@ mod watches;
 use std::sync::Arc;
 use std::time::Duration;
 
+use jiff::Timestamp;
 use kube::Client;
 use kube::runtime::events::{Recorder as EventRecorder, Reporter};
 use kube::runtime::watcher::Config;
@@ -152,7 +152,10 @@ impl Parts {
             return Ok(());
         }
         tokio::select! { () = self.watches.synced() => {}, () = self.telemetry.stop.wait() => return Ok(()) }
-        self.telemetry.metrics.expect_phases(&Phase::ALL.map(Phase::as_str));
+        // Prometheus sees no increase in a sample that begins with 1.
+        for phase in Phase::ALL {
+            self.telemetry.metrics.submissions.phases.of([phase.as_str()]);
+        }
         let queues = Queues::new(self.settings.concurrency, &self.telemetry.metrics);
         let (rows, changed_rows) = mpsc::unbounded_channel();
         let (evalai, changed) = mpsc::unbounded_channel();
@@ -169,6 +172,10 @@ impl Parts {
         let context = Arc::clone(&shared.context);
         let look = async move { looks::carry_out(wanted, context.for_looks()).await };
         self.telemetry.tasks.until_stop("looks", look);
+        let walked = Arc::clone(&shared);
+        let walk = move || gauges::walk(&walked, Timestamp::now());
+        let gauges = gauges::keep(gauges::EVERY, walk, self.telemetry.clone());
+        self.telemetry.tasks.stay("gauges", gauges);
         let reports = events::Reports {
             rows: changed_rows,
             evalai: changed,
@@ -215,14 +222,6 @@ impl Parts {
             rows,
             telemetry.tasks.clone(),
         );
-        let gauges = counts::keep(
-            hub.clone(),
-            watches.leaderboards.store.clone(),
-            Arc::clone(&watches.census),
-            self.settings.operator.clone(),
-            telemetry.clone(),
-        );
-        telemetry.tasks.stay("gauges", gauges);
         ExternalSystems::new(hub, recorder, self.settings.allowed.clone())
     }
 

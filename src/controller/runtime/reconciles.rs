@@ -29,8 +29,8 @@ use leaderboard_api::reasons::OTHER_OPERATOR;
 use leaderboard_api::{Leaderboard, Submission};
 
 /// The kinds as their watches call them, for metrics.
-const SUBMISSION: &str = "Submission";
-const LEADERBOARD: &str = "Leaderboard";
+pub(super) const SUBMISSION: &str = "Submission";
+pub(super) const LEADERBOARD: &str = "Leaderboard";
 /// A reconcile takes at most this long.
 const TIME_LIMIT: Duration = Duration::from_secs(90);
 /// An object without any other cause is reconciled this often.
@@ -56,7 +56,10 @@ impl Queues {
                 creates: CREATES,
                 creates_per_namespace: CREATES_PER_NAMESPACE,
             };
-            Queue::new(limits, metrics.queue(kind, Class::ALL.map(Class::as_str)))
+            Queue::new(
+                limits,
+                Class::ALL.map(|class| metrics.work.reconcile_wait.of([kind, class.as_str()])),
+            )
         };
         Self {
             submissions: queue(SUBMISSION, concurrency.into()),
@@ -228,7 +231,7 @@ fn finish(
         }
         Err((error, class)) => {
             metrics.reconciled(kind, "error", started.elapsed());
-            metrics.reconcile_failed(kind, error.label());
+            metrics.work.reconcile_errors.of([kind, error.label()]).inc();
             After::In(shared.backoff.failed(&uid), class)
         }
     }

@@ -8,7 +8,6 @@ use kube::core::NamespaceResourceScope;
 use kube::runtime::watcher::Config;
 use kube::{Api, Client};
 
-use super::counts::Census;
 use super::leader::Leader;
 use crate::controller::objects::children_selector;
 use crate::controller::settings::Settings;
@@ -35,12 +34,9 @@ fn all<K: Watchable<Scope = NamespaceResourceScope>>(
 }
 
 /// What is kept of Submissions in sums.
-fn tallies(teams: &Teams, census: &Arc<Census>) -> Vec<Tally<Submission>> {
-    let (teams, census) = (teams.clone(), Arc::clone(census));
-    vec![
-        Arc::new(move |before, now| teams.changed(before, now)),
-        Arc::new(move |before, now| census.changed(before, now)),
-    ]
+fn tallies(teams: &Teams) -> Vec<Tally<Submission>> {
+    let teams = teams.clone();
+    vec![Arc::new(move |before, now| teams.changed(before, now))]
 }
 
 /// The caches, and what they are filled from.
@@ -49,7 +45,6 @@ pub(super) struct Watches {
     pub(super) submissions: Watch<Submission>,
     /// What the cache of Submissions adds up to.
     pub(super) teams: Teams,
-    pub(super) census: Arc<Census>,
     pub(super) jobs: Watch<Job>,
     pub(super) pods: Watch<Pod>,
     pub(super) policies: Watch<NetworkPolicy>,
@@ -61,9 +56,9 @@ impl Watches {
     pub(super) fn start(client: &Client, settings: &Settings, telemetry: &Observability) -> Self {
         let namespaces = &settings.namespaces;
         let children = || Config::default().labels(&children_selector());
-        let (teams, census) = (Teams::default(), Arc::new(Census::default()));
+        let teams = Teams::default();
         let submissions = Shape {
-            tallies: tallies(&teams, &census),
+            tallies: tallies(&teams),
             ..Shape::default()
         };
         let pods = Shape {
@@ -74,7 +69,6 @@ impl Watches {
             leaderboards: all(namespaces, client, Config::default(), Shape::default(), telemetry),
             submissions: all(namespaces, client, Config::default(), submissions, telemetry),
             teams,
-            census,
             jobs: all(namespaces, client, children(), Shape::default(), telemetry),
             pods: all(namespaces, client, children(), pods, telemetry),
             policies: all(namespaces, client, children(), Shape::default(), telemetry),

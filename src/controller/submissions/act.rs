@@ -27,7 +27,7 @@ use crate::controller::stores::Stores;
 use crate::controller::writes::{apply_status, patch_by, set_finalizer};
 use crate::kubernetes::objects::{Job, Meta, Pod};
 use crate::kubernetes::{CallError, Watchable, Writes, call, call_within};
-use crate::observability::metrics::{FailedAttempt, Metrics};
+use crate::observability::metrics::Metrics;
 use crate::observability::traces::Traces;
 use crate::pod::run::Stop;
 use leaderboard_api::text::one_line;
@@ -224,7 +224,8 @@ impl Actor<'_> {
         let ended = phases::ended(self.view, new);
         for one in &ended {
             let took = one.end.duration_since(one.start).unsigned_abs();
-            self.uses.metrics.phase_ended(one.phase.as_str(), took);
+            let duration = self.uses.metrics.submissions.phases.of([one.phase.as_str()]);
+            duration.observe(took.as_secs_f64());
             log_delivery(new, one);
         }
         if !ended.is_empty() {
@@ -239,7 +240,8 @@ impl Actor<'_> {
         if more > 0 {
             let track = new.track.clone().unwrap_or_default();
             let team = self.view.submission.team();
-            self.uses.metrics.gpus_used(self.leaderboard(), track, team, more);
+            let submissions = &self.uses.metrics.submissions;
+            submissions.gpus_used(self.leaderboard(), track, team, more);
         }
     }
 
@@ -248,12 +250,11 @@ impl Actor<'_> {
         let failed = |status: &SubmissionStatus| status.state_of_conditions() == State::Failed;
         let is_known = failed(old) && old.attempt == new.attempt;
         if let Some(failure) = new.failure.as_ref().filter(|_| failed(new) && !is_known) {
-            self.uses.metrics.attempt_failed(FailedAttempt {
-                leaderboard: self.leaderboard(),
-                class: failure.class.as_str(),
-                reason: reasons::of(&failure.reason).map_or("Other", |reason| reason.name),
-                is_charged: failure.charged,
-            });
+            let reason = reasons::of(&failure.reason).map_or("Other", |reason| reason.name);
+            let charged = if failure.charged { "true" } else { "false" };
+            let labels = [&self.leaderboard(), failure.class.as_str(), reason, charged];
+            let failures = &self.uses.metrics.submissions.failures;
+            failures.of(labels.map(str::to_owned)).inc();
         }
     }
 

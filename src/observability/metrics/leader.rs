@@ -1,95 +1,170 @@
-//! Which controller leads, and the gauges without labels that it alone has.
+//! The gauges that the leader alone shows: a set of samples that each walk over the caches replaces.
 
+use std::collections::BTreeMap;
 use std::fmt;
-use std::sync::Arc;
-use std::sync::atomic::{AtomicI64, Ordering};
+use std::sync::Mutex;
 
-use prometheus_client::encoding::{EncodeMetric, MetricEncoder};
+use prometheus_client::collector::Collector;
+use prometheus_client::encoding::DescriptorEncoder;
 use prometheus_client::metrics::MetricType;
-use prometheus_client::metrics::counter::Counter;
-use prometheus_client::metrics::family::Family;
-use prometheus_client::metrics::gauge::Gauge;
-use prometheus_client::registry::Registry;
 
-use super::labels::Reason;
-use super::{Metrics, zero};
+use crate::lock::lock;
 
-/// A gauge of the leader: who does not lead has no sample of it, where a 0 would mean that something is so.
-#[derive(Clone, Debug)]
-pub(super) struct LeaderGauge(Arc<AtomicI64>);
-
-/// No count comes near it.
-const NO_SAMPLE: i64 = i64::MIN;
-
-impl Default for LeaderGauge {
-    fn default() -> Self {
-        Self(Arc::new(AtomicI64::new(NO_SAMPLE)))
-    }
-}
-
-impl LeaderGauge {
-    pub(super) fn set(&self, value: i64) {
-        self.0.store(value, Ordering::Relaxed);
-    }
-
-    pub(super) fn clear(&self) {
-        self.set(NO_SAMPLE);
-    }
-}
-
-impl EncodeMetric for LeaderGauge {
-    fn encode(&self, mut encoder: MetricEncoder) -> fmt::Result {
-        match self.0.load(Ordering::Relaxed) {
-            NO_SAMPLE => Ok(()),
-            value => encoder.encode_gauge(&value),
-        }
-    }
-
-    fn metric_type(&self) -> MetricType {
-        MetricType::Gauge
-    }
-
-    fn is_empty(&self) -> bool {
-        self.0.load(Ordering::Relaxed) == NO_SAMPLE
-    }
-}
-
+/// A gauge with `N` labels: its name after `leaderboard_`, its labels and its meaning.
 #[derive(Debug)]
-pub(super) struct Leader {
-    leads: Gauge,
-    term: LeaderGauge,
-    errors: Family<Reason, Counter>,
+pub struct Gauge<const N: usize>(&'static str, [&'static str; N], &'static str);
+
+const IS_LEADER: Gauge<0> = Gauge("is_leader", [], "1 while this process leads");
+const LEADER_TERM: Gauge<0> = Gauge("leader_term", [], "Term in which this process leads");
+pub const SUBMISSIONS: Gauge<1> = Gauge("submissions", ["state"], "Submissions by state");
+pub const SUBMISSIONS_BY_REASON: Gauge<3> = Gauge(
+    "submissions_by_reason",
+    ["state", "reason", "class"],
+    "Submissions by the reason of their state; `class` is that of the failure, or empty",
+);
+pub const OBSERVED: Gauge<1> = Gauge(
+    "observed_submissions",
+    ["reason"],
+    "Submissions that are only observed, by what their comparison shows",
+);
+pub const REPEATING_TEAMS: Gauge<0> = Gauge(
+    "teams_with_repeated_infrastructure_failures",
+    [],
+    "Teams with 3 attempts in a row or more that ended because of the infrastructure in ways that an agent can cause",
+);
+pub const GPU_SECONDS: Gauge<2> = Gauge(
+    "submission_gpu_seconds",
+    ["leaderboard", "submission"],
+    "GPUs times seconds that a submission has used so far, over all its Jobs, while it holds GPUs; of a Leaderboard the first 500, all others together as `other`",
+);
+pub const READY: Gauge<1> = Gauge(
+    "ready",
+    ["leaderboard"],
+    "1 while the condition `Ready` of the Leaderboard is True",
+);
+pub const OLDEST_PENDING: Gauge<1> = Gauge(
+    "oldest_pending_seconds",
+    ["leaderboard"],
+    "How long the oldest submission that is Pending has waited; 0 without one",
+);
+pub const OLDEST_UNPUBLISHED: Gauge<1> = Gauge(
+    "oldest_unpublished_seconds",
+    ["leaderboard"],
+    "How long ago the oldest submission ended whose end EvalAI does not have yet; 0 without one",
+);
+pub const SLOTS_IN_USE: Gauge<1> = Gauge(
+    "slots_in_use",
+    ["leaderboard"],
+    "Submissions that have a Job, or are about to get one",
+);
+pub const SLOTS_LIMIT: Gauge<1> = Gauge(
+    "slots_limit",
+    ["leaderboard"],
+    "Submissions that may have a Job at once; absent without `concurrency.total`",
+);
+pub const TOKEN_EXPIRY: Gauge<1> = Gauge(
+    "evalai_token_expiry_timestamp_seconds",
+    ["leaderboard"],
+    "Unix time at which EvalAI's token ends; absent where the token does not say",
+);
+pub const VISIBLE_MESSAGES: Gauge<1> = Gauge(
+    "queue_visible_messages",
+    ["leaderboard"],
+    "Messages that wait in the SQS queue, as SQS reported last",
+);
+pub const IN_FLIGHT_MESSAGES: Gauge<1> = Gauge(
+    "queue_in_flight_messages",
+    ["leaderboard"],
+    "Messages of the SQS queue that somebody has received and not deleted, as SQS reported last",
+);
+pub const DEAD_LETTERS: Gauge<1> = Gauge(
+    "dead_letter_queue_messages",
+    ["leaderboard"],
+    "Messages that lie in the dead-letter queue, as SQS reported last",
+);
+pub const ROWS_WAITING: Gauge<1> = Gauge(
+    "table_rows_waiting",
+    ["leaderboard"],
+    "Rows that have waited for the table for more than 10 s, of all Leaderboards that write to it",
+);
+pub const EVALAI_BUDGET_USED: Gauge<0> = Gauge("evalai_budget_used", [], "Requests to EvalAI within the last minute");
+pub const EVALAI_BUDGET_LIMIT: Gauge<0> = Gauge(
+    "evalai_budget_limit",
+    [],
+    "Requests to EvalAI that the operator allows itself within a minute, over all tokens",
+);
+pub const EVALAI_WAITING: Gauge<0> = Gauge(
+    "evalai_waiting",
+    [],
+    "Updates and questions that wait for a request to EvalAI",
+);
+pub const RECONCILES_WAITING: Gauge<2> = Gauge(
+    "reconciles_waiting",
+    ["kind", "class"],
+    "Objects that are ready to be reconciled, by class",
+);
+
+type Labels = Vec<(&'static str, String)>;
+
+/// Samples of these gauges.
+#[derive(Clone, Debug, Default, PartialEq, Eq)]
+pub struct Samples(BTreeMap<&'static str, (&'static str, BTreeMap<Labels, i64>)>);
+
+impl Samples {
+    /// A value that no `i64` holds is shown as the largest one.
+    pub fn set<const N: usize>(
+        &mut self,
+        Gauge(name, labels, help): &Gauge<N>,
+        values: [&str; N],
+        value: impl TryInto<i64>,
+    ) {
+        let labels = labels.iter().copied().zip(values.map(str::to_owned));
+        let (_, samples) = self.0.entry(name).or_insert((help, BTreeMap::new()));
+        samples.insert(labels.collect(), value.try_into().unwrap_or(i64::MAX));
+    }
+
+    fn encode(&self, encoder: &mut DescriptorEncoder<'_>) -> fmt::Result {
+        for (name, (help, samples)) in &self.0 {
+            let mut gauge = encoder.encode_descriptor(name, help, None, MetricType::Gauge)?;
+            for (labels, value) in samples {
+                match labels.as_slice() {
+                    [] => gauge.encode_gauge(value)?,
+                    _ => gauge.encode_family(labels)?.encode_gauge(value)?,
+                }
+            }
+        }
+        Ok(())
+    }
 }
+
+/// What this process shows of the lead.
+#[derive(Debug, Default)]
+pub(super) struct Leader(Mutex<(Option<i32>, Samples)>);
 
 impl Leader {
-    pub(super) fn new(r: &mut Registry) -> Self {
-        Self {
-            leads: zero(r, "is_leader", "1 while this process leads"),
-            term: zero(r, "leader_term", "Term in which this process leads"),
-            errors: zero(r, "lease_errors", "Failed calls about the Lease by reason"),
+    /// Of an earlier term nothing is shown.
+    pub(super) fn leads(&self, term: Option<i32>) {
+        *lock(&self.0) = (term, Samples::default());
+    }
+
+    /// Who does not lead shows nothing.
+    pub(super) fn show(&self, samples: Samples) {
+        let mut shown = lock(&self.0);
+        if shown.0.is_some() {
+            shown.1 = samples;
         }
     }
 }
 
-impl Metrics {
-    /// This process leads in a term, or does not lead: then it shows nothing of what the leader alone counts at present.
-    pub fn set_leading(&self, term: Option<i32>) {
-        self.leader.leads.set(i64::from(term.is_some()));
+impl Collector for Leader {
+    fn encode(&self, mut encoder: DescriptorEncoder<'_>) -> fmt::Result {
+        let (term, samples) = &*lock(&self.0);
+        let mut own = Samples::default();
+        own.set(&IS_LEADER, [], i64::from(term.is_some()));
         if let Some(term) = term {
-            self.leader.term.set(term.into());
-        } else {
-            self.leader.term.clear();
-            self.submissions.leave_to_the_leader();
-            self.boards.leave_to_the_leader();
-            self.limits.leave_to_the_leader();
-            self.queues.leave_to_the_leader();
-            self.evalai.leave_to_the_leader();
-            self.reconciles.leave_to_the_leader();
+            own.set(&LEADER_TERM, [], *term);
         }
-    }
-
-    /// A call about the Lease has failed.
-    pub fn lease_failed(&self, reason: &'static str) {
-        self.leader.errors.get_or_create(&Reason { reason }).inc();
+        own.encode(&mut encoder)?;
+        samples.encode(&mut encoder)
     }
 }

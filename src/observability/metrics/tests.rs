@@ -7,70 +7,67 @@ use super::*;
 /// One of everything.
 fn all(program: Program) -> Metrics {
     let metrics = Metrics::new(program);
-    metrics.reconciled("Submission", "ok", Duration::from_millis(20));
-    metrics.reconcile_failed("Submission", "conflict");
-    let queue = metrics.queue("Submission", ["urgent", "new"]);
-    queue.waiting([0, 3]);
-    queue.began(1, Duration::from_millis(20));
-    let watch = metrics.watch("Job");
-    watch.failed();
-    watch.event();
+    let (ms, second) = (Duration::from_millis(20), Duration::from_secs(1));
     metrics.set_leading(Some(7));
-    metrics.lease_failed("timeout");
-    metrics.set_submissions("Running", 2);
-    metrics.set_standing(FAILED, 3);
-    metrics.set_observed("SameEnd", 1);
+    metrics.show(samples());
+    metrics.reconciled("Submission", "ok", ms);
+    metrics.work.reconcile_errors.of(["Submission", "conflict"]).inc();
+    metrics
+        .work
+        .reconcile_wait
+        .of(["Submission", "new"])
+        .observe(ms.as_secs_f64());
+    metrics.work.reconcile_wait.of(["Submission", "urgent"]);
+    metrics.work.lease_errors.of(["timeout"]).inc();
+    metrics.work.spans.of(["sent"]).inc_by(12);
+    let watch = metrics.watch("Job");
+    watch.errors.inc();
+    watch.event();
     metrics.set_oldest_message("https://q/1", Some(1_800_000_000_500));
-    metrics.set_repeating_teams(1);
-    metrics.gpus_used("ns/board".into(), "sensors".into(), Some("7"), 400);
-    metrics.set_live_gpu_use(&live(), 240);
-    metrics.attempt_failed(FailedAttempt {
-        leaderboard: "ns/board".into(),
-        class: "Participant",
-        reason: "AgentCrashed",
-        is_charged: true,
-    });
-    let state = BoardState {
-        is_ready: true,
-        oldest_pending: Duration::from_secs(9),
-        oldest_unpublished: Duration::from_secs(4),
-    };
-    metrics.set_leaderboard("ns/board", state);
-    metrics.set_limits("ns/board", limits());
-    metrics.phase_ended("run", Duration::from_mins(50));
-    metrics.spans("sent", 12);
-    metrics.evalai_request("put_finished", "ok", Duration::from_millis(20));
-    metrics.set_evalai_load(50, 54, 1);
-    metrics.cloud_call("s3", "GetObject", "ok", Duration::from_secs(1));
-    metrics.sqs_message("created");
-    metrics.sqs_message_waited(Duration::from_secs(2));
+    metrics
+        .submissions
+        .gpus_used("ns/board".into(), "sensors".into(), Some("7"), 400);
+    let failure = ["ns/board", "Participant", "AgentCrashed", "true"];
+    metrics.submissions.failures.of(failure).inc();
+    metrics.submissions.phases.of(["run"]).observe(3000.0);
+    metrics.evalai.requests.of(["put_finished", "ok"]).inc();
+    metrics.evalai.duration.of(["put_finished"]).observe(ms.as_secs_f64());
+    metrics.shared.cloud_calls.of(["s3", "GetObject", "ok"]).inc();
+    let duration = metrics.shared.cloud_call_duration.of(["s3", "GetObject"]);
+    duration.observe(second.as_secs_f64());
+    metrics.messages.total.of(["created"]).inc();
+    metrics.messages.wait.observe(2.0);
     metrics
 }
 
-const FAILED: Standing = Standing {
-    state: "Failed",
-    reason: "AgentCrashed",
-    class: "Participant",
-};
-
-/// A submission that holds GPUs.
-fn live() -> OfSubmission {
-    OfSubmission {
-        leaderboard: "ns/board".into(),
-        submission: "submission-1".into(),
-    }
-}
-
-/// A Leaderboard with everything that has a limit.
-fn limits() -> LimitsState {
-    LimitsState {
-        slots_in_use: 3,
-        slots: Some(8),
-        token_ends: Some(jiff::Timestamp::from_second(1_800_000_000).unwrap()),
-        queue: Some((5, 2)),
-        dead_letters: Some(1),
-        rows_waiting: Some(187),
-    }
+/// A sample of each gauge of the leader.
+fn samples() -> Samples {
+    let mut samples = Samples::default();
+    let board = ["ns/board"];
+    samples.set(&leader::SUBMISSIONS, ["Running"], 2);
+    samples.set(
+        &leader::SUBMISSIONS_BY_REASON,
+        ["Failed", "AgentCrashed", "Participant"],
+        3,
+    );
+    samples.set(&leader::OBSERVED, ["SameEnd"], 1);
+    samples.set(&leader::REPEATING_TEAMS, [], 1);
+    samples.set(&leader::GPU_SECONDS, ["ns/board", "submission-1"], 240);
+    samples.set(&leader::READY, board, 1);
+    samples.set(&leader::OLDEST_PENDING, board, 9);
+    samples.set(&leader::OLDEST_UNPUBLISHED, board, 4);
+    samples.set(&leader::SLOTS_IN_USE, board, 3);
+    samples.set(&leader::SLOTS_LIMIT, board, 8);
+    samples.set(&leader::TOKEN_EXPIRY, board, 1_800_000_000);
+    samples.set(&leader::VISIBLE_MESSAGES, board, 5);
+    samples.set(&leader::IN_FLIGHT_MESSAGES, board, 2);
+    samples.set(&leader::DEAD_LETTERS, board, 1);
+    samples.set(&leader::ROWS_WAITING, board, 187);
+    samples.set(&leader::EVALAI_BUDGET_USED, [], 50);
+    samples.set(&leader::EVALAI_BUDGET_LIMIT, [], 54);
+    samples.set(&leader::EVALAI_WAITING, [], 1);
+    samples.set(&leader::RECONCILES_WAITING, ["Submission", "new"], 3);
+    samples
 }
 
 #[test]
@@ -90,18 +87,18 @@ fn every_metric_has_its_name_and_its_labels() {
         "leaderboard_lease_errors_total{reason=\"timeout\"} 1",
         "leaderboard_submissions{state=\"Running\"} 2",
         "leaderboard_submissions_by_reason{state=\"Failed\",reason=\"AgentCrashed\",class=\"Participant\"} 3",
-        "leaderboard_queue_oldest_message_timestamp_seconds{queue=\"https://q/1\"} 1800000000.5",
+        "leaderboard_queue_oldest_message_timestamp_seconds{queue=\"https://q/1\"} 1800000000",
         "leaderboard_teams_with_repeated_infrastructure_failures 1",
         "leaderboard_gpu_seconds_total{leaderboard=\"ns/board\",track=\"sensors\"} 400",
         "leaderboard_team_gpu_seconds_total{leaderboard=\"ns/board\",team=\"7\"} 400",
         "leaderboard_submission_gpu_seconds{leaderboard=\"ns/board\",submission=\"submission-1\"} 240",
         "leaderboard_submission_failures_total{leaderboard=\"ns/board\",class=\"Participant\",reason=\"AgentCrashed\",charged=\"true\"} 1",
         "leaderboard_ready{leaderboard=\"ns/board\"} 1",
-        "leaderboard_oldest_pending_seconds{leaderboard=\"ns/board\"} 9.0",
-        "leaderboard_oldest_unpublished_seconds{leaderboard=\"ns/board\"} 4.0",
+        "leaderboard_oldest_pending_seconds{leaderboard=\"ns/board\"} 9",
+        "leaderboard_oldest_unpublished_seconds{leaderboard=\"ns/board\"} 4",
         "leaderboard_slots_in_use{leaderboard=\"ns/board\"} 3",
         "leaderboard_slots_limit{leaderboard=\"ns/board\"} 8",
-        "leaderboard_evalai_token_expiry_timestamp_seconds{leaderboard=\"ns/board\"} 1800000000.0",
+        "leaderboard_evalai_token_expiry_timestamp_seconds{leaderboard=\"ns/board\"} 1800000000",
         "leaderboard_queue_visible_messages{leaderboard=\"ns/board\"} 5",
         "leaderboard_queue_in_flight_messages{leaderboard=\"ns/board\"} 2",
         "leaderboard_dead_letter_queue_messages{leaderboard=\"ns/board\"} 1",
@@ -125,7 +122,7 @@ fn every_metric_has_its_name_and_its_labels() {
 #[test]
 fn fifty_teams_of_a_leaderboard_have_a_sample_each_and_the_others_one() {
     let metrics = Metrics::new(Program::Controller);
-    let used = |board: &str, team: Option<&str>| metrics.gpus_used(board.into(), "map".into(), team, 2);
+    let used = |board: &str, team: Option<&str>| metrics.submissions.gpus_used(board.into(), "map".into(), team, 2);
     let teams: Vec<String> = (1..=200).map(|number| format!("Team {number}")).collect();
     for team in teams.iter().chain(&teams) {
         used("ns/board", Some(team));
@@ -151,8 +148,8 @@ fn fifty_teams_of_a_leaderboard_have_a_sample_each_and_the_others_one() {
     }
 }
 
-#[test]
-fn what_differs_with_each_run_has_its_name_too() {
+#[tokio::test]
+async fn what_differs_with_each_run_has_its_name_too() {
     let text = all(Program::Controller).text().unwrap();
     for start in [
         concat!(
@@ -178,8 +175,8 @@ fn what_differs_with_each_run_has_its_name_too() {
     }
 }
 
-#[test]
-fn a_bridge_exports_what_it_counts_and_nothing_of_a_controller() {
+#[tokio::test]
+async fn a_bridge_exports_what_it_counts_and_nothing_of_a_controller() {
     let families = |text: &str| -> Vec<String> {
         let types = text.lines().filter_map(|line| line.strip_prefix("# TYPE "));
         let names = types.filter_map(|line| line.split(' ').next());
@@ -188,16 +185,16 @@ fn a_bridge_exports_what_it_counts_and_nothing_of_a_controller() {
     };
     let bridge = families(&all(Program::Bridge).text().unwrap());
     let expected = [
+        "leaderboard_runtime_workers",
+        "leaderboard_runtime_tasks",
+        "leaderboard_runtime_queued_tasks",
+        "leaderboard_runtime_busy_seconds",
         "leaderboard_build",
         "leaderboard_watch_errors",
         "leaderboard_watch_unreadable_objects",
         "leaderboard_watch_last_event_timestamp_seconds",
         "leaderboard_cloud_calls",
         "leaderboard_cloud_call_duration_seconds",
-        "leaderboard_runtime_workers",
-        "leaderboard_runtime_tasks",
-        "leaderboard_runtime_queued_tasks",
-        "leaderboard_runtime_busy_seconds",
         "leaderboard_queue_oldest_message_timestamp_seconds",
         "leaderboard_sqs_messages",
         "leaderboard_sqs_message_wait_duration_seconds",
@@ -249,56 +246,24 @@ fn who_does_not_lead_shows_nothing_that_only_the_leader_counts() {
 }
 
 #[test]
-fn what_nobody_stands_for_and_an_empty_queue_have_no_samples() {
+fn a_walk_replaces_all_that_the_one_before_has_shown() {
     let metrics = all(Program::Controller);
-    metrics.set_standing(FAILED, 0);
+    let mut samples = Samples::default();
+    samples.set(&leader::READY, ["ns/other"], 1);
+    metrics.show(samples.clone());
     metrics.set_oldest_message("https://q/1", None);
     let text = metrics.text().unwrap();
+    assert_eq!(gauges(&text), ["is_leader", "leader_term", "ready"], "{text}");
     assert!(
-        !text.contains("_by_reason{") && !text.contains("_oldest_message_timestamp_seconds{"),
+        text.contains("leaderboard_ready{leaderboard=\"ns/other\"} 1\n"),
         "{text}"
     );
-}
-
-#[test]
-fn a_submission_that_holds_no_gpu_any_more_has_no_sample() {
-    let metrics = all(Program::Controller);
-    metrics.forget_live_gpu_use(&live());
+    metrics.set_leading(None);
+    metrics.show(samples);
     let text = metrics.text().unwrap();
-    assert!(!text.contains("submission=\""), "{text}");
-}
-
-#[test]
-fn a_leaderboard_that_is_gone_has_no_samples() {
-    let metrics = all(Program::Controller);
-    metrics.forget_leaderboard("ns/board");
-    let text = metrics.text().unwrap();
-    assert!(
-        !text.contains("leaderboard_ready{") && !text.contains("_oldest_pending_seconds{"),
-        "{text}"
+    assert_eq!(
+        gauges(&text),
+        ["is_leader"],
+        "one that ends after the lead shows nothing"
     );
-    assert!(!text.contains("{leaderboard=\"ns/board\"}"), "{text}");
-}
-
-#[test]
-fn what_a_leaderboard_no_longer_has_is_no_longer_shown() {
-    let metrics = all(Program::Controller);
-    let state = LimitsState {
-        slots_in_use: 1,
-        ..LimitsState::default()
-    };
-    metrics.set_limits("ns/board", state);
-    let text = metrics.text().unwrap();
-    assert!(
-        text.contains("leaderboard_slots_in_use{leaderboard=\"ns/board\"} 1\n"),
-        "{text}"
-    );
-    for gone in [
-        "slots_limit{",
-        "token_expiry_timestamp_seconds{",
-        "_messages{leaderboard",
-        "rows_waiting{leaderboard",
-    ] {
-        assert!(!text.contains(gone), "{gone} in\n{text}");
-    }
 }

@@ -52,7 +52,7 @@ impl Outlet {
     pub(super) fn send(&self, spans: Vec<Span>) {
         for span in spans {
             if self.queue.try_send(span).is_err() {
-                self.metrics.spans("dropped", 1);
+                self.metrics.work.spans.of(["dropped"]).inc();
             }
         }
     }
@@ -173,13 +173,13 @@ impl Sender {
     async fn export(&mut self, batch: &mut Vec<Span>) {
         let sampled = batch.drain(..).map(|span| data(span, &self.scope));
         let sampled: Vec<SpanData> = sampled.filter(|span| self.is_sampled(span)).collect();
-        let count = sampled.len();
+        let count = u64::try_from(sampled.len()).unwrap_or(u64::MAX);
         if count == 0 {
             return;
         }
         let failure = self.exporter.export(sampled).await.err();
-        self.metrics
-            .spans(if failure.is_some() { "failed" } else { "sent" }, count);
+        let outcome = if failure.is_some() { "failed" } else { "sent" };
+        self.metrics.work.spans.of([outcome]).inc_by(count);
         match &failure {
             Some(error) if !self.fails => tracing::warn!(%error, "the collector of traces does not take spans"),
             None if self.fails => tracing::info!("the collector of traces takes spans again"),

@@ -211,7 +211,7 @@ impl Elector {
             // Two candidates that met once are kept from meeting again.
             jittered(retry / 8, 0.1)
         } else {
-            self.metrics.lease_failed(error.reason());
+            self.metrics.work.lease_errors.of([error.reason()]).inc();
             tracing::warn!("{error}");
             jittered(retry / 2, 0.1)
         };

@@ -18,7 +18,7 @@ use tokio::task::JoinSet;
 use tokio::time::{Instant, sleep_until};
 
 use crate::lock::lock;
-use crate::observability::metrics::QueueMetrics;
+use crate::observability::metrics::Histogram;
 use crate::observability::shutdown::Stop;
 pub use lanes::Class;
 pub use state::{After, Limits};
@@ -58,15 +58,16 @@ pub struct Queue {
     state: Mutex<State>,
     /// There may be something to begin.
     changed: Notify,
-    metrics: QueueMetrics<3>,
+    /// How long events of each class waited for their reconcile.
+    waits: [Histogram; 3],
 }
 
 impl Queue {
-    pub fn new(limits: Limits, metrics: QueueMetrics<3>) -> Arc<Self> {
+    pub fn new(limits: Limits, waits: [Histogram; 3]) -> Arc<Self> {
         Arc::new(Self {
             state: Mutex::new(State::new(limits)),
             changed: Notify::new(),
-            metrics,
+            waits,
         })
     }
 
@@ -120,12 +121,14 @@ impl Queue {
         }
     }
 
+    /// How many are ready in each class.
+    pub fn depth(&self) -> [usize; 3] {
+        lock(&self.state).depth()
+    }
+
     fn begin(&self) -> Option<Key> {
-        let mut state = lock(&self.state);
-        let begun = state.begin(Instant::now());
-        self.metrics.waiting(state.depth());
-        let Begun { key, class, waited } = begun?;
-        self.metrics.began(class as usize, waited);
+        let Begun { key, class, waited } = lock(&self.state).begin(Instant::now())?;
+        self.waits[class as usize].observe(waited.as_secs_f64());
         Some(key)
     }
 

@@ -34,8 +34,13 @@ struct Running {
 
 /// A queue whose reconciles take as long as `takes` returns for their key. Those that are new create a Job.
 fn start(takes: impl Fn(&Key) -> Duration + Send + Sync + 'static) -> Running {
-    let classes = Class::ALL.map(Class::as_str);
-    let queue = Queue::new(LIMITS, Metrics::default().queue("Submission", classes));
+    let waits = Class::ALL.map(|class| {
+        Metrics::default()
+            .work
+            .reconcile_wait
+            .of(["Submission", class.as_str()])
+    });
+    let queue = Queue::new(LIMITS, waits);
     let (tell, begun) = mpsc::unbounded_channel();
     let (stop, stopped) = Stop::new();
     let reconciles = Arc::clone(&queue);
