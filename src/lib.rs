@@ -3,6 +3,7 @@
 //! The modules and what each may import are drawn in docs/architecture.md.
 
 pub mod allowed;
+pub mod ask;
 pub mod backoff;
 pub mod bridge;
 pub mod cli;
