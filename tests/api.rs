@@ -13,7 +13,6 @@ mod api {
     mod allowed;
     mod boards;
     mod bridge;
-    mod charging;
     mod claims;
     mod columns;
     mod counts;

@@ -52,7 +52,7 @@ fn with_state(mut made: Submission, state: State) -> Submission {
         observed_generation: None,
         last_transition_time: Time(jiff::Timestamp::UNIX_EPOCH),
     };
-    let failure = json!({"class": "Participant", "charged": true, "reason": "Test", "message": "It failed."});
+    let failure = json!({"class": "Participant", "reason": "Test", "message": "It failed."});
     made.status = Some(SubmissionStatus {
         attempt: Some(made.spec.attempt),
         conditions: vec![

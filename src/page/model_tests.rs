@@ -94,7 +94,7 @@ fn failures_are_counted_by_class_and_reason_for_a_day() {
         (names(&view["failures"]), &view["failures"]["count"]),
         (vec!["a", "b", "c"], &3.into())
     );
-    assert_eq!(view["failures"]["rows"][0]["isCharged"], true);
+    assert_eq!(view["failures"]["rows"][0]["class"], "Participant");
     assert_eq!(view["ended"]["rows"][1]["open"], serde_json::json!(["EvalAI"]));
 }
 

@@ -97,7 +97,6 @@ pub(super) struct Failed {
     pub who: Who,
     pub class: &'static str,
     pub reason: String,
-    pub is_charged: bool,
     pub message: String,
     pub time: Option<i64>,
 }
@@ -260,7 +259,6 @@ impl Failed {
             who: Who::of(submission),
             class: failure.class.as_str(),
             reason: name(&failure.reason),
-            is_charged: failure.charged,
             message: message(&failure.message),
             time: end(submission).map(seconds),
         }

@@ -268,7 +268,7 @@ impl World {
         let condition = json!({
             "type": "Finished", "status": "True", "reason": state, "message": "", "lastTransitionTime": "2026-11-20T10:00:00Z"
         });
-        let failure = json!({"class": "Participant", "charged": true, "reason": "Test", "message": "It failed."});
+        let failure = json!({"class": "Participant", "reason": "Test", "message": "It failed."});
         let failure = (state == "Failed").then_some(failure);
         let status =
             json!({"status": {"state": state, "attempt": attempt, "failure": failure, "conditions": [condition]}});

@@ -64,7 +64,7 @@ pub fn full_status() -> Value {
         "nodeName": "node-1",
         "resultsURL": "s3://results/a/42",
         "failure": {"class": "Infrastructure", "reason": "NodeLost", "message": "The node is gone. Look at it.",
-                    "nextStep": "Look at it.", "charged": false},
+                    "nextStep": "Look at it."},
         "conditions": [condition("Running", "Resumed"), condition("Published", "Published")],
     })
 }

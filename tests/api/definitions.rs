@@ -74,7 +74,7 @@ async fn a_minimal_leaderboard_reads_back_whole() {
         "agent": {"logSizeLimit": "2Gi", "imageSizeLimit": "60Gi"},
         "pairs": 4,
         "routes": 20,
-        "retries": {"perPair": 3, "infrastructure": 2, "onRepeatedInfrastructure": "Forgive"},
+        "retries": {"perPair": 3, "infrastructure": 2},
         "deadlines": {
             "scheduleSeconds": 0,
             "pullSeconds": 5400,
@@ -134,12 +134,12 @@ fn half_filled_runs() -> Vec<HalfFilled> {
         (
             "retries",
             json!({"perPair": 0}),
-            json!({"perPair": 0, "infrastructure": 2, "onRepeatedInfrastructure": "Forgive"}),
+            json!({"perPair": 0, "infrastructure": 2}),
         ),
         (
             "retries",
             json!({"infrastructure": 0}),
-            json!({"perPair": 3, "infrastructure": 0, "onRepeatedInfrastructure": "Forgive"}),
+            json!({"perPair": 3, "infrastructure": 0}),
         ),
         (
             "deadlines",

@@ -13,7 +13,7 @@ use std::time::Duration;
 use k8s_openapi::api::core::v1::{Node, Pod};
 use kube::ResourceExt;
 use kube::api::{Api, ApiResource, DeleteParams, DynamicObject, GroupVersionKind, ListParams, Patch, PatchParams};
-use leaderboard_api::{State, Submission, reasons};
+use leaderboard_api::{FailureClass, State, Submission, reasons};
 use serde_json::{Value, json};
 
 use super::matrix;
@@ -163,8 +163,8 @@ async fn finds_no_gpu(scene: &Scene) -> String {
     assert_eq!(state(&failed), Some(State::Failed));
     let failure = failed.status.unwrap().failure.unwrap();
     assert_eq!(
-        (failure.reason.as_str(), failure.charged),
-        (reasons::NO_GPU, false),
+        (failure.reason.as_str(), failure.class),
+        (reasons::NO_GPU, FailureClass::Infrastructure),
         "{}",
         failure.message
     );

@@ -5,7 +5,7 @@ use std::time::Duration;
 use k8s_openapi::api::core::v1::Pod;
 use k8s_openapi::api::networking::v1::NetworkPolicy;
 use kube::api::DeleteParams;
-use leaderboard_api::{Leaderboard, State, conditions, reasons};
+use leaderboard_api::{FailureClass, Leaderboard, State, conditions, reasons};
 use serde_json::json;
 
 use crate::operator::controller;
@@ -79,8 +79,8 @@ async fn a_pod_that_has_to_be_isolated_and_is_not_runs_nothing() {
         let status = failed.status.unwrap();
         let failure = status.failure.unwrap();
         assert_eq!(
-            (failure.reason.as_str(), failure.charged),
-            (reasons::NOT_ISOLATED, false)
+            (failure.reason.as_str(), failure.class),
+            (reasons::NOT_ISOLATED, FailureClass::Infrastructure)
         );
         assert!(
             failure.message.contains("network.enforcement is Require"),

@@ -157,11 +157,10 @@ fn end(submission: &Submission) -> String {
         };
     };
     let class = match failure.class {
-        FailureClass::Participant => "participant",
-        FailureClass::Infrastructure => "infrastructure",
+        FailureClass::Participant => "participant, charged",
+        FailureClass::Infrastructure => "infrastructure, not charged",
     };
-    let charged = if failure.charged { "charged" } else { "not charged" };
-    format!("{state} {} ({class}, {charged})", reason(submission))
+    format!("{state} {} ({class})", reason(submission))
 }
 
 /// When the container ended whose end decided a failed run.

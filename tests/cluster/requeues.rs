@@ -46,7 +46,7 @@ async fn assert_free_of_charge(scene: &Scene, name: &str) {
     assert_eq!((status.attempt, status.retry), (Some(Attempt(1)), 1));
     let requeued = status.requeued.unwrap();
     assert_eq!((requeued.number, requeued.retries), (1, 1));
-    assert_eq!((status.failure, status.infrastructure_failures), (None, None));
+    assert_eq!((status.failure, status.routes_before), (None, None));
     assert_eq!(status.interruptions, None);
     assert!(status.pairs.iter().all(|pair| pair.crashes == 0), "{:?}", status.pairs);
     assert_eq!(scene.jobs().await, [format!("{name}-1"), format!("{name}-1-r1")]);

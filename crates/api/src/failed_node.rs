@@ -6,13 +6,13 @@ use serde::{Deserialize, Serialize};
 /// Nodes that one status names at most.
 pub const MAX_FAILED_NODES: usize = 8;
 
-/// A node that gave a Job no GPU, or could not start its Pod.
+/// A node on which a Job failed because of the infrastructure.
 #[derive(Serialize, Deserialize, JsonSchema, Clone, Debug, PartialEq, Eq)]
 #[serde(rename_all = "camelCase")]
 pub struct FailedNode {
     /// The node.
     #[schemars(length(max = 253))]
     pub node_name: String,
-    /// Jobs of this attempt that ended so on it.
+    /// Jobs of this attempt that it gave no GPU, or could not start; 0 if they ended otherwise.
     pub jobs: i32,
 }

@@ -103,7 +103,6 @@ fn failure(what: &str) -> Failure {
             .to_owned(),
         next_step,
         participant_message: None,
-        charged: false,
         pair: None,
     }
 }
@@ -145,7 +144,8 @@ mod tests {
             assert_eq!((status.state, status.attempt), (Some(shown), Some(Attempt(2))));
             assert_eq!(status.state_of_conditions(), shown);
             assert_eq!(status.failure.is_some(), shown == State::Failed);
-            assert!(!status.failure.is_some_and(|failure| failure.charged));
+            let is_theirs = |failure: Box<Failure>| failure.class == FailureClass::Participant;
+            assert!(!status.failure.is_some_and(is_theirs));
         }
     }
 

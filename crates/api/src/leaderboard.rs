@@ -13,7 +13,6 @@ use serde::{Deserialize, Serialize};
 use super::check::{CheckImage, LastCheck};
 use super::conditions::{self, Condition};
 use super::evalai_mode::EvalaiMode;
-use super::infrastructure_failures::{MAX_TEAMS, TeamFailures};
 use super::leaderboard_parts::{
     AgentContainer, Concurrency, ContentsContainer, Deadlines, Evalai, Gpu, LogGroup, Network, PodIdentity, Queue,
     Retries, SimulatorContainer, Storage, Table, Track,
@@ -228,12 +227,6 @@ pub struct LeaderboardStatus {
     /// Use of the table; absent while no row waits for it.
     #[serde(default, skip_serializing_if = "Option::is_none")]
     pub table: Option<TableUse>,
-    /// Teams with attempts in a row that ended because of the infrastructure in ways that an agent can cause as well; those with the
-    /// most come first.
-    #[serde(default, skip_serializing_if = "Vec::is_empty")]
-    #[x_kube(merge_strategy = ListMerge::Map(vec!["team".into()]))]
-    #[schemars(length(max = MAX_TEAMS))]
-    pub infrastructure_failures: Vec<TeamFailures>,
     /// Teams whose submissions have used the most GPU seconds; the most come first.
     #[serde(default, skip_serializing_if = "Vec::is_empty")]
     #[x_kube(merge_strategy = ListMerge::Map(vec!["team".into()]))]

@@ -18,7 +18,6 @@ use serde::{Deserialize, Serialize};
 pub use super::byte_quantity::ByteQuantity;
 pub use super::gpu::*;
 use super::image_pattern::ImagePattern;
-use super::infrastructure_failures::OnRepeatedInfrastructure;
 pub use super::leaderboard_network::*;
 pub use super::leaderboard_services::*;
 pub use super::route_subset::RouteSubset;
@@ -249,13 +248,11 @@ pub struct Retries {
     #[serde(default = "defaults::retries_per_pair")]
     #[schemars(range(min = 0, max = 100))]
     pub per_pair: i32,
-    /// New Jobs after infrastructure failures.
+    /// New Jobs after infrastructure failures. After a second failure of an attempt that an agent can cause a Job follows only if the one
+    /// before has finished a route.
     #[serde(default = "defaults::retries_infrastructure")]
     #[schemars(range(min = 0, max = 100))]
     pub infrastructure: i32,
-    /// What becomes of an attempt that ends because of the infrastructure after `infrastructure` others of its team in a row did.
-    #[serde(default)]
-    pub on_repeated_infrastructure: OnRepeatedInfrastructure,
 }
 
 /// Time limits.
@@ -367,7 +364,6 @@ impl Default for Retries {
         Self {
             per_pair: defaults::retries_per_pair(),
             infrastructure: defaults::retries_infrastructure(),
-            on_repeated_infrastructure: OnRepeatedInfrastructure::default(),
         }
     }
 }

@@ -81,8 +81,7 @@ mod tests {
 
     #[test]
     fn the_state_follows_the_conditions_whatever_the_stored_one_is() {
-        let failure =
-            json!({"class": "Participant", "charged": true, "reason": "AgentCrashed", "message": "It crashed."});
+        let failure = json!({"class": "Participant", "reason": "AgentCrashed", "message": "It crashed."});
         for (expected, attempt, finished, running, failed) in [
             (State::Pending, 1, None, None, false),
             (

@@ -10,7 +10,6 @@ use serde::{Deserialize, Serialize};
 use super::attempt::Attempt;
 use super::conditions::Condition;
 use super::failed_node::{FailedNode, MAX_FAILED_NODES};
-use super::infrastructure_failures::InfrastructureFailures;
 use super::leaderboard_parts::{LeaderboardVersion, Storage};
 use super::pair_status::PairStatus;
 use super::progress::{Progress, Score};
@@ -144,8 +143,8 @@ pub struct SubmissionStatus {
     #[serde(default, skip_serializing_if = "Option::is_none")]
     #[schemars(length(max = 253))]
     pub node_name: Option<String>,
-    /// Nodes that gave a Job of this attempt no GPU, or could not start its Pod. The next Job prefers other nodes; a node that did so twice
-    /// gets no further Job of the attempt.
+    /// Nodes on which Jobs of this attempt failed because of the infrastructure. The next Job prefers other nodes; a node that gave two Jobs
+    /// no GPU, or could not start their Pods, gets no further Job of the attempt.
     #[serde(default, skip_serializing_if = "Vec::is_empty")]
     #[x_kube(merge_strategy = ListMerge::Map(vec!["nodeName".into()]))]
     #[schemars(length(max = MAX_FAILED_NODES))]
@@ -163,10 +162,10 @@ pub struct SubmissionStatus {
     /// What went wrong.
     #[serde(default, skip_serializing_if = "Option::is_none")]
     pub failure: Option<Box<Failure>>,
-    /// Attempts, since one last finished, that ended because of the infrastructure in ways that an agent can cause as well. A resume
-    /// keeps them.
+    /// Routes that were stored when the present Job was due; absent until an infrastructure failure that an agent can cause has ended a
+    /// Job of this attempt. After another such failure a further Job follows only if more are stored.
     #[serde(default, skip_serializing_if = "Option::is_none")]
-    pub infrastructure_failures: Option<Box<InfrastructureFailures>>,
+    pub routes_before: Option<i32>,
     /// What its Jobs have used. A resume keeps it.
     #[serde(rename = "use", default, skip_serializing_if = "Option::is_none")]
     pub usage: Option<Use>,
@@ -370,8 +369,6 @@ pub struct Failure {
     #[serde(default, skip_serializing_if = "Option::is_none")]
     #[schemars(length(max = MAX_MESSAGE))]
     pub participant_message: Option<String>,
-    /// Whether it should cost the participant an attempt.
-    pub charged: bool,
     /// The pair that it happened in, from 1; absent if it concerns the whole run.
     #[serde(default, skip_serializing_if = "Option::is_none")]
     pub pair: Option<i32>,

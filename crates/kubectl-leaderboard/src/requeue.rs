@@ -203,7 +203,10 @@ pub fn dry_run(verb: &str, chosen: &[&Submission], frame: Frame) -> Vec<String> 
 fn row(one: &Submission, now: Timestamp) -> Vec<String> {
     let status = one.status.as_ref();
     let failure = status.and_then(|status| status.failure.as_ref());
-    let charged = failure.map_or("", |failure| if failure.charged { "yes" } else { "no" });
+    let charged = failure.map_or("", |failure| match failure.class {
+        FailureClass::Participant => "yes",
+        FailureClass::Infrastructure => "no",
+    });
     let plan = status.and_then(|status| status.plan.as_ref());
     // The registry is the same for all, and the tag is what differs.
     let simulator = plan.and_then(|plan| plan.simulator_image.rsplit('/').next());

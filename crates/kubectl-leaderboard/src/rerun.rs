@@ -31,8 +31,7 @@ pub fn chosen<'a>(submissions: &'a [Submission], reason: Option<&str>) -> Vec<&'
         let status = one.status.as_ref();
         let failure = status.and_then(|status| status.failure.as_ref());
         let is_hosts = failure.is_some_and(|failure| {
-            let is_uncharged = failure.class == FailureClass::Infrastructure && !failure.charged;
-            is_uncharged && reason.is_none_or(|reason| reason == failure.reason)
+            failure.class == FailureClass::Infrastructure && reason.is_none_or(|reason| reason == failure.reason)
         });
         is_hosts && facts::has_ended(one) && one.metadata.deletion_timestamp.is_none() && !one.spec.check
     };

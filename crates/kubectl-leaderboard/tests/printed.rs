@@ -74,7 +74,7 @@ fn submission(name: &str, status: &Value) -> Value {
 fn failed(class: &str, reason: &str) -> Value {
     json!({
         "attempt": 1, "reason": reason, "message": "It has ended.", "track": "sensors", "resultsURL": "s3://results/v2/42",
-        "failure": {"class": class, "reason": reason, "message": "It has ended.", "charged": class == "Participant"},
+        "failure": {"class": class, "reason": reason, "message": "It has ended."},
         "times": {"finished": TIME}, "plan": plan(), "conditions": [condition("Finished", "True", reason)],
     })
 }

@@ -19,8 +19,8 @@ use crate::services::evalai::{InboxTrouble, Usage};
 use leaderboard_api::conditions::{self, Truth};
 use leaderboard_api::leaderboard::Counts;
 use leaderboard_api::{
-    CheckEnd, Evalai, EvalaiBacklog, EvalaiUse, Leaderboard, LeaderboardStatus, TableUse, TeamFailures, TeamUse, Track,
-    TrackStatus, effective, names, reasons,
+    CheckEnd, Evalai, EvalaiBacklog, EvalaiUse, Leaderboard, LeaderboardStatus, TableUse, TeamUse, Track, TrackStatus,
+    effective, names, reasons,
 };
 
 const CLAIMS_NOT_SERVED: &str = "gpu.mode is Claim, and the API server does not serve resource.k8s.io/v1, which Kubernetes has from 1.34 on. \
@@ -40,8 +40,6 @@ pub struct LeaderboardView {
     pub counts: Counts,
     /// The check that ended last, as far as its Submission was seen.
     pub check: Option<CheckEnd>,
-    /// Teams with failures in a row that an agent can cause.
-    pub teams: Vec<TeamFailures>,
     /// Its teams that have used the most.
     pub gpu_use: Vec<TeamUse>,
     /// Submissions that are live or not yet published and recorded.
@@ -94,7 +92,6 @@ pub fn decide(view: &LeaderboardView) -> LeaderboardPlan {
         status.observed_generation = generation;
     }
     status.counts = Some(view.counts);
-    status.infrastructure_failures.clone_from(&view.teams);
     status.gpu_use.clone_from(&view.gpu_use);
     status.evalai = view.usage.filter(|_| view.refusal.is_none()).map(evalai_use);
     status.table = view.rows_waiting.filter(|waiting| *waiting > 0).map(table_use);

@@ -47,7 +47,6 @@ fn view(mine: &Arc<Leaderboard>, all: &[Arc<Leaderboard>]) -> LeaderboardView {
         all: all.to_vec(),
         counts: Counts::default(),
         check: None,
-        teams: Vec::new(),
         gpu_use: Vec::new(),
         in_use: 0,
         pods: 0,

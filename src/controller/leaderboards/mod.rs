@@ -36,7 +36,7 @@ use super::settings::Settings;
 use super::slots::SlotAllocator;
 use super::writes::{apply_status, set_finalizer};
 use crate::controller::submissions::external::ExternalSystems;
-use crate::controller::submissions::team_history::Teams;
+use crate::controller::submissions::team_use::Teams;
 use crate::kubernetes::CallError;
 use crate::observability::metrics::leader::{self, Gauge, Samples};
 use decide::{LeaderboardPlan, LeaderboardView, decide};
@@ -199,7 +199,6 @@ fn observe(
         all: stores.leaderboards.state(),
         counts,
         check: uses.slots.last_check(leaderboard),
-        teams: uses.teams.failures(leaderboard),
         gpu_use: uses.teams.gpu_use(leaderboard),
         in_use,
         pods: isolation::pods_left(stores, leaderboard),

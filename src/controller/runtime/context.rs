@@ -19,7 +19,7 @@ use crate::controller::submissions::memory::Memory;
 use crate::controller::submissions::observe::causes::Causes;
 use crate::controller::submissions::observe::workers::Workers;
 use crate::controller::submissions::reruns::Reruns;
-use crate::controller::submissions::team_history::Teams;
+use crate::controller::submissions::team_use::Teams;
 use crate::controller::submissions::{act, observe};
 use crate::kubernetes::objects::Pod;
 use crate::observability::metrics::Metrics;
@@ -57,7 +57,6 @@ impl Context {
             workers: &self.workers,
             slots: &self.slots,
             causes: &self.causes,
-            teams: &self.teams,
             reruns: &self.reruns,
             external: &self.external,
         }

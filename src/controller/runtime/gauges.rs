@@ -20,8 +20,6 @@ use leaderboard_api::{FailureClass, Leaderboard, State, Submission, SubmissionSt
 
 /// More often than anybody scrapes.
 pub(super) const EVERY: Duration = Duration::from_secs(15);
-/// So many failures in a row are worth a host's look.
-const REPEATED: i32 = 3;
 /// Submissions of a Leaderboard that have a sample of their own.
 const MAX_SHOWN: usize = 500;
 /// All states, so that one without submissions has 0.
@@ -58,7 +56,6 @@ pub(super) fn walk(shared: &Shared, now: Timestamp) -> Samples {
     let (context, mut samples) = (&shared.context, Samples::default());
     let us = &context.settings.operator;
     let mut boards = context.stores.leaderboards.state();
-    samples.set(&leader::REPEATING_TEAMS, [], repeating_teams(&boards));
     boards.retain(|board| operator::is_ours(board, us));
     let submissions = context.stores.submissions.state();
     show_states(&mut samples, &submissions);
@@ -221,15 +218,6 @@ fn stands_since(submission: &Submission) -> Option<Timestamp> {
     let changes = [since(conditions::FINISHED), since(conditions::RUNNING)];
     let since = (changes.into_iter().flatten().max()).or(submission.metadata.creation_timestamp.as_ref());
     since.map(|time| time.0)
-}
-
-/// Teams that have had this often in a row what an agent can cause, by the statuses of the Leaderboards.
-fn repeating_teams(leaderboards: &[Arc<Leaderboard>]) -> usize {
-    let statuses = leaderboards
-        .iter()
-        .filter_map(|leaderboard| leaderboard.status.as_ref());
-    let teams = statuses.flat_map(|status| &status.infrastructure_failures);
-    teams.filter(|team| team.number >= REPEATED).count()
 }
 
 #[cfg(test)]

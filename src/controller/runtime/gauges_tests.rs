@@ -136,7 +136,7 @@ fn in_state(state: State, reason: Option<&str>, class: Option<&str>) -> Submissi
         State::Failed | State::Cancelled => &[("Finished", "True", "AsItEnded", 1)],
     };
     let mut one = submission("a", conditions);
-    let failure = class.map(|class| json!({"class": class, "charged": false, "reason": "R", "message": "M"}));
+    let failure = class.map(|class| json!({"class": class, "reason": "R", "message": "M"}));
     let status = one.status.as_mut().unwrap();
     // What is for people is read by nobody.
     status.state = Some(State::Resumed);

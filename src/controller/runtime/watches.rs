@@ -12,7 +12,7 @@ use super::leader::Leader;
 use crate::controller::objects::children_selector;
 use crate::controller::settings::Settings;
 use crate::controller::stores::{Nodes, Stores, owner_uid};
-use crate::controller::submissions::team_history::Teams;
+use crate::controller::submissions::team_use::Teams;
 use crate::kubernetes::objects::{Job, Node, Pod};
 use crate::kubernetes::{Namespaces, Shape, Tally, Watch, Watchable, spawn_watch};
 use crate::observability::Observability;

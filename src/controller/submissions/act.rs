@@ -251,8 +251,7 @@ impl Actor<'_> {
         let is_known = failed(old) && old.attempt == new.attempt;
         if let Some(failure) = new.failure.as_ref().filter(|_| failed(new) && !is_known) {
             let reason = reasons::of(&failure.reason).map_or("Other", |reason| reason.name);
-            let charged = if failure.charged { "true" } else { "false" };
-            let labels = [&self.leaderboard(), failure.class.as_str(), reason, charged];
+            let labels = [&self.leaderboard(), failure.class.as_str(), reason];
             let failures = &self.uses.metrics.submissions.failures;
             failures.of(labels.map(str::to_owned)).inc();
         }

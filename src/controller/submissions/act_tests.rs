@@ -157,7 +157,7 @@ async fn a_failed_attempt_is_counted_once_when_it_is_stored() {
     let old = view.submission.status.clone().unwrap();
     let finished = json!({"type": "Finished", "status": "True", "reason": "AgentCrashed", "message": "",
                           "lastTransitionTime": "2026-01-01T00:00:00Z"});
-    let failure = json!({"class": "Participant", "charged": true, "reason": "AgentCrashed", "message": "It crashed."});
+    let failure = json!({"class": "Participant", "reason": "AgentCrashed", "message": "It crashed."});
     let failed = SubmissionStatus {
         conditions: vec![serde_json::from_value(finished).unwrap()],
         failure: Some(serde_json::from_value(failure).unwrap()),
@@ -179,7 +179,7 @@ async fn a_failed_attempt_is_counted_once_when_it_is_stored() {
         (resumed, Some("2")),
     ] {
         let text = metrics_after(&around, &mut view, status).await;
-        let labels = "leaderboard=\"one/board\",class=\"Participant\",reason=\"AgentCrashed\",charged=\"true\"";
+        let labels = "leaderboard=\"one/board\",class=\"Participant\",reason=\"AgentCrashed\"";
         let found = text.lines().find(|line| line.starts_with(family));
         assert_eq!(
             found,

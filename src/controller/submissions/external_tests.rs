@@ -13,7 +13,6 @@ use tokio::sync::mpsc;
 
 use super::*;
 use crate::controller::fixtures::{Cluster, Surroundings, leaderboard, surroundings, with_job};
-use crate::controller::submissions::team_history::TeamHistory;
 use crate::controller::submissions::view::{
     ObservedFence, ObservedImage, ObservedJob, ObservedLog, ObservedNode, ObservedReport, ObservedRoutes,
     ObservedTexts, ObservedTraces, Turn,
@@ -86,7 +85,7 @@ async fn bench(state: State) -> Bench {
     let (mut submission, _) = with_job("sub", &board);
     let now = Timestamp::now();
     let status = submission.status.as_mut().unwrap();
-    let failure = json!({"class": "Participant", "charged": true, "reason": "Test", "message": "It failed."});
+    let failure = json!({"class": "Participant", "reason": "Test", "message": "It failed."});
     status.failure = (state == State::Failed).then(|| serde_json::from_value(failure).unwrap());
     let (type_, reason) = (conditions::FINISHED, state.as_str());
     conditions::set(&mut status.conditions, type_, Truth::True, reason, "", None, &Time(now));
@@ -119,7 +118,6 @@ async fn bench(state: State) -> Bench {
         record: Some(RecordView::default()),
         partial_sent: None,
         rerun_as: None,
-        team: TeamHistory::default(),
         evalai_writes_from: None,
     };
     Bench {

@@ -111,7 +111,6 @@ fn of_attempt(new: &SubmissionStatus) -> Vec<(&'static str, Value)> {
     }
     if let Some(failure) = &new.failure {
         found.push(("leaderboard.failure.class", Value::Word(failure.class.as_str())));
-        found.push(("leaderboard.failure.charged", Value::Flag(failure.charged)));
     }
     found
 }

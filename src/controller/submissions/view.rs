@@ -10,7 +10,6 @@ pub use super::foreign_runs::ObservedTraces;
 pub use super::images::ObservedImage;
 pub use super::other_results::ObservedRoutes;
 use super::report_digest::{ReportDigest, ReportId};
-use super::team_history::TeamHistory;
 pub use crate::controller::slots::turns::Turn;
 use crate::pod::run::Stop;
 use crate::services::held_text::HeldText;
@@ -63,8 +62,6 @@ pub struct View {
     pub partial_sent: Option<u32>,
     /// The submission that re-runs this one, as its status shows.
     pub rerun_as: Option<Rerun>,
-    /// How its team's attempts ended before; read only if this may be the reconcile that ends it.
-    pub team: TeamHistory,
     /// Until when nothing is written to EvalAI, because the controller before may still have requests under way.
     pub evalai_writes_from: Option<Timestamp>,
 }

@@ -31,7 +31,7 @@ use crate::controller::submissions::memory::Memory;
 use crate::controller::submissions::observe::causes::Causes;
 use crate::controller::submissions::observe::workers::Workers;
 use crate::controller::submissions::reruns::Reruns;
-use crate::controller::submissions::team_history::Teams;
+use crate::controller::submissions::team_use::Teams;
 use crate::kubernetes::Namespaces;
 use crate::kubernetes::objects::{Job, Owner, Pod};
 use crate::kubernetes::{Store, Synced};

@@ -27,11 +27,6 @@ pub const OBSERVED: Gauge<1> = Gauge(
     ["reason"],
     "Submissions that are only observed, by what their comparison shows",
 );
-pub const REPEATING_TEAMS: Gauge<0> = Gauge(
-    "teams_with_repeated_infrastructure_failures",
-    [],
-    "Teams with 3 attempts in a row or more that ended because of the infrastructure in ways that an agent can cause",
-);
 pub const GPU_SECONDS: Gauge<2> = Gauge(
     "submission_gpu_seconds",
     ["leaderboard", "submission"],

@@ -133,7 +133,7 @@ impl Work {
 /// What has become of submissions while this process led.
 #[derive(Debug)]
 pub struct Submissions {
-    pub failures: Counters<4>,
+    pub failures: Counters<3>,
     gpu: Counters<2>,
     team_gpu: Counters<2>,
     pub phases: Timings<1>,
@@ -146,8 +146,8 @@ impl Submissions {
         Self {
             failures: r.counters(
                 "submission_failures",
-                ["leaderboard", "class", "reason", "charged"],
-                "Attempts that have failed while this process led; `charged` is `true` where EvalAI counts the attempt",
+                ["leaderboard", "class", "reason"],
+                "Attempts that have failed while this process led; those of class `Participant` count as attempts",
             ),
             gpu: r.counters(
                 "gpu_seconds",

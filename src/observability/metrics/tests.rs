@@ -27,7 +27,7 @@ fn all(program: Program) -> Metrics {
     metrics
         .submissions
         .gpus_used("ns/board".into(), "sensors".into(), Some("7"), 400);
-    let failure = ["ns/board", "Participant", "AgentCrashed", "true"];
+    let failure = ["ns/board", "Participant", "AgentCrashed"];
     metrics.submissions.failures.of(failure).inc();
     metrics.submissions.phases.of(["run"]).observe(3000.0);
     metrics.evalai.requests.of(["put_finished", "ok"]).inc();
@@ -51,7 +51,6 @@ fn samples() -> Samples {
         3,
     );
     samples.set(&leader::OBSERVED, ["SameEnd"], 1);
-    samples.set(&leader::REPEATING_TEAMS, [], 1);
     samples.set(&leader::GPU_SECONDS, ["ns/board", "submission-1"], 240);
     samples.set(&leader::READY, board, 1);
     samples.set(&leader::OLDEST_PENDING, board, 9);
@@ -88,11 +87,10 @@ fn every_metric_has_its_name_and_its_labels() {
         "leaderboard_submissions{state=\"Running\"} 2",
         "leaderboard_submissions_by_reason{state=\"Failed\",reason=\"AgentCrashed\",class=\"Participant\"} 3",
         "leaderboard_queue_oldest_message_timestamp_seconds{queue=\"https://q/1\"} 1800000000",
-        "leaderboard_teams_with_repeated_infrastructure_failures 1",
         "leaderboard_gpu_seconds_total{leaderboard=\"ns/board\",track=\"sensors\"} 400",
         "leaderboard_team_gpu_seconds_total{leaderboard=\"ns/board\",team=\"7\"} 400",
         "leaderboard_submission_gpu_seconds{leaderboard=\"ns/board\",submission=\"submission-1\"} 240",
-        "leaderboard_submission_failures_total{leaderboard=\"ns/board\",class=\"Participant\",reason=\"AgentCrashed\",charged=\"true\"} 1",
+        "leaderboard_submission_failures_total{leaderboard=\"ns/board\",class=\"Participant\",reason=\"AgentCrashed\"} 1",
         "leaderboard_ready{leaderboard=\"ns/board\"} 1",
         "leaderboard_oldest_pending_seconds{leaderboard=\"ns/board\"} 9",
         "leaderboard_oldest_unpublished_seconds{leaderboard=\"ns/board\"} 4",

@@ -43,7 +43,6 @@ pub enum Value {
     Text(String),
     Word(&'static str),
     Number(i64),
-    Flag(bool),
 }
 
 /// Where spans go; clones are the same. The default keeps none.

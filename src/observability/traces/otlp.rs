@@ -205,7 +205,6 @@ fn data(span: Span, scope: &InstrumentationScope) -> SpanData {
         Value::Text(text) => KeyValue::new(key, text),
         Value::Word(word) => KeyValue::new(key, word),
         Value::Number(number) => KeyValue::new(key, number),
-        Value::Flag(flag) => KeyValue::new(key, flag),
     });
     SpanData {
         span_context: SpanContext::new(trace, id(span.id), TraceFlags::SAMPLED, false, TraceState::default()),

@@ -105,7 +105,7 @@ pub(super) fn failed(
     let status = json!({
         "attempt": 1, "reason": reason, "track": "sensors",
         "progress": {"done": 22, "total": 80, "text": "22/80"},
-        "failure": {"class": class, "reason": reason, "message": message, "charged": class == "Participant"},
+        "failure": {"class": class, "reason": reason, "message": message},
         "times": {
             "submitted": ago(end + 2 * HOUR), "scheduled": ago(end + HOUR), "started": ago(end + HOUR - 5 * MINUTE),
             "finished": ago(end),

@@ -250,7 +250,7 @@ export function failures(view, context) {
       { class: "row fail", "data-key": keyOf(row) },
       who(row, context),
       element("p", { class: "why" }, element("b", {}, row.reason), " ", row.message),
-      element("span", { class: "muted notes" }, `${row.class}, ${row.isCharged ? "counts as an attempt" : "not charged"}`, row.time === null ? null : [" · ", ago(row.time, context.now)]),
+      element("span", { class: "muted notes" }, `${row.class}, ${row.class === "Participant" ? "counts as an attempt" : "not charged"}`, row.time === null ? null : [" · ", ago(row.time, context.now)]),
     ),
   );
 }

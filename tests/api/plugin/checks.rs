@@ -173,7 +173,7 @@ async fn what_collects_the_lines_on_the_node_of_the_check_too_is_noted() {
 async fn a_fault_is_named_with_its_step_and_the_code_is_one() {
     let terminal = Terminal::new().await;
     terminal.leaderboard(&json!({})).await;
-    let failure = json!({"class": "Infrastructure", "reason": "ImagePull", "charged": false,
+    let failure = json!({"class": "Infrastructure", "reason": "ImagePull",
                          "message": "The image of simulator-1 cannot be pulled: not found."});
     let bad = ended(
         "ImagePull",

@@ -131,9 +131,9 @@ async fn status_is_followed_until_the_end() {
 #[tokio::test]
 async fn only_what_the_infrastructure_failed_is_resumed() {
     let terminal = Terminal::new().await;
-    let mut lost = failed("Infrastructure", "NodeLost");
-    lost["failure"]["charged"] = json!(false);
-    terminal.submission("lost", &json!({}), &lost).await;
+    terminal
+        .submission("lost", &json!({}), &failed("Infrastructure", "NodeLost"))
+        .await;
     terminal
         .submission("crashed", &json!({}), &failed("Participant", "AgentCrashed"))
         .await;

@@ -226,8 +226,7 @@ pub fn end(state: &str, reason: &str) -> Value {
 
 pub fn failed(class: &str, reason: &str) -> Value {
     let mut status = end("Failed", reason);
-    let failure = json!({"class": class, "reason": reason, "message": "It has ended.",
-                         "charged": class == "Participant", "pair": 2});
+    let failure = json!({"class": class, "reason": reason, "message": "It has ended.", "pair": 2});
     merge(&mut status, &json!({ "failure": failure }));
     status
 }

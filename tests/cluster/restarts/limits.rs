@@ -11,7 +11,7 @@ use futures::{AsyncBufReadExt, TryStreamExt};
 use k8s_openapi::api::core::v1::Pod;
 use kube::ResourceExt;
 use kube::api::LogParams;
-use leaderboard_api::State;
+use leaderboard_api::{FailureClass, State};
 use serde_json::json;
 use tokio::time::timeout;
 
@@ -88,7 +88,9 @@ async fn report_of(scene: &Scene, submission: &str) -> String {
 async fn judge(scene: &Scene, limit: &Limit, name: &str) -> String {
     let ended = scene.settled(name, LIMIT).await;
     let failure = ended.status.as_ref().and_then(|status| status.failure.clone());
-    let charged = failure.as_ref().is_some_and(|failure| failure.charged);
+    let charged = failure
+        .as_ref()
+        .is_some_and(|failure| failure.class == FailureClass::Participant);
     assert!(!charged, "{name}: {failure:?}");
     if limit.neighbor == "not charged" {
         return limit.neighbor.to_owned();

@@ -191,18 +191,10 @@ reasons! {
         IMAGE_VOLUMES = "ImageVolumes",
             "The submitted image declares volumes, whose content no limit of the cluster counts. No Job is created.",
             "Remove VOLUME from the image's Dockerfile or use a base image without it, and submit again.";
-        REPEATED_FAILURES = "RepeatedFailures",
-            "The attempt ended because of the infrastructure in a way that an agent can cause as well, and so did the team's attempts \
-             before it, while other teams' runs with the same simulator finished. Only with \
-             `retries.onRepeatedInfrastructure: Charge`.",
-            "Look at the log of the simulator and of the agent. If the agent is not the cause, resume the submission; else the \
-             participant fixes the agent and submits again.",
-            log: "the log of simulator `<n>`, read from its node before the Pod ends, else `simulator/console-<n>.log`; where no simulator \
-             failed, the log of `logcopy`";
         DISK_FULL = "DiskFull",
             "The Pod was evicted because its disk was full. A participant failure if the kubelet names an agent's container or a volume that \
-             agents alone write to, or if `logcopy` has measured that agents fill the logs. Else it is an infrastructure failure, \
-             which is counted by team: CARLA's saves and core dumps are on the same account.",
+             agents alone write to, or if `logcopy` has measured that agents fill the logs. Else it is an infrastructure failure: \
+             CARLA's saves and core dumps are on the same account.",
             "Write less to disk or to the log.",
             after_failure: "Look at what fills the disk, such as the simulator's Saved and core dumps, or raise the limit; then resume the \
              submission.",
@@ -223,8 +215,8 @@ reasons! {
         NODE_CANNOT_START = "NodeCannotStart",
             "The node could not start a container, or its kubelet did not admit the Pod (`UnexpectedAdmissionError`): the container engine, \
              the GPU toolkit or device plugin, a full disk, too many open files. All that is not proven to be the image's counts here. \
-             Another Job follows, which prefers other nodes; after two on one node the Jobs of this attempt avoid it \
-             (`status.failedNodes`).",
+             Another Job follows, which prefers other nodes (`status.failedNodes`); after a second such end only if its Job has finished a \
+             route.",
             "Look at the node that the message names. The participant's image is not the cause.",
             after_failure: "Look at the node that the message names: its container engine, GPU toolkit, device plugin and disk. Then resume the \
              submission.";
@@ -247,8 +239,7 @@ reasons! {
             after_failure: "Resume the submission.";
         REQUEUED = "Requeued",
             "A host has put the submission back in line (`spec.requeue`). A Job that ran was stopped, its results were stored, and a new \
-             Job resumes from them; this uses up neither an attempt nor `retries.infrastructure`, and what was counted in \
-             `status.infrastructureFailures` is forgiven.",
+             Job resumes from them; this uses up neither an attempt nor `retries.infrastructure`.",
             "Nothing.",
             after_failure: "Resume the submission.";
         START_DEADLINE = "StartDeadline",

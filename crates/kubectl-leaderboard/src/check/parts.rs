@@ -401,7 +401,7 @@ fn part_of(reason: &str, text: &str) -> Part {
         reasons::CANNOT_START if text.contains("imulator-") => Part::Simulator,
         reasons::CANNOT_START if text.contains("ontents") => Part::Contents,
         reasons::NOT_ISOLATED => Part::Network,
-        reasons::SIMULATION_CRASHED | reasons::REPEATED_FAILURES => Part::Simulator,
+        reasons::SIMULATION_CRASHED => Part::Simulator,
         reasons::CANNOT_START
         | reasons::AGENT_CRASHED
         | reasons::OUT_OF_MEMORY

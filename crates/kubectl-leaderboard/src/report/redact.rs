@@ -147,8 +147,8 @@ mod tests {
             "status": {"team": {"name": "Team Seven", "displayName": "Team Seven"}, "failure": {"reason": "NodeLost", "message": ended}},
         });
         let numbered = json!({"spec": {"team": {"id": "8", "name": "gpu"}}});
-        let board = json!({"status": {"gpuUse": [{"team": "Team Seven", "gpuSeconds": 4}, {"team": "8", "gpuSeconds": 2}],
-                                      "infrastructureFailures": [{"team": "Team Seven", "number": 2}]}});
+        let board =
+            json!({"status": {"gpuUse": [{"team": "Team Seven", "gpuSeconds": 4}, {"team": "8", "gpuSeconds": 2}]}});
         let all = vec![
             submission,
             numbered,

@@ -93,7 +93,7 @@ pub(super) fn failed(class: &str, reason: &str, message: &str) -> Value {
         &json!({
             "reason": reason, "message": message, "progress": null, "score": null,
             "times": {"accepted": "2026-11-01T11:50:00Z", "scheduled": "2026-11-01T11:50:41Z", "finished": "2026-11-01T11:57:00Z"},
-            "failure": {"class": class, "reason": reason, "message": message, "charged": false},
+            "failure": {"class": class, "reason": reason, "message": message},
             "conditions": [
                 condition("Accepted", "True", "Accepted", ""), condition("Finished", "True", reason, message),
                 condition("Archived", "False", "NotStored", ""), condition("Recorded", "True", "Recorded", ""),

@@ -192,7 +192,7 @@ fn teams_of_leaderboards_that_share_a_name_are_told_apart_by_their_namespace() {
 fn programs_get_the_same_facts() {
     let value = why::value(&submission(&crashed()), Observed::Missing);
     assert_eq!(value["state"], "Failed");
-    assert_eq!(value["failure"]["charged"], true);
+    assert_eq!(value["failure"]["class"], "Participant");
     let step = value["nextSteps"][0].as_str().unwrap();
     assert!(step.starts_with("Look at agent/agent2/leaderboard.log"), "{step}");
     assert_eq!(

@@ -101,7 +101,7 @@ fn crashed() -> Value {
         "state": "Failed", "attempt": 1, "reason": "AgentCrashed", "message": message, "track": "sensors",
         "progress": {"done": 12, "total": 20, "text": "12/20"}, "score": {"driving": "41.20", "final": false, "text": "~41.20"}, "jobName": "submission-42-1",
         "resultsURL": "s3://results/v2/42", "times": {"finished": "2026-11-01T11:57:00Z"},
-        "failure": {"class": "Participant", "reason": "AgentCrashed", "message": message, "charged": true, "pair": 2},
+        "failure": {"class": "Participant", "reason": "AgentCrashed", "message": message, "pair": 2},
         "pairs": [
             {"id": 1, "done": 10, "total": 10, "crashes": 0, "state": "Done"},
             {"id": 2, "done": 2, "total": 10, "crashes": 4, "state": "Crashed",
@@ -122,7 +122,7 @@ fn node_lost() -> Value {
     json!({
         "state": "Failed", "attempt": 1, "retry": 2, "reason": "NodeLost", "message": message, "track": "sensors",
         "resultsURL": "s3://results/v2/42", "times": {"finished": "2026-11-01T11:57:00Z"},
-        "failure": {"class": "Infrastructure", "reason": "NodeLost", "message": message, "charged": false},
+        "failure": {"class": "Infrastructure", "reason": "NodeLost", "message": message},
         "conditions": [condition("Finished", "True", "NodeLost", message), condition("Published", "True", "Published", "")],
     })
 }

@@ -80,7 +80,7 @@ fn programs_get_those_that_have_a_line_with_their_next_steps() {
         .map(|one| one["name"].clone())
         .collect();
     assert_eq!(names, ["third", "crashed", "elsewhere"]);
-    assert_eq!(shown[1]["failure"]["charged"], true);
+    assert_eq!(shown[1]["failure"]["class"], "Participant");
     let step = shown[1]["nextSteps"][0].as_str().unwrap();
     assert!(step.starts_with("Look at agent/agent2/leaderboard.log"), "{step}");
     let problems = |all: &Value, at: usize| all[at]["leaderboardProblems"].as_array().unwrap().len();

@@ -83,8 +83,7 @@ fn the_crashes_of_the_failed_pair_are_counted_once() {
         {"id": 1, "done": 1, "total": 10, "crashes": 3, "state": "Crashed"},
         {"id": 2, "done": 2, "total": 10, "crashes": 2, "state": "Crashed", "last": {"reason": "unseen"}},
     ]);
-    let failure =
-        json!({"class": "Participant", "charged": true, "pair": 2, "reason": "CannotStart", "message": message});
+    let failure = json!({"class": "Participant", "pair": 2, "reason": "CannotStart", "message": message});
     let text = explained(&with(
         crashed(),
         &json!({"message": message, "failure": failure, "pairs": pairs}),
@@ -98,24 +97,6 @@ fn the_crashes_of_the_failed_pair_are_counted_once() {
         "{text}"
     );
     assert!(text.contains("Pair 2:      2 of 10 routes done."), "{text}");
-}
-
-#[test]
-fn repeated_failures_of_the_infrastructure_are_counted_for_the_submission_and_its_team() {
-    let time = "2026-11-01T11:57:00Z";
-    let own = json!({"infrastructureFailures": {"number": 2, "firstTime": time, "lastTime": time, "nodes": ["gpu-3"]}});
-    let team = json!({"team": {"id": "7", "name": "Team Seven"}});
-    let board = changed(|board| {
-        let teams = json!([{"team": "7", "number": 3, "lastTime": time}, {"team": "8", "number": 9, "lastTime": time}]);
-        board.status.as_mut().unwrap().infrastructure_failures = serde_json::from_value(teams).unwrap();
-    });
-    let failed = submission(&with(with(node_lost(), &own), &team));
-    let text = printed(&failed, Observed::Found(&board));
-    let words = text.split_whitespace().collect::<Vec<_>>().join(" ");
-    let row = "Repeated: attempts that ended because of the infrastructure in ways that an agent can cause as well: 2 of this \
-               submission, the last 2026-11-01 11:57:00 UTC (3 min ago); 3 of its team since a run of it last finished.";
-    assert!(words.contains(row), "{text}");
-    assert!(!explained(&crashed()).contains("Repeated"));
 }
 
 #[test]
@@ -155,7 +136,7 @@ fn the_next_step_of_a_failure_is_not_that_of_a_wait_for_the_same_reason() {
     ] {
         assert!(wait(reason).contains(waits), "{}", wait(reason));
         let message = "Something failed. Correct that.";
-        let failure = json!({"class": "Infrastructure", "charged": false, "reason": reason, "message": message});
+        let failure = json!({"class": "Infrastructure", "reason": reason, "message": message});
         let text = explained(&with(
             node_lost(),
             &json!({"reason": reason, "message": message, "failure": failure}),

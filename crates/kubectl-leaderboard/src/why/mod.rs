@@ -17,7 +17,7 @@ use super::text::{Frame, Page, join, span, when};
 use leaderboard_api::conditions::{self, Condition};
 use leaderboard_api::names::FAILURE_LOG_KEY;
 use leaderboard_api::text::sentence;
-use leaderboard_api::{EndReason, LastEnd, PairStatus, Rerun, Submission, SubmissionStatus, reasons};
+use leaderboard_api::{EndReason, FailureClass, LastEnd, PairStatus, Rerun, Submission, SubmissionStatus, reasons};
 
 /// What is known, and the lines about it so far.
 struct Explanation<'a> {
@@ -64,7 +64,6 @@ pub fn explain(submission: &Submission, leaderboard: Observed<'_>, frame: Frame)
     explanation.rerun();
     explanation.requeued();
     explanation.failure();
-    explanation.repeated();
     explanation.line();
     explanation.attempt();
     explanation.run();
@@ -145,10 +144,9 @@ impl Explanation<'_> {
     fn failure(&mut self) {
         let Some(failure) = &self.status.failure else { return };
         let pair = failure.pair.map(|pair| format!(" in pair {pair}")).unwrap_or_default();
-        let counts = if failure.charged {
-            "counts as an attempt"
-        } else {
-            "does not count as an attempt"
+        let counts = match failure.class {
+            FailureClass::Participant => "counts as an attempt",
+            FailureClass::Infrastructure => "does not count as an attempt",
         };
         let class = class(failure.class);
         let text = format!("{}{pair}: {class}, {counts}.", failure.reason);
@@ -156,36 +154,6 @@ impl Explanation<'_> {
         // While the run is being stopped, the message above is that of the stop.
         if self.status.message.as_deref() != Some(failure.message.as_str()) {
             self.page.row("", &failure.message);
-        }
-    }
-
-    /// What of its own, and of its team, ended in ways that are not charged and that an agent can cause.
-    fn repeated(&mut self) {
-        let status = self
-            .leaderboard
-            .leaderboard()
-            .and_then(|leaderboard| leaderboard.status.as_ref());
-        let teams = status
-            .map(|status| status.infrastructure_failures.as_slice())
-            .unwrap_or_default();
-        let of_team = teams
-            .iter()
-            .find(|failures| Some(failures.team.as_str()) == self.submission.team());
-        let own = self.status.infrastructure_failures.as_ref();
-        let parts = [
-            own.map(|own| {
-                format!(
-                    "{} of this submission, the last {}",
-                    own.number,
-                    when(own.last_time.0, self.now)
-                )
-            }),
-            of_team.map(|team| format!("{} of its team since a run of it last finished", team.number)),
-        ];
-        let parts: Vec<String> = parts.into_iter().flatten().collect();
-        if !parts.is_empty() {
-            let what = "attempts that ended because of the infrastructure in ways that an agent can cause as well";
-            self.page.row("Repeated", &format!("{what}: {}.", parts.join("; ")));
         }
     }
 

@@ -32,7 +32,7 @@ fn ended(reason: &str) -> Value {
 fn a_submission_is_as_urgent_as_what_it_shows() {
     use Class::{New, Refresh, Urgent};
     let time = "2026-01-01T00:00:00Z";
-    let failure = json!({"class": "Participant", "reason": "AgentCrashed", "message": "m", "charged": true});
+    let failure = json!({"class": "Participant", "reason": "AgentCrashed", "message": "m"});
     // What it shows; the urgency of a change of its own, of an answer, and of news of EvalAI.
     for (what, change, expected) in [
         ("just created", json!({}), [New, New, New]),

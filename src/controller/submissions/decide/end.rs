@@ -5,7 +5,7 @@ use std::time::Duration;
 use k8s_openapi::apimachinery::pkg::apis::meta::v1::Time;
 
 use super::plan_builder::{PlanBuilder, after};
-use super::{allowance, clock, crashes, disk, failure, interruption, reading, reported, requeue};
+use super::{clock, crashes, disk, failure, interruption, provoked, reading, reported, requeue};
 use crate::controller::submissions::report_digest::ReportDigest;
 use crate::controller::submissions::view::{JobEnd, ObservedReport, Stage};
 use leaderboard_api::conditions::{self, Truth};
@@ -25,7 +25,7 @@ const READ_SECONDS: i64 = 86_400;
 /// The same of one that was cancelled, which has `deadlines.cancelSeconds`: a bucket that hung is left alone for up to half of it.
 const READ_AT_LEAST_SECONDS: i64 = 60;
 
-/// Failures after which the next Jobs keep off the node.
+/// Failures of a node, which gets no third Job of the attempt.
 const OF_NODES: [&str; 2] = [reasons::NO_GPU, reasons::NODE_CANNOT_START];
 
 /// The Job is terminal, or gone because we ended it (`None`).
@@ -74,7 +74,7 @@ pub(super) fn decide(draft: &mut PlanBuilder<'_>, job_end: Option<&JobEnd>) {
     if found.class == FailureClass::Infrastructure && may_retry(draft, &found) {
         return retry(draft, &found);
     }
-    let found = allowance::counted(draft, found);
+    let found = provoked::explained(draft, found);
     failed(draft, found);
 }
 
@@ -191,7 +191,7 @@ fn may_retry(draft: &PlanBuilder<'_>, found: &Failure) -> bool {
     // A higher attempt that is already requested takes the place of a retry.
     let is_latest = Some(draft.spec().attempt) <= draft.status.attempt;
     let is_left = interruption::is_one(found)
-        || (!allowance::is_used_up(draft, found)
+        || (provoked::leaves_a_job(draft, found)
             && interruption::other_failures(&draft.status) < draft.retries().infrastructure);
     can_recover && is_latest && is_left
 }
@@ -215,11 +215,13 @@ fn retry(draft: &mut PlanBuilder<'_>, found: &Failure) {
     } else if requeue::is_one(found) {
         requeue::note(draft, 1);
     }
+    provoked::note(draft, found);
     draft.status.retry += 1;
     draft.status.job_name = None;
+    let is_of_node = OF_NODES.contains(&found.reason.as_str());
     let node = draft.status.node_name.take();
-    if let Some(node) = node.filter(|_| OF_NODES.contains(&found.reason.as_str())) {
-        note_failed_node(&mut draft.status.failed_nodes, node);
+    if let Some(node) = node.filter(|_| is_of_node || provoked::is_one(found)) {
+        note_failed_node(&mut draft.status.failed_nodes, node, i32::from(is_of_node));
     }
     draft.status.failure = None;
     draft.status.recreated = 0;
@@ -239,23 +241,22 @@ fn retry(draft: &mut PlanBuilder<'_>, found: &Failure) {
     draft.requeue_at(at);
 }
 
-/// Counts a Job that a node has failed. If there are too many nodes, the oldest is forgotten.
-pub(super) fn note_failed_node(nodes: &mut Vec<FailedNode>, node_name: String) {
+/// Remembers a node on which a Job has failed; `jobs` is 1 if by its fault. If there are too many nodes, the oldest is forgotten.
+pub(super) fn note_failed_node(nodes: &mut Vec<FailedNode>, node_name: String, jobs: i32) {
     if let Some(known) = nodes.iter_mut().find(|known| known.node_name == node_name) {
-        known.jobs = known.jobs.saturating_add(1);
+        known.jobs = known.jobs.saturating_add(jobs);
         return;
     }
     if nodes.len() >= MAX_FAILED_NODES {
         nodes.remove(0);
     }
-    nodes.push(FailedNode { node_name, jobs: 1 });
+    nodes.push(FailedNode { node_name, jobs });
 }
 
 fn finished(draft: &mut PlanBuilder<'_>, report: &ReportDigest) {
     // Without its Job nobody has taken it in yet.
     reported::take(draft, report);
     draft.status.failure = None;
-    draft.status.infrastructure_failures = None;
     let score = draft.status.score.as_ref().map_or("", |score| score.text.as_str());
     let message = format!("{} of {} routes, driving score {score}.", report.done, report.total);
     close(draft, reasons::FINISHED, &message);

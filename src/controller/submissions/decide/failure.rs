@@ -20,7 +20,6 @@ pub(super) fn participant(reason: &str, what: &str, next: &Steps) -> Failure {
         participant_message: Some(for_participants).filter(|text| *text != message),
         message,
         next_step: Some(next.hosts.clone()),
-        charged: true,
         pair: None,
     }
 }
@@ -38,7 +37,6 @@ pub(super) fn infrastructure(reason: &str, what: &str) -> Failure {
         message: what.to_owned(),
         next_step: None,
         participant_message: Some(infrastructure_for_participants(reason)),
-        charged: false,
         pair: None,
     }
 }

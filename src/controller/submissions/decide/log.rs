@@ -83,12 +83,8 @@ fn places(status: &SubmissionStatus, pod: Option<&PodView>) -> Vec<LogPlace> {
     let on_node = |container: &str| pod.and_then(|pod| on_node(pod, container));
     let found = match failure.reason.as_str() {
         reasons::SIMULATION_CRASHED => vec![on_node(&simulator), Some(stored(&simulator, console(pair)))],
-        // What it was before it was one of several.
-        reasons::REPEATED_FAILURES if failure.pair.is_some() => {
-            vec![on_node(&simulator), Some(stored(&simulator, console(pair)))]
-        }
         reasons::START_DEADLINE => vec![pod.and_then(trouble::failing_before_agents).and_then(on_node)],
-        reasons::RESULTS_NOT_STORED | reasons::JOB_FAILED | reasons::REPEATED_FAILURES => vec![
+        reasons::RESULTS_NOT_STORED | reasons::JOB_FAILED => vec![
             on_node(names::CONTAINER_LOGCOPY),
             Some(stored(names::CONTAINER_LOGCOPY, crate::pod::ownlog::OWN_LOG.into())),
         ],

@@ -99,14 +99,12 @@ impl<'a> PlanBuilder<'a> {
 
     /// The first crash and the first fault of the infrastructure end a check, since they are what it is to show.
     pub(super) fn retries(&self) -> Retries {
-        let retries = self.leaderboard().map(|l| l.retries).unwrap_or_default();
         if !self.spec().check {
-            return retries;
+            return self.leaderboard().map(|l| l.retries).unwrap_or_default();
         }
         Retries {
             per_pair: 0,
             infrastructure: 0,
-            ..retries
         }
     }
 
@@ -224,7 +222,6 @@ impl<'a> PlanBuilder<'a> {
             score: old.score.map(Score::so_far),
             results_url: old.results_url,
             rerun_of: old.rerun_of,
-            infrastructure_failures: old.infrastructure_failures,
             // Retries are counted anew.
             requeued: old.requeued.map(|mut requeued| {
                 requeued.retries = 0;

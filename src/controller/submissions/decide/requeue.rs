@@ -1,6 +1,6 @@
 //! A host puts a submission back in line: its simulator's image was broken, or its nodes are to be upgraded. A run is stopped as before
-//! an interruption, and another Job resumes it when its turn comes. Neither an attempt nor a retry is used up, and what was counted against
-//! its team because of it is forgiven: unlike a retry or a resume, only a person with the right to edit Submissions can ask for it.
+//! an interruption, and another Job resumes it when its turn comes. Neither an attempt nor a retry is used up, and the failures of
+//! the attempt before it are forgiven: unlike a retry or a resume, only a person with the right to edit Submissions can ask for it.
 //!
 //! Called by `live` and `end`.
 
@@ -59,7 +59,7 @@ pub(super) fn note(draft: &mut PlanBuilder<'_>, jobs: i32) {
         retries: draft.status.retry.saturating_sub(interruptions).saturating_add(jobs),
     };
     draft.status.requeued = Some(Box::new(requeued));
-    draft.status.infrastructure_failures = None;
+    draft.status.routes_before = None;
 }
 
 fn what(draft: &PlanBuilder<'_>) -> String {

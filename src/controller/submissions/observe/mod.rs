@@ -17,7 +17,6 @@ use super::decide::job_name;
 use super::external::ExternalSystems;
 use super::memory::Memory;
 use super::reruns::Reruns;
-use super::team_history::{TeamHistory, Teams};
 use super::view::{NodeView, ObservedJob, PodView, View};
 use crate::controller::slots::SlotAllocator;
 use crate::controller::stores::Stores;
@@ -34,7 +33,6 @@ pub struct Uses<'a> {
     pub workers: &'a Workers,
     pub slots: &'a SlotAllocator,
     pub causes: &'a Causes,
-    pub teams: &'a Teams,
     pub reruns: &'a Reruns,
     pub external: &'a ExternalSystems,
 }
@@ -80,7 +78,6 @@ pub fn observe(uses: Uses<'_>, submission: Arc<Submission>, is_policy_in_place: 
         written_ago: uses.memory.since_write(&submission),
         partial_sent: uses.memory.partial_sent(&submission),
         rerun_as: uses.reruns.of(&submission),
-        team: team_of(uses.teams, &submission, &job, now),
         evalai_writes_from: uses.external.hub.writes_from(),
         submission,
         leaderboard,
@@ -140,23 +137,6 @@ fn node(uses: Uses<'_>, pod: Option<&PodView>) -> NodeView {
     let name = pod.filter(|pod| pod.needs_node()).and_then(|pod| pod.node.as_deref());
     let known = |name| node::watched(uses.stores, name).unwrap_or_else(|| uses.workers.lookups.node(name));
     name.map(known).unwrap_or_default()
-}
-
-/// How its team's attempts ended. Read only if this may be the reconcile that ends it.
-fn team_of(teams: &Teams, submission: &Submission, job: &ObservedJob, now: Timestamp) -> TeamHistory {
-    let is_under_way = match job {
-        ObservedJob::Ours(job) => job.end.is_none(),
-        ObservedJob::Created => true,
-        ObservedJob::Absent | ObservedJob::Foreign => false,
-    };
-    let may_end = submission.status.as_ref().is_some_and(|status| {
-        let is_finished = status.has_ended();
-        status.job_name.is_some() && !is_finished && (status.failure.is_some() || !is_under_way)
-    });
-    if !may_end {
-        return TeamHistory::default();
-    }
-    teams.history(submission, now)
 }
 
 fn is_owned_by(job: &Job, submission: &Submission) -> bool {

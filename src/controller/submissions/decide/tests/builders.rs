@@ -11,7 +11,6 @@ use crate::controller::submissions::decide::blame::is_crash;
 use crate::controller::submissions::decide::{Action, EvalaiUpdate, Plan, decide, job_name};
 use crate::controller::submissions::foreign_runs::{Looked, Traces, Unread};
 use crate::controller::submissions::report_digest::ReportDigest;
-use crate::controller::submissions::team_history::TeamHistory;
 use crate::controller::submissions::view::{
     ContainerView, EndView, EvalaiEnd, EvalaiInfo, EvalaiView, JobEnd, JobView, ObservedFence, ObservedImage,
     ObservedJob, ObservedLog, ObservedNode, ObservedReport, ObservedRoutes, ObservedTexts, ObservedTraces, PodView,
@@ -141,7 +140,6 @@ impl World {
                 record: Some(RecordView::default()),
                 partial_sent: None,
                 rerun_as: None,
-                team: TeamHistory::default(),
                 evalai_writes_from: None,
             },
         }

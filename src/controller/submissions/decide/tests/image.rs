@@ -67,7 +67,7 @@ fn an_image_of_another_team_or_of_the_host_fails_at_once_and_no_registry_is_aske
         );
         assert_eq!(condition(&plan, ACCEPTED).0, "False");
         let failure = plan.status.failure.unwrap();
-        assert_eq!((failure.class, failure.charged), (FailureClass::Participant, true));
+        assert_eq!(failure.class, FailureClass::Participant);
         let shown = failure.participant_message.unwrap_or(failure.message);
         assert!(!shown.contains("amazonaws") && !shown.contains("8080"), "{shown}");
     }
@@ -183,11 +183,7 @@ fn what_a_registry_reports_ends_a_submission_before_a_job_is_made() {
         let plan = world.pass_to(Failed, reason);
         assert!(!creates(&plan) && plan.status.image.is_none(), "{reason}");
         let failure = plan.status.failure.unwrap();
-        assert_eq!(
-            (failure.class, failure.charged),
-            (class, class == Participant),
-            "{reason}"
-        );
+        assert_eq!(failure.class, class, "{reason}");
         let shown = failure.participant_message.unwrap_or(failure.message);
         assert!(!shown.contains(ECR), "{shown}");
     }

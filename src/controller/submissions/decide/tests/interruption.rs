@@ -70,7 +70,7 @@ fn a_node_that_is_about_to_go_is_left_with_all_that_was_reached() {
             .ends_with("this costs neither an attempt nor a retry.")
     );
     assert_eq!((plan.status.attempt, plan.status.retry), (Some(Attempt(1)), 1));
-    assert_eq!((plan.status.failure, plan.status.infrastructure_failures), (None, None));
+    assert_eq!((plan.status.failure, plan.status.routes_before), (None, None));
     let known = plan.status.interruptions.unwrap();
     assert_eq!((known.number, known.nodes), (1, vec!["node-a".to_owned()]));
     world.job_gone();
@@ -255,7 +255,7 @@ fn what_a_stopped_run_has_stored_is_no_verdict_on_the_job_that_follows() {
 
         let now = ended.view.now;
         ended.job().end = Some(JobEnd::Complete { at: Some(now) });
-        let plan = ended.pass_to(Pending, reasons::REPLACING);
+        let plan = ended.pass();
         let running = conditions::get(&plan.status.conditions, conditions::RUNNING).unwrap();
         assert_eq!(running.reason, reasons::RESULTS_NOT_STORED, "{stop:?}");
     }

@@ -7,7 +7,7 @@ use k8s_openapi::apimachinery::pkg::apis::meta::v1::Time;
 use super::builders::*;
 use leaderboard_api::State::{Failed, Pending, Running};
 use leaderboard_api::conditions::{self, ACCEPTED, ISOLATED, STALLED, Truth};
-use leaderboard_api::{PolicySource, reasons};
+use leaderboard_api::{FailureClass, PolicySource, reasons};
 
 /// The Leaderboard says so of its present spec.
 fn say_of_the_leaderboard(world: &mut World, reason: &str, message: &str) {
@@ -119,7 +119,7 @@ fn a_pod_that_was_not_isolated_ends_at_once_and_is_tried_again_uncharged() {
         (failure.reason.as_str(), failure.message.as_str()),
         (reasons::NOT_ISOLATED, why)
     );
-    assert!(!failure.charged);
+    assert_eq!(failure.class, FailureClass::Infrastructure);
     let mut last = world.clone();
     last.leaderboard().retries.infrastructure = 0;
     last.job_gone();

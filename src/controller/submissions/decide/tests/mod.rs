@@ -2,7 +2,6 @@
 
 mod accept;
 mod after;
-mod allowance;
 mod blame;
 mod blame_of_neither;
 mod builders;
@@ -25,6 +24,7 @@ mod not_crashes;
 mod observe;
 mod phases;
 mod properties;
+mod provoked;
 mod reading;
 mod record;
 mod requeue;

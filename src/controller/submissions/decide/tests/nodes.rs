@@ -4,7 +4,7 @@ use super::builders::*;
 use crate::controller::submissions::decide::Action;
 use crate::controller::submissions::view::{ObservedNode, ObservedReport, PodView};
 use leaderboard_api::FailureClass::Infrastructure;
-use leaderboard_api::State::{Pending, Running};
+use leaderboard_api::State::{Failed, Pending, Running};
 use leaderboard_api::{Attempt, FailedNode, JobNumber, reasons};
 
 #[test]
@@ -161,26 +161,27 @@ fn a_pod_that_its_node_does_not_admit_ends_its_job_with_the_kubelets_words() {
     let words = "Pod was rejected: Allocate failed due to requested number of devices unavailable for nvidia.com/gpu. Requested: 1, \
                  Available: 0, which is unexpected";
     let mut world = World::local().with_pod();
-    for jobs in [1, 2] {
+    let refused = |world: &mut World| {
         world.view.pod = Some(pod(0));
         world.pod().ended_by_node = Some(("UnexpectedAdmissionError".into(), words.into()));
         let plan = world.pass_to(Pending, reasons::STOPPING);
         assert!(has(&plan, |a| matches!(a, Action::DeleteJob { .. })));
-        let failure = plan.status.failure.unwrap();
-        assert_eq!(failure.class, Infrastructure);
-        assert_eq!(
-            failure.message,
-            format!("On node node-a the kubelet did not admit the Pod (UnexpectedAdmissionError): {words}.")
-        );
         world.job_gone();
-        let plan = world.pass_to(Pending, reasons::REPLACING);
-        let node_name = "node-a".into();
-        assert_eq!(plan.status.failed_nodes, [FailedNode { node_name, jobs }]);
-        world.wait(60);
-        assert!(creates(&world.pass()));
-        world.see_job();
-        world.view.report = ObservedReport::NotRead;
-    }
+        plan.status.failure.unwrap()
+    };
+    let failure = refused(&mut world);
+    assert_eq!(failure.class, Infrastructure);
+    let expected = format!("On node node-a the kubelet did not admit the Pod (UnexpectedAdmissionError): {words}.");
+    assert_eq!(failure.message, expected);
+    let plan = world.pass_to(Pending, reasons::REPLACING);
+    let node_name = "node-a".into();
+    assert_eq!(plan.status.failed_nodes, [FailedNode { node_name, jobs: 1 }]);
+    world.wait(60);
+    assert!(creates(&world.pass()));
+    world.see_job();
+    world.view.report = ObservedReport::NotRead;
+    refused(&mut world);
+    world.pass_to(Failed, reasons::NODE_CANNOT_START);
 }
 
 #[test]

@@ -87,10 +87,7 @@ fn a_simulator_that_is_kept_away_for_want_of_processes_ends_the_run_at_the_agent
     world.see_alone(agent);
     world.go_to(1021);
     let failure = world.pass_to(Running, reasons::STOPPING).status.failure.unwrap();
-    assert_eq!(
-        (failure.class, failure.charged, failure.pair),
-        (Participant, true, Some(2))
-    );
+    assert_eq!((failure.class, failure.pair), (Participant, Some(2)));
 }
 
 #[test]
@@ -98,8 +95,8 @@ fn an_agent_that_its_node_starts_no_more_is_charged_to_nobody() {
     let mut world = World::local().running();
     world.see(ended("agent-1", 3, "nodeRefused", 71, 100));
     let failure = world.pass_to(Running, reasons::STOPPING).status.failure.unwrap();
-    let found = (failure.reason.as_str(), failure.class, failure.charged);
-    assert_eq!(found, (reasons::NODE_CANNOT_START, Infrastructure, false));
+    let found = (failure.reason.as_str(), failure.class);
+    assert_eq!(found, (reasons::NODE_CANNOT_START, Infrastructure));
     assert_eq!(
         failure.message,
         "The container of agent 1 could not be started 4 times on node node-a; nothing of its image is the cause."
@@ -112,8 +109,8 @@ fn agents_that_leave_no_process_to_start_one_of_them_again_are_charged() {
     world.see(ended("agent-1", 3, "noProcess", 75, 100));
     let failure = world.pass_to(Running, reasons::STOPPING).status.failure.unwrap();
     assert_eq!(
-        (failure.reason.as_str(), failure.charged),
-        (reasons::AGENT_CRASHED, true)
+        (failure.reason.as_str(), failure.class),
+        (reasons::AGENT_CRASHED, Participant)
     );
     assert!(
         failure.message.contains("left the Pod no process to start it again"),

@@ -156,7 +156,6 @@ fn the_spans_of_a_failed_attempt_are_one_tree_that_names_the_reason() {
     for expected in [
         ("leaderboard.state", Value::Word("Failed")),
         ("leaderboard.failure.class", Value::Word("Participant")),
-        ("leaderboard.failure.charged", Value::Flag(true)),
     ] {
         assert!(attempt.attributes.contains(&expected), "{expected:?}");
     }

@@ -16,7 +16,7 @@ use crate::services::table::ObservedRow;
 use leaderboard_api::ImportedState::{Cancelled as WasCancelled, Failed as HasFailed, Finished as HasFinished};
 use leaderboard_api::State::{Cancelled, Failed, Finished, Pending};
 use leaderboard_api::conditions::{ACCEPTED, PUBLISHED, RECORDED, STALLED};
-use leaderboard_api::{Attempt, names, reasons};
+use leaderboard_api::{Attempt, FailureClass, names, reasons};
 
 /// UID of the object before it was restored.
 const OLD: &str = "uid-0";
@@ -178,7 +178,13 @@ fn an_end_that_every_system_has_is_shown_and_nothing_else_happens() {
         );
         let score = shown.status.score.clone().map(|score| score.text);
         assert_eq!(score.as_deref(), (state == Finished).then_some("43.13"));
-        assert!(shown.status.failure.iter().all(|failure| !failure.charged));
+        assert!(
+            shown
+                .status
+                .failure
+                .iter()
+                .all(|failure| failure.class == FailureClass::Infrastructure)
+        );
         for _ in 0..3 {
             let plan = world.pass();
             assert_eq!(plan.status, shown.status);
@@ -232,7 +238,12 @@ fn what_was_stopped_keeps_its_end() {
         world.pass();
         let plan = world.pass_to(state, reason);
         assert!(!creates(&plan));
-        assert!(plan.status.failure.iter().all(|failure| !failure.charged));
+        assert!(
+            plan.status
+                .failure
+                .iter()
+                .all(|failure| failure.class == FailureClass::Infrastructure)
+        );
     }
 }
 

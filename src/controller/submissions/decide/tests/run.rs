@@ -5,7 +5,7 @@ use crate::controller::submissions::decide::{Action, EvalaiUpdate};
 use crate::controller::submissions::view::{ObservedJob, ObservedReport, PodView, Stage};
 use crate::pod::report::{Logs, Report};
 use crate::pod::run::Stop;
-use leaderboard_api::FailureClass::Infrastructure;
+use leaderboard_api::FailureClass::{Infrastructure, Participant};
 use leaderboard_api::State::{Failed, Finished, Pending, Resumed, Running};
 use leaderboard_api::conditions::{self, LOGGED, PLAUSIBLE, RUNNING, STALLED};
 use leaderboard_api::reasons;
@@ -145,7 +145,7 @@ fn the_run_deadline_counts_from_the_first_agent_to_the_second() {
     assert_eq!(annotated(&plan), Some(Stop::RunDeadline));
     world.complete();
     let failure = world.pass_to(Failed, reasons::TIME_LIMIT).status.failure.unwrap();
-    assert!(failure.charged);
+    assert_eq!(failure.class, Participant);
 }
 
 #[test]
@@ -370,7 +370,7 @@ fn a_job_that_is_gone_after_its_time_is_not_made_again() {
     };
     let plan = gone_at(WEEK).pass_to(Failed, reasons::JOB_EXPIRED);
     let failure = plan.status.failure.unwrap();
-    assert_eq!((failure.class, failure.charged), (Infrastructure, false));
+    assert_eq!(failure.class, Infrastructure);
     assert!(creates(&gone_at(WEEK - 1).pass_to(Running, reasons::REPLACING)));
 
     let mut longer = gone_at(WEEK);
