@@ -31,6 +31,7 @@ mod scene;
 mod cluster {
     mod abrupt;
     mod abuse;
+    mod attempts;
     mod audit;
     mod both_versions;
     mod bridge;
@@ -57,7 +58,6 @@ mod cluster {
     mod probes;
     mod publish;
     mod real_files;
-    mod requeues;
     mod restarts;
     mod runs;
     mod stops;

@@ -237,9 +237,8 @@ enum Progress {
 }
 
 fn progress(existing: &Submission) -> Progress {
-    // A raised attempt that the controller has not read yet still shows the end of the one before.
-    let is_of_present =
-        |status: &&SubmissionStatus| status.attempt.is_none_or(|attempt| attempt == existing.spec.attempt);
+    // A raised attempt that the controller has not begun yet is live, whatever has become of the one before.
+    let is_of_present = |status: &&SubmissionStatus| !status.is_followed_by(existing.spec.attempt);
     let status = existing.status.as_ref().filter(is_of_present);
     let is_stopping = status.is_some_and(|status| status.times.stopping.is_some());
     match status.map(SubmissionStatus::state_of_conditions) {
@@ -305,7 +304,6 @@ fn new_submission(leaderboard: &str, incoming: &Incoming) -> Submission {
             priority: 0,
             attempt: Attempt::FIRST,
             cancel: false,
-            requeue: None,
         },
         status: None,
     }

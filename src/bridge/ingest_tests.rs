@@ -151,6 +151,18 @@ fn a_resume_bumps_what_has_failed_or_was_cancelled() {
     check("running", &in_state(State::Running), &resume, &REPEAT);
     check("resumed", &in_state(State::Resumed), &resume, &REPEAT);
     check("not read by the controller", &made_by(&first), &resume, &REPEAT);
+    let by_person = |state| {
+        let mut made = in_state(state);
+        made.spec.attempt = Attempt(2);
+        made
+    };
+    check("a person restarts it", &by_person(State::Running), &resume, &REPEAT);
+    check(
+        "the run had finished by then",
+        &by_person(State::Finished),
+        &resume,
+        &refuse(3, "10"),
+    );
     let fresh = bumped(in_state(State::Failed), &resume);
     check(
         "the resume again, before the controller read it",

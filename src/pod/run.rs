@@ -114,7 +114,7 @@ pub enum Stop {
     Retries,
     /// `deadlines.runSeconds` is over.
     RunDeadline,
-    /// Its node is about to be taken away.
+    /// Its node is about to be taken away, or a higher attempt is asked for.
     Interruption,
 }
 

@@ -6,7 +6,7 @@ mod checks;
 mod daily;
 mod dashboard;
 mod logs;
-mod requeue;
+mod resume;
 mod rights;
 mod terminal;
 
@@ -176,7 +176,7 @@ async fn resume_of_anything_else_is_refused_with_the_next_step() {
         &words,
         &[
             "runs is Running; only Failed and Cancelled submissions can be resumed.",
-            "kubectl leaderboard cancel runs",
+            "kubectl leaderboard resume runs",
         ],
     );
     let words = terminal.run(&["resume", "done"]).await.refused();

@@ -29,7 +29,6 @@ mod pair_status;
 mod progress;
 pub mod ranges;
 pub mod reasons;
-mod requeue;
 mod retention;
 mod route_slice;
 mod route_subset;
@@ -61,7 +60,6 @@ pub use leaderboard::{
 pub use leaderboard_parts::*;
 pub use pair_status::{EndReason, LastEnd, PairState, PairStatus};
 pub use progress::{Progress, Score};
-pub use requeue::{Requeue, Requeued};
 pub use retention::Retention;
 pub use route_slice::{NotASlice, RouteSlice};
 pub use run_id::{NotARunId, RunId};

@@ -68,6 +68,13 @@ impl SubmissionStatus {
         self.job_name.is_some() || self.retry > 0
     }
 
+    /// Whether the present attempt has taken the place of one that ran. No other system has had an end in between, so each end that EvalAI
+    /// shows is new.
+    pub fn is_restart(&self) -> bool {
+        let live = self.condition(FINISHED).filter(|finished| finished.status != "True");
+        live.is_some_and(|finished| finished.reason == reasons::REPLACING)
+    }
+
     /// Whether its run continues from stored results.
     pub fn is_resumed(&self) -> bool {
         self.plan.as_ref().is_some_and(|plan| plan.resume) || self.attempt > Some(Attempt::FIRST)

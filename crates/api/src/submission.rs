@@ -7,7 +7,6 @@ use schemars::JsonSchema;
 use serde::{Deserialize, Serialize};
 
 use super::attempt::Attempt;
-use super::requeue::Requeue;
 use super::submission_status::SubmissionStatus;
 use super::team::Team;
 
@@ -31,7 +30,6 @@ use super::team::Team;
     validation = Rule::new("!has(self.spec.check) || !self.spec.check || self.metadata.name.startsWith('check-')").message("the name of a check begins with check-: its results then have a prefix that is no submission's"),
     validation = Rule::new("!self.metadata.name.contains('.')").message("metadata.name may not contain a dot: it becomes the name of a Job and a label"),
     validation = Rule::new("!has(oldSelf.status) || !has(oldSelf.status.conditions) || !oldSelf.status.conditions.exists(c, c.type == 'Finished' && c.status == 'True' && c.reason == 'Finished') || self.spec.attempt == oldSelf.spec.attempt").message("a finished submission is not resumed; submit it again"),
-    validation = Rule::new("!has(oldSelf.status) || !has(oldSelf.status.conditions) || !oldSelf.status.conditions.exists(c, c.type == 'Finished' && c.status == 'True' && c.reason == 'Finished') || (has(self.spec.requeue) ? self.spec.requeue.number : 0) == (has(oldSelf.spec.requeue) ? oldSelf.spec.requeue.number : 0)").message("a finished submission is not requeued; submit it again, or re-run it in EvalAI"),
     printcolumn = r#"{"name":"Leaderboard","type":"string","jsonPath":".spec.leaderboardName"}"#,
     printcolumn = r#"{"name":"Track","type":"string","jsonPath":".status.track"}"#,
     printcolumn = r#"{"name":"State","type":"string","jsonPath":".status.state"}"#,
@@ -60,7 +58,6 @@ use super::team::Team;
     validation = Rule::new("has(self.evalai) || has(self.image)").message("a Submission without evalai needs an image"),
     validation = Rule::new("self.attempt >= oldSelf.attempt").message("attempt may only grow"),
     validation = Rule::new("self.attempt == oldSelf.attempt || !self.cancel").message("to resume, set cancel to false together with the higher attempt"),
-    validation = Rule::new("!has(oldSelf.requeue) || (has(self.requeue) && self.requeue.number >= oldSelf.requeue.number)").message("requeue.number may only grow"),
     validation = Rule::new("!oldSelf.cancel || self.cancel || self.attempt > oldSelf.attempt").message("a cancel is undone only by a higher attempt: set cancel to false and raise attempt in one patch")
 )]
 pub struct SubmissionSpec {
@@ -89,16 +86,13 @@ pub struct SubmissionSpec {
     #[serde(default)]
     #[schemars(range(min = -1000, max = 1000))]
     pub priority: i32,
-    /// Grows to resume from what is stored; manifests in git leave it out.
+    /// Grows to run it again from what is stored; a live run stores its results and stops first. Manifests in git leave it out.
     #[serde(default)]
     #[schemars(range(min = 1, max = 9999))]
     pub attempt: Attempt,
     /// Stops the present attempt and keeps its results; manifests in git leave it out.
     #[serde(default)]
     pub cancel: bool,
-    /// A host's request to put it back in line at nobody's cost; manifests in git leave it out.
-    #[serde(default, skip_serializing_if = "Option::is_none")]
-    pub requeue: Option<Requeue>,
 }
 
 impl Submission {

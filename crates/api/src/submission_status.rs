@@ -13,7 +13,6 @@ use super::failed_node::{FailedNode, MAX_FAILED_NODES};
 use super::leaderboard_parts::{LeaderboardVersion, Storage};
 use super::pair_status::PairStatus;
 use super::progress::{Progress, Score};
-use super::requeue::Requeued;
 use super::route_slice::RouteSlice;
 use super::run_id::RunId;
 use super::shared_text::SharedText;
@@ -74,9 +73,6 @@ pub struct SubmissionStatus {
     /// Those of them whose node was taken away, which use up no retry.
     #[serde(default, skip_serializing_if = "Option::is_none")]
     pub interruptions: Option<Box<Interruptions>>,
-    /// The last request of `spec.requeue` that was carried out.
-    #[serde(default, skip_serializing_if = "Option::is_none")]
-    pub requeued: Option<Box<Requeued>>,
     /// Times the Job of this attempt had to be created again after somebody deleted it.
     #[serde(default, skip_serializing_if = "is_zero")]
     pub recreated: i32,

@@ -1,4 +1,4 @@
-//! Whether a submission can be cancelled, resumed or requeued, the patch that does it, and what happens then.
+//! Whether a submission can be cancelled, resumed or restarted, the patch that does it, and what happens then.
 //!
 //! Called by `commands`. Pure; the API server's own rules decide in the end.
 
@@ -6,19 +6,19 @@ use kube::ResourceExt;
 use serde_json::{Value, json};
 
 use super::board::{self, Observed};
-use super::facts::{command, has_ended, is_attempt_requested, is_requeue_requested, shown, state};
+use super::facts::{command, has_ended, is_attempt_requested, is_run, shown, state};
 use super::text::{Frame, when};
 use leaderboard_api::{Attempt, Deadlines, State, Submission, reasons};
 
 /// What a person asks for.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
-pub enum Request<'a> {
+pub enum Request {
     Cancel,
     Resume,
     /// The same for many: in few words.
-    Rerun,
-    /// With the reason, for people.
-    Requeue(Option<&'a str>),
+    ResumeMany,
+    /// A higher attempt of a live run.
+    Restart,
 }
 
 /// How a request is carried out.
@@ -34,7 +34,7 @@ pub struct Change {
 
 /// How to carry out a request, or why that is impossible, with the next step.
 pub fn plan(
-    request: Request<'_>,
+    request: Request,
     submission: &Submission,
     leaderboard: Observed<'_>,
     frame: Frame,
@@ -42,8 +42,8 @@ pub fn plan(
     match request {
         Request::Cancel => cancel(submission, leaderboard, frame),
         Request::Resume => resume(submission, leaderboard, frame),
-        Request::Rerun => rerun(submission, frame),
-        Request::Requeue(why) => requeue(submission, why, frame),
+        Request::ResumeMany => resume_many(submission, frame),
+        Request::Restart => restart(submission, frame),
     }
 }
 
@@ -88,7 +88,7 @@ fn cancel(submission: &Submission, leaderboard: Observed<'_>, frame: Frame) -> R
 
 /// What the operator does about a stop at this stage; docs/states.md has the details.
 fn how_it_stops(submission: &Submission, leaderboard: Observed<'_>) -> String {
-    let status = submission.status.as_ref().filter(|_| !is_attempt_requested(submission));
+    let status = submission.status.as_ref().filter(|status| !status.has_ended());
     if status.is_none_or(|s| s.job_name.is_none()) {
         return "It has no Job, so it ends at once.".to_owned();
     }
@@ -112,42 +112,30 @@ fn how_it_stops(submission: &Submission, leaderboard: Observed<'_>) -> String {
 }
 
 /// In few words, since there may be many.
-fn requeue(submission: &Submission, why: Option<&str>, frame: Frame) -> Result<Change, String> {
-    let name = submission.name_any();
-    if is_requeue_requested(submission) {
-        return Err(format!(
-            "{name} is already requeued and has not stopped yet. See `{}`",
-            command("why", submission)
-        ));
-    }
-    let number = submission.spec.requeue.as_ref().map_or(0, |requeue| requeue.number);
-    let mut spec = json!({"requeue": {"number": number.saturating_add(1), "reason": why}});
-    let mut attempt = submission.spec.attempt;
-    let line = if submission.status.as_ref().is_some_and(|s| s.job_name.is_some()) && !has_ended(submission) {
-        format!("Requeued {name}: its run stops and continues in attempt {attempt}, when its turn comes.")
-    } else {
-        if let Some(why_not) = not_resumable(submission) {
-            return Err(why_not);
-        }
-        attempt = attempt.next();
-        spec["attempt"] = json!(attempt);
-        spec["cancel"] = json!(false);
-        format!("Requeued {name}: attempt {attempt} begins when its turn comes.")
-    };
-    let mut page = frame.page();
-    page.paragraph(&line);
-    Ok(Change {
-        // It may end at the same time: then the patch conflicts.
-        patch: Some(json!({"metadata": {"resourceVersion": submission.resource_version()}, "spec": spec})),
-        lines: page.into_lines(),
-        attempt,
-    })
-}
-
-fn rerun(submission: &Submission, frame: Frame) -> Result<Change, String> {
+fn resume_many(submission: &Submission, frame: Frame) -> Result<Change, String> {
     let mut page = frame.page();
     let attempt = next_attempt(submission)?;
     page.paragraph(&format!("Requested attempt {attempt} of {}.", submission.name_any()));
+    Ok(resumption(submission, attempt, page.into_lines()))
+}
+
+fn restart(submission: &Submission, frame: Frame) -> Result<Change, String> {
+    let name = submission.name_any();
+    if let Some(why_not) = is_settled(submission) {
+        return Err(why_not);
+    }
+    if !is_run(submission) {
+        return Err(format!(
+            "{name} is {} and has no run to restart. See `{}`",
+            shown(submission),
+            command("why", submission)
+        ));
+    }
+    let attempt = submission.spec.attempt.next();
+    let mut page = frame.page();
+    page.paragraph(&format!(
+        "Requested attempt {attempt} of {name}: its run stores its results, stops, and goes on when its turn comes."
+    ));
     Ok(resumption(submission, attempt, page.into_lines()))
 }
 
@@ -197,9 +185,9 @@ fn resumption(submission: &Submission, attempt: Attempt, lines: Vec<String>) -> 
     }
 }
 
-fn not_resumable(submission: &Submission) -> Option<String> {
+/// Why no attempt can be requested of it, whatever has become of the present one.
+fn is_settled(submission: &Submission) -> Option<String> {
     let name = submission.name_any();
-    let see = command("why", submission);
     if submission.metadata.deletion_timestamp.is_some() {
         return Some(format!(
             "{name} is being deleted. Wait until it is gone, and apply it again with a higher attempt to continue from its \
@@ -209,9 +197,19 @@ fn not_resumable(submission: &Submission) -> Option<String> {
     if is_attempt_requested(submission) {
         let wanted = submission.spec.attempt;
         return Some(format!(
-            "attempt {wanted} of {name} is already requested and has not started yet. See `{see}`"
+            "attempt {wanted} of {name} is already requested and has not started yet. See `{}`",
+            command("why", submission)
         ));
     }
+    None
+}
+
+fn not_resumable(submission: &Submission) -> Option<String> {
+    if let Some(why_not) = is_settled(submission) {
+        return Some(why_not);
+    }
+    let name = submission.name_any();
+    let see = command("why", submission);
     let found = submission.status.as_ref().and_then(state);
     match found.filter(|_| has_ended(submission)) {
         Some(State::Failed | State::Cancelled) => None,
@@ -220,19 +218,22 @@ fn not_resumable(submission: &Submission) -> Option<String> {
         )),
         _ => {
             let shown = shown(submission);
-            let cancel = command("cancel", submission);
+            let or = if is_run(submission) {
+                format!("restart its run (`{} --restart`)", command("resume", submission))
+            } else {
+                format!("cancel it first (`{}`)", command("cancel", submission))
+            };
             Some(format!(
-                "{name} is {shown}; only Failed and Cancelled submissions can be resumed. Wait for its end (`{see}`), or \
-                 cancel it first (`{cancel}`)"
+                "{name} is {shown}; only Failed and Cancelled submissions can be resumed. Wait for its end (`{see}`), or {or}"
             ))
         }
     }
 }
 
 /// What to do when the API server refuses a patch.
-pub fn after_refusal(request: Request<'_>, submission: &Submission) -> String {
+pub fn after_refusal(request: Request, submission: &Submission) -> String {
     match (request, submission.spec.evalai) {
-        (Request::Resume | Request::Rerun | Request::Requeue(_), Some(evalai)) => format!(
+        (Request::Resume | Request::ResumeMany, Some(evalai)) => format!(
             "Resume submission {} in EvalAI (challenge {}): its message raises the attempt here",
             evalai.submission, evalai.challenge
         ),
@@ -240,6 +241,6 @@ pub fn after_refusal(request: Request<'_>, submission: &Submission) -> String {
             "Cancel submission {} in EvalAI (challenge {}): the operator notices it within seconds",
             evalai.submission, evalai.challenge
         ),
-        (_, None) => format!("Fix what it names; see `{}`", command("why", submission)),
+        (Request::Restart, _) | (_, None) => format!("Fix what it names; see `{}`", command("why", submission)),
     }
 }

@@ -13,67 +13,57 @@ use crate::commands::{frame, note_interruption, nothing};
 use crate::error::{self, Error};
 use crate::output::{self, note, print};
 use crate::transitions::Waiting;
-use crate::{Change, requeue, rerun, submit};
+use crate::{Cancel, resume, submit};
 use leaderboard_api::{Attempt, State, Submission};
 
 /// How often a change is tried again after a conflict with somebody else's.
 const TRIES: usize = 4;
 
-/// `rerun`.
-pub async fn rerun(cluster: &Cluster, wanted: &rerun::Rerun) -> Result<ExitCode, Error> {
+/// `resume`.
+pub async fn resume(cluster: &Cluster, wanted: &resume::Resume) -> Result<ExitCode, Error> {
+    if !wanted.names.is_empty() {
+        return resume_named(cluster, wanted).await;
+    }
     let scope = of_labels(wanted.selector.as_ref());
     let submissions = cluster.submissions(&scope).await?;
     if submissions.is_empty() {
         print(&nothing(cluster, &scope).await);
         return Ok(ExitCode::SUCCESS);
     }
-    let (frame, reason) = (frame(), wanted.reason.as_deref());
-    let chosen = rerun::chosen(&submissions, reason);
+    let (frame, verb) = (frame(), wanted.verb());
+    let chosen = wanted.chosen(&submissions);
     if chosen.is_empty() {
-        print(&rerun::none(submissions.len(), reason, &cluster.namespace, frame));
+        print(&wanted.none(submissions.len(), &cluster.namespace, frame));
         return Ok(ExitCode::SUCCESS);
     }
     if wanted.dry_run {
-        print(&requeue::dry_run("resume", &chosen, frame));
+        print(&resume::dry_run(verb, &chosen, frame));
         return Ok(ExitCode::SUCCESS);
     }
-    send_all(cluster, Request::Rerun, &chosen).await
-}
-
-/// `requeue`.
-pub async fn requeue(cluster: &Cluster, wanted: &requeue::Requeue) -> Result<ExitCode, Error> {
-    let scope = of_labels(wanted.selector.as_ref());
-    let submissions = if wanted.names.is_empty() {
-        cluster.submissions(&scope).await?
-    } else {
-        let mut named = Vec::new();
-        for name in &wanted.names {
-            named.push(cluster.submission(name).await?);
-        }
-        named
-    };
-    if submissions.is_empty() {
-        print(&nothing(cluster, &scope).await);
-        return Ok(ExitCode::SUCCESS);
-    }
-    let frame = frame();
-    let chosen = wanted.chosen(&submissions, frame.now);
-    if chosen.is_empty() {
-        print(&requeue::none(submissions.len(), &cluster.namespace, frame));
-        return Ok(ExitCode::SUCCESS);
-    }
-    if wanted.dry_run {
-        print(&requeue::dry_run("requeue", &chosen, frame));
-        return Ok(ExitCode::SUCCESS);
-    }
-    print(&requeue::lines(&chosen, frame));
+    print(&resume::lines(&chosen, frame));
     print(&[String::new()]);
-    let question = format!("Requeue {}?", requeue::counted(chosen.len()));
-    if !wanted.yes && !output::is_confirmed(&question) {
+    if !wanted.yes && !output::is_confirmed(&resume::question(verb, chosen.len())) {
         print(&["Nothing was changed.".to_owned()]);
         return Ok(ExitCode::SUCCESS);
     }
-    send_all(cluster, Request::Requeue(wanted.why.as_deref()), &chosen).await
+    send_all(cluster, wanted.request(), &chosen).await
+}
+
+async fn resume_named(cluster: &Cluster, wanted: &resume::Resume) -> Result<ExitCode, Error> {
+    let sent = send_each(cluster, wanted.request(), &wanted.names).await?;
+    let mut is_fulfilled = sent.len() == wanted.names.len();
+    for (name, attempt) in sent.into_iter().filter(|_| wanted.wait) {
+        is_fulfilled &= wait(cluster, name, attempt).await? == State::Finished;
+    }
+    Ok(code(is_fulfilled))
+}
+
+fn code(is_fulfilled: bool) -> ExitCode {
+    if is_fulfilled {
+        ExitCode::SUCCESS
+    } else {
+        ExitCode::FAILURE
+    }
 }
 
 fn of_labels(selector: Option<&String>) -> Scope {
@@ -83,41 +73,41 @@ fn of_labels(selector: Option<&String>) -> Scope {
     }
 }
 
-/// Sends a request for each; one that is refused does not hold up the others, but without the right to it, or a way to the API server, no
-/// further one is tried.
-async fn send_all(cluster: &Cluster, request: Request<'_>, chosen: &[&Submission]) -> Result<ExitCode, Error> {
-    let mut requested = 0;
-    for one in chosen {
-        match send(cluster, request, &one.name_any()).await {
-            Ok(_) => requested += 1,
+/// Sends a request for each, and says how many were taken.
+async fn send_all(cluster: &Cluster, request: Request, chosen: &[&Submission]) -> Result<ExitCode, Error> {
+    let names: Vec<String> = chosen.iter().map(|one| one.name_any()).collect();
+    let requested = send_each(cluster, request, &names).await?.len();
+    print(&resume::summary(requested, names.len(), &cluster.namespace, frame()));
+    Ok(code(requested == names.len()))
+}
+
+/// Sends a request for each; returns those that were taken, with their attempts. One that is refused does not hold up the others, but
+/// without the right to it, or a way to the API server, no further one is tried.
+async fn send_each<'a>(
+    cluster: &Cluster,
+    request: Request,
+    names: &'a [String],
+) -> Result<Vec<(&'a str, Attempt)>, Error> {
+    let mut sent = Vec::new();
+    for name in names {
+        match send(cluster, request, name).await {
+            Ok(attempt) => sent.push((name.as_str(), attempt)),
             Err(error @ (Error::Forbidden(_) | Error::Credentials(_) | Error::Unreachable { .. })) => {
                 return Err(error);
             }
             Err(error) => note(&error.to_string()),
         }
     }
-    print(&requeue::summary(requested, chosen.len(), &cluster.namespace, frame()));
-    Ok(if requested < chosen.len() {
-        ExitCode::FAILURE
-    } else {
-        ExitCode::SUCCESS
-    })
+    Ok(sent)
 }
 
-/// `cancel` and `resume`.
-pub async fn change(cluster: &Cluster, request: Request<'_>, target: &Change) -> Result<ExitCode, Error> {
-    let attempt = send(cluster, request, &target.name).await?;
-    if !target.wait {
-        return Ok(ExitCode::SUCCESS);
+/// `cancel`.
+pub async fn cancel(cluster: &Cluster, target: &Cancel) -> Result<ExitCode, Error> {
+    let attempt = send(cluster, Request::Cancel, &target.name).await?;
+    if target.wait {
+        wait(cluster, &target.name, attempt).await?;
     }
-    let end = wait(cluster, &target.name, attempt).await?;
-    // A cancel succeeds with any end, a resume only with a result.
-    let is_fulfilled = request == Request::Cancel || end == State::Finished;
-    Ok(if is_fulfilled {
-        ExitCode::SUCCESS
-    } else {
-        ExitCode::FAILURE
-    })
+    Ok(ExitCode::SUCCESS)
 }
 
 /// `submit`.
@@ -134,15 +124,11 @@ pub async fn submit(cluster: &Cluster, wanted: &submit::Submit) -> Result<ExitCo
         return Ok(ExitCode::SUCCESS);
     }
     let end = wait(cluster, &name, Attempt::FIRST).await?;
-    Ok(if end == State::Finished {
-        ExitCode::SUCCESS
-    } else {
-        ExitCode::FAILURE
-    })
+    Ok(code(end == State::Finished))
 }
 
 /// Sends a request to the API server; returns the attempt whose end fulfils it.
-async fn send(cluster: &Cluster, request: Request<'_>, name: &str) -> Result<Attempt, Error> {
+async fn send(cluster: &Cluster, request: Request, name: &str) -> Result<Attempt, Error> {
     for _ in 0..TRIES {
         let submission = cluster.submission(name).await?;
         let leaderboard = cluster.leaderboard(&submission.spec.leaderboard_name).await?;
@@ -161,11 +147,11 @@ async fn send(cluster: &Cluster, request: Request<'_>, name: &str) -> Result<Att
 }
 
 /// The next step after a refusal by the API server's rules, or for lack of a right where EvalAI is another way.
-fn refusal(request: Request<'_>, submission: &Submission, error: kube::Error) -> Error {
+fn refusal(request: Request, submission: &Submission, error: kube::Error) -> Error {
     let kube::Error::Api(status) = &error else {
         return error.into();
     };
-    let has_other_way = status.is_forbidden() && submission.spec.evalai.is_some();
+    let has_other_way = status.is_forbidden() && request != Request::Restart && submission.spec.evalai.is_some();
     if has_other_way || status.is_invalid() || status.code == 400 {
         return Error::Refused {
             message: error::phrase(&status.message),

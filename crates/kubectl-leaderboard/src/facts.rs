@@ -93,19 +93,16 @@ pub(super) fn has_ended(submission: &Submission) -> bool {
         && !is_attempt_requested(submission)
 }
 
-/// Whether a higher attempt is requested than the operator has started.
-pub(super) fn is_attempt_requested(submission: &Submission) -> bool {
-    let started = submission.status.as_ref().and_then(|s| s.attempt);
-    started.is_some_and(|started| submission.spec.attempt > started)
+/// Whether it has a Job and has not ended.
+pub(super) fn is_run(submission: &Submission) -> bool {
+    let status = submission.status.as_ref();
+    status.is_some_and(|status| status.job_name.is_some() && !status.has_ended())
 }
 
-/// Whether a host has asked to put it back in line, and the operator has not done so.
-pub(super) fn is_requeue_requested(submission: &Submission) -> bool {
-    let wanted = submission.spec.requeue.as_ref().map_or(0, |requeue| requeue.number);
+/// Whether a higher attempt is requested than the operator has started.
+pub(super) fn is_attempt_requested(submission: &Submission) -> bool {
     let status = submission.status.as_ref();
-    let done = status.and_then(|status| status.requeued.as_ref());
-    // One that has ended takes a request up with its next attempt.
-    wanted > done.map_or(0, |done| done.number) && !has_ended(submission)
+    status.is_some_and(|status| status.is_followed_by(submission.spec.attempt))
 }
 
 /// A command of this plugin for a submission, to be copied.

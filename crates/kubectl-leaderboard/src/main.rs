@@ -1,6 +1,6 @@
 //! `kubectl leaderboard`: explains why a submission waits, runs or failed, and cancels or resumes it.
 //!
-//! `why`, `status`, `overview`, `top`, `change`, `requeue` and `transitions` are pure and hold what is printed and decided; `cluster` talks to
+//! `why`, `status`, `overview`, `top`, `change`, `resume` and `transitions` are pure and hold what is printed and decided; `cluster` talks to
 //! the API server; `commands` and `changes` bring both together. It shows what the status holds, and contacts neither EvalAI nor AWS;
 //! where that helps, it starts the person's own `aws` program.
 
@@ -25,8 +25,7 @@ mod near;
 mod output;
 mod overview;
 mod report;
-mod requeue;
-mod rerun;
+mod resume;
 mod status;
 mod submit;
 mod table;
@@ -45,7 +44,6 @@ use std::time::Duration;
 use clap::{Args, ColorChoice, CommandFactory, FromArgMatches, Parser, Subcommand};
 use kube::ResourceExt;
 
-use self::change::Request;
 use self::cluster::{Cluster, Scope, Target};
 use self::complete::Offer;
 use self::error::Error;
@@ -102,22 +100,14 @@ enum Command {
     #[command(
         after_help = "Exit code 0: the cancellation is requested; with --wait, the submission has ended. 1: it had already ended, or an error."
     )]
-    Cancel(Change),
-    /// Run a Failed or Cancelled submission again, from its stored results.
+    Cancel(Cancel),
+    /// Run submissions again, from their stored results.
     #[command(
-        after_help = "Exit code 0: the attempt is requested; with --wait, the submission is Finished. 1: it cannot be resumed, it did not finish, or an error."
+        after_help = "A submission that is named is Failed or Cancelled; with --restart, it runs. With -l or --all, a terminal shows which ones \
+                      fit, and asks.\n\nExit code 0: all are requested, or nobody was asked for; with --wait, all are Finished. 1: one was refused \
+                      or did not finish, or an error."
     )]
-    Resume(Change),
-    /// Resume all submissions that failed because of the infrastructure.
-    #[command(after_help = "Exit code 0: all are requested; 1: one was refused, or an error.")]
-    Rerun(rerun::Rerun),
-    /// Put submissions back in line at nobody's cost: what a broken simulator image has failed, what runs on a node to be upgraded.
-    #[command(
-        after_help = "Without --state, only Failed ones are chosen, charged or not. Completed routes are kept; a run is stopped and continued. \
-                      `rerun` resumes only what is not charged anyway.\n\nExit code 0: all are requested, or nobody was asked for; 1: one was \
-                      refused, or an error."
-    )]
-    Requeue(requeue::Requeue),
+    Resume(resume::Resume),
     /// Write what a person who helps needs into one archive, without secrets, routes and names of teams.
     Report(report::Report),
     /// Print the program with which kubectl completes these commands in a shell.
@@ -156,7 +146,7 @@ struct Watched {
 }
 
 #[derive(Args, Debug)]
-struct Change {
+struct Cancel {
     /// Name of the submission.
     name: String,
     /// Wait for the end, and print each state until then.
@@ -240,11 +230,9 @@ async fn carry_out_there(command: Command, cluster: &Cluster) -> Result<ExitCode
             .map(|()| ExitCode::SUCCESS),
         Command::Logs(wanted) => Box::pin(logs::logs(cluster, &wanted)).await,
         Command::Report(wanted) => report::report(cluster, &wanted).await.map(|()| ExitCode::SUCCESS),
-        Command::Requeue(wanted) => Box::pin(changes::requeue(cluster, &wanted)).await,
-        Command::Rerun(wanted) => changes::rerun(cluster, &wanted).await,
         Command::Check(wanted) => Box::pin(checking::check(cluster, &wanted)).await,
-        Command::Cancel(target) => changes::change(cluster, Request::Cancel, &target).await,
-        Command::Resume(target) => changes::change(cluster, Request::Resume, &target).await,
+        Command::Cancel(target) => changes::cancel(cluster, &target).await,
+        Command::Resume(wanted) => changes::resume(cluster, &wanted).await,
     }
 }
 

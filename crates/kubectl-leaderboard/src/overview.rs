@@ -186,7 +186,7 @@ fn row(place: Place<'_>, submission: &Submission, now: Timestamp) -> Option<Row>
 fn own_reason(submission: &Submission, status: &SubmissionStatus) -> Option<String> {
     let reason = status.reason.as_deref().unwrap_or_default();
     let message = status.message.as_deref().unwrap_or_default();
-    if facts::is_attempt_requested(submission) {
+    if status.has_ended() && facts::is_attempt_requested(submission) {
         let wanted = submission.spec.attempt;
         return Some(format!(
             "Attempt {wanted} is requested; the operator has not processed it yet."

@@ -9,7 +9,7 @@
 
 use std::process::{Command, Output};
 
-const COMMANDS: [&str; 13] = [
+const COMMANDS: [&str; 11] = [
     "why",
     "status",
     "top",
@@ -18,8 +18,6 @@ const COMMANDS: [&str; 13] = [
     "check",
     "cancel",
     "resume",
-    "rerun",
-    "requeue",
     "report",
     "completion",
     "man",
@@ -68,8 +66,8 @@ fn every_command_has_a_manual_page_with_its_flags() {
             "{command}: {text}"
         );
     }
-    assert!(page("kubectl-leaderboard-requeue").contains("\\-\\-simulator"));
-    assert!(page("kubectl-leaderboard").contains("requeue"));
+    assert!(page("kubectl-leaderboard-resume").contains("\\-\\-restart"));
+    assert!(page("kubectl-leaderboard").contains("resume"));
     let hidden = man.join("kubectl-leaderboard-complete.1");
     assert!(!hidden.exists(), "what only shells call has no page");
     std::fs::remove_dir_all(folder).unwrap();

@@ -193,7 +193,7 @@ fn a_wrong_name_or_namespace_is_answered_with_the_right_one() {
             &["status", "-n", "default"],
             &["why", "-n", "default"],
             &["top", "-n", "default"],
-            &["rerun", "--all", "-n", "default"],
+            &["resume", "--all", "-n", "default"],
             &["status", "-l", "leaderboard.carla.org/phase=8", "-n", "default"],
             &["why", "submission-42", "-n", "default"],
             &["cancel", "submision-42"],
@@ -234,7 +234,7 @@ fn without_rights_each_command_names_what_is_missing() {
             &["status", "submission-42"],
             &["top"],
             &["cancel", "submission-42"],
-            &["requeue", "--all"],
+            &["resume", "--all"],
             &["logs", "submission-42"],
             &["check"],
             &[
@@ -257,7 +257,12 @@ fn without_a_cluster_its_address_is_named() {
     assert_printed(
         "cluster",
         &stub,
-        &[&["why"], &["cancel", "submission-42"], &["report"], &["rerun", "--all"]],
+        &[
+            &["why"],
+            &["cancel", "submission-42"],
+            &["report"],
+            &["resume", "--all"],
+        ],
     );
     assert!(
         !Path::new("leaderboard-report-carla.zip").exists(),
@@ -285,9 +290,9 @@ fn a_command_that_changes_something_prints_what_and_how_to_go_on() {
             &["cancel", "submission-45"],
             &["resume", "submission-41"],
             &["resume", "submission-43"],
-            &["rerun", "--all"],
-            &["rerun", "--all", "--reason", "ImagePull"],
-            &["requeue", "submission-45"],
+            &["resume", "submission-43", "submission-44"],
+            &["resume", "--all", "--reason", "ImagePull"],
+            &["resume", "submission-43", "--restart"],
         ],
     );
 }
@@ -343,7 +348,7 @@ fn on_a_terminal(stub: &Stub, arguments: &str) -> String {
 #[test]
 fn a_terminal_has_colours_unless_they_are_turned_off() {
     let stub = Stub::start(cluster);
-    for arguments in ["status", "why submission-42", "logs submission-43", "requeue --help"] {
+    for arguments in ["status", "why submission-42", "logs submission-43", "resume --help"] {
         let coloured = on_a_terminal(&stub, arguments);
         assert!(coloured.contains('\u{1b}'), "{arguments}: {coloured}");
         for flag in ["--no-color", "--color never", "--color=never"] {
@@ -359,7 +364,7 @@ fn a_terminal_has_colours_unless_they_are_turned_off() {
 #[test]
 fn errors_and_help_are_broken_between_words_on_a_narrow_terminal() {
     let stub = Stub::start(forbidden);
-    for arguments in ["why", "requeue --help"] {
+    for arguments in ["why", "resume --help"] {
         let text = on_a_terminal(&stub, &format!("{arguments} --no-color"));
         assert!(text.lines().count() > 2, "{text}");
         for line in text.lines() {

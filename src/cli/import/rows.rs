@@ -178,7 +178,6 @@ fn submission(row: &StoredRow, place: &Destination<'_>, attempt: Attempt) -> Res
             priority: 0,
             attempt,
             cancel: false,
-            requeue: None,
         },
         status: None,
     })

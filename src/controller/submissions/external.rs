@@ -198,11 +198,12 @@ impl ExternalSystems {
 fn run_of(submission: &Submission) -> Run {
     let attempt = submission.present_attempt();
     let status = submission.status.as_ref();
+    let is_restart = status.is_some_and(SubmissionStatus::is_restart);
     Run {
         attempt,
         job: names::job(&submission.name_any(), JobNumber::first(attempt)),
-        by_hand: !Ingested::of(submission).is_some_and(|record| record.has_begun(attempt)),
-        has_job: status.is_some_and(SubmissionStatus::has_run),
+        by_hand: !is_restart && !Ingested::of(submission).is_some_and(|record| record.has_begun(attempt)),
+        has_job: is_restart || status.is_some_and(SubmissionStatus::has_run),
         ended: status.and_then(|s| s.times.finished.as_ref()).map(|time| time.0),
         log: log_span_of(submission),
     }

@@ -18,7 +18,7 @@ use crate::controller::submissions::view::{
     ObservedTexts, ObservedTraces, Turn,
 };
 use leaderboard_api::conditions::{self, Truth};
-use leaderboard_api::{Attempt, State};
+use leaderboard_api::{Attempt, State, reasons};
 
 /// Longer than a write takes on a busy machine.
 const LIMIT: std::time::Duration = std::time::Duration::from_mins(1);
@@ -214,6 +214,21 @@ fn an_attempt_that_evalai_has_asked_for_differs_from_one_that_a_person_has_begun
         of(2, Some(json!({"message": "m", "sent": 1}))),
         "an older operator noted no attempt"
     );
+}
+
+#[test]
+fn an_attempt_that_goes_on_from_a_live_one_is_nobodys_new_wish() {
+    let (mut submission, _) = with_job("sub", &leaderboard("one", "http://s3"));
+    submission.spec.attempt = Attempt(2);
+    let restart = |reason: &str| {
+        json!({"attempt": 2, "conditions": [{"type": "Finished", "status": "False", "reason": reason, "message": "",
+                                              "lastTransitionTime": "2026-01-01T00:00:00Z"}]})
+    };
+    for (reason, is_restart) in [(reasons::REPLACING, true), (reasons::PREPARING, false)] {
+        submission.status = serde_json::from_value(restart(reason)).unwrap();
+        let run = run_of(&submission);
+        assert_eq!((run.by_hand, run.has_job), (!is_restart, is_restart), "{reason}");
+    }
 }
 
 #[test]

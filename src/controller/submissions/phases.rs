@@ -83,15 +83,22 @@ pub fn ended(view: &View, new: &SubmissionStatus) -> Vec<Ended> {
         let created = created(view);
         found.add(Phase::Intake, Some(sent(view).unwrap_or(created)), created);
     }
+    let is_same = |before: &&SubmissionStatus| before.attempt == Some(attempt);
     let step = Step {
         view,
-        old: before.filter(|before| before.attempt == Some(attempt)),
+        old: restarted(view, new).or(before.filter(is_same)),
         new,
     };
     step.to_job(&mut found);
     step.of_job(&mut found);
     step.to_end(&mut found);
     found.0
+}
+
+/// The status of the attempt that a restart ends with `new`: all that ends then is of that attempt.
+pub fn restarted<'a>(view: &'a View, new: &SubmissionStatus) -> Option<&'a SubmissionStatus> {
+    let old = view.submission.status.as_ref().filter(|old| !old.has_ended())?;
+    (old.has_run() && new.is_restart() && old.attempt < new.attempt).then_some(old)
 }
 
 struct Found(Vec<Ended>);
@@ -159,6 +166,8 @@ impl Step<'_> {
         let finished = self.new.end();
         if let Some(end) = finished.filter(|_| !self.old.is_some_and(SubmissionStatus::has_ended)) {
             found.add(Phase::Attempt, self.begun(), end.last_transition_time.0);
+        } else if restarted(self.view, self.new).is_some() {
+            found.add(Phase::Attempt, self.begun(), self.view.now);
         }
         let over = self.new.times.finished.as_ref().map(|time| time.0);
         for (type_, phase) in [
@@ -180,7 +189,7 @@ impl Step<'_> {
 
     /// When the attempt began: the first one with the object, any other with its status.
     fn begun(&self) -> Option<Timestamp> {
-        if self.new.attempt == Some(Attempt::FIRST) {
+        if self.old.unwrap_or(self.new).attempt == Some(Attempt::FIRST) {
             return Some(created(self.view));
         }
         let mut known = self.old.into_iter().chain([self.new]);
@@ -207,7 +216,8 @@ impl Step<'_> {
         let Some(old) = self.old else {
             return self.new.has_ended();
         };
-        let is_replaced = self.new.retry > old.retry || self.new.recreated > old.recreated;
+        let is_replaced =
+            self.new.attempt > old.attempt || self.new.retry > old.retry || self.new.recreated > old.recreated;
         is_replaced || (self.new.has_ended() && !old.has_ended())
     }
 }

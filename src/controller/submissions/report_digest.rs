@@ -85,8 +85,8 @@ impl ReportDigest {
         self.is_final && self.done == self.total && self.total > 0
     }
 
-    /// Whether it shows how a run came to its own end, whatever becomes of its Job. Of one that was stopped for its node, or by a host,
-    /// only results that count do: it goes on in another Job, which stores no report of its own before its first round.
+    /// Whether it shows how a run came to its own end, whatever becomes of its Job. Of one that was stopped by a person or for its node
+    /// only results that count do: another Job may go on, which stores no report of its own before its first round.
     pub fn is_verdict(&self) -> bool {
         let goes_on = matches!(self.stopped, Some(Stop::Interruption | Stop::Cancel));
         let is_decided = self.is_complete() || (self.is_final && self.why.is_some());

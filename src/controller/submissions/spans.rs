@@ -5,7 +5,7 @@
 
 use sha2::{Digest, Sha256};
 
-use super::phases::{Ended, Phase};
+use super::phases::{Ended, Phase, restarted};
 use super::view::View;
 use crate::controller::objects::uid_of;
 use crate::observability::trace_id::TraceId;
@@ -15,6 +15,7 @@ use leaderboard_api::{Submission, SubmissionStatus, names, reasons};
 /// The spans of what has ended with `new`.
 pub fn of(view: &View, new: &SubmissionStatus, ended: &[Ended]) -> Vec<Span> {
     let submission = &view.submission;
+    let new = restarted(view, new).unwrap_or(new);
     let uid = uid_of(submission.as_ref());
     let root = id(&uid, Phase::Intake, 0);
     let attempt = new.attempt.unwrap_or_default();

@@ -1,13 +1,11 @@
-//! `status`, `top`, `submit`, `rerun`, `report` and completion against a real API server.
+//! `status`, `top`, `submit`, `report` and completion against a real API server.
 
 use kube::ResourceExt;
 use kube::api::ListParams;
 use serde_json::{Value, json};
 use tokio::process::Command;
 
-use super::terminal::{
-    Printed, Terminal, assert_has, condition, end, ended, failed, finished, plugin, running, waiting,
-};
+use super::terminal::{Printed, Terminal, assert_has, condition, end, ended, finished, plugin, running, waiting};
 use crate::api::objects::Kind;
 
 #[tokio::test]
@@ -51,17 +49,11 @@ async fn status_and_top_show_all_of_a_namespace_and_one_on_a_screen() {
 async fn a_wrong_namespace_is_answered_with_the_right_one() {
     let (empty, full) = (Terminal::new().await, Terminal::new().await);
     full.submission("submission-4711", &json!({}), &waiting()).await;
-    for command in [
-        &["status"][..],
-        &["why"],
-        &["top"],
-        &["rerun", "--all"],
-        &["requeue", "--all"],
-    ] {
+    for command in [&["status"][..], &["why"], &["top"], &["resume", "--all"]] {
         let text = empty.run(command).await.well().replace('\n', " ");
         assert_has(&text, &["has no submissions. There are some in ", &full.namespace]);
     }
-    for command in ["status", "why", "logs", "cancel", "resume", "requeue"] {
+    for command in ["status", "why", "logs", "cancel", "resume"] {
         let text = empty.run(&[command, "submission-4711"]).await.refused();
         assert_has(
             &text,
@@ -129,36 +121,6 @@ async fn status_is_followed_until_the_end() {
 }
 
 #[tokio::test]
-async fn only_what_the_infrastructure_failed_is_resumed() {
-    let terminal = Terminal::new().await;
-    terminal
-        .submission("lost", &json!({}), &failed("Infrastructure", "NodeLost"))
-        .await;
-    terminal
-        .submission("crashed", &json!({}), &failed("Participant", "AgentCrashed"))
-        .await;
-    let text = terminal.run(&["rerun", "--all", "--dry-run"]).await.well();
-    assert_has(&text, &["lost  ", "Would resume 1 submission."]);
-    assert!(!text.contains("crashed"), "{text}");
-    assert_eq!(terminal.requested("lost").await, (1, false));
-    let text = terminal
-        .run(&["rerun", "--all", "--reason", "SimulationCrashed"])
-        .await
-        .well();
-    assert_has(
-        &text,
-        &["None of 2 submissions has failed because of the infrastructure with the reason SimulationCrashed."],
-    );
-    let text = terminal.run(&["rerun", "--all"]).await.well();
-    assert_has(
-        &text,
-        &["Requested attempt 2 of lost.", "Requested for 1 of 1 submission."],
-    );
-    assert_eq!(terminal.requested("lost").await, (2, false));
-    assert_eq!(terminal.requested("crashed").await, (1, false));
-}
-
-#[tokio::test]
 async fn a_report_is_an_archive_without_secrets() {
     let terminal = Terminal::new().await;
     terminal
@@ -210,7 +172,7 @@ async fn a_shell_gets_names_from_the_cluster() {
     let here = &terminal.namespace;
     assert_eq!(complete(&["why", "-n", here, "sub"]).await, "submission-7\n:4\n");
     assert_eq!(complete(&["check", "-n", here, ""]).await, "local\n:4\n");
-    assert_eq!(complete(&["re"]).await, "report\nrequeue\nrerun\nresume\n:4\n");
+    assert_eq!(complete(&["re"]).await, "report\nresume\n:4\n");
 }
 
 /// A screen without any of the optional parts.

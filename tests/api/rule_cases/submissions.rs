@@ -6,10 +6,7 @@ use super::super::objects::Kind::Submission;
 use super::{Case, Step, create, update};
 
 pub(super) fn all() -> Vec<Case> {
-    [immutable(), checks(), attempts(), requeues()]
-        .into_iter()
-        .flatten()
-        .collect()
+    [immutable(), checks(), attempts()].into_iter().flatten().collect()
 }
 
 fn immutable() -> Vec<Case> {
@@ -81,37 +78,6 @@ fn checks() -> Vec<Case> {
             &check,
             &json!({"priority": 5}),
         ),
-    ]
-}
-
-fn requeues() -> Vec<Case> {
-    let number = |number: i64| json!({"requeue": {"number": number}});
-    let mut finished = update(
-        Submission,
-        "a finished submission is not requeued",
-        &number(1),
-        &number(2),
-        &json!({"priority": 5}),
-    );
-    if let Step::Update { end, .. } = &mut finished.step {
-        *end = Some("Finished");
-    }
-    vec![
-        update(
-            Submission,
-            "requeue.number may only grow",
-            &number(2),
-            &number(1),
-            &number(3),
-        ),
-        update(
-            Submission,
-            "requeue.number may only grow",
-            &number(2),
-            &json!({"requeue": null}),
-            &json!({"requeue": {"number": 2, "reason": "A broken simulator image."}}),
-        ),
-        finished,
     ]
 }
 

@@ -106,9 +106,9 @@ reasons! {
             "The agents are running and continue from the stored results.",
             "Nothing.";
         REPLACING = "Replacing",
-            "The Pod or the Job was lost, and a new one continues from the stored results; or the operator retries after an \
-             infrastructure failure.",
-            "Nothing. The message names what was lost.";
+            "The Pod or the Job was lost, or a host has raised `spec.attempt` of a live run, and a new Job continues from the stored \
+             results; or the operator retries after an infrastructure failure.",
+            "Nothing. The message names the cause.";
         STOPPING = "Stopping",
             "The submission is being stopped; completed routes are kept.",
             "Nothing. It ends within about three minutes after `deadlines.cancelSeconds`; later while the bucket cannot be read.";
@@ -236,11 +236,6 @@ reasons! {
              evicted from it or preempted. The results were stored, and a new Job resumes from them; this uses up neither an attempt nor \
              `retries.infrastructure`.",
             "Nothing. If it happens often, give the track nodes that stay.",
-            after_failure: "Resume the submission.";
-        REQUEUED = "Requeued",
-            "A host has put the submission back in line (`spec.requeue`). A Job that ran was stopped, its results were stored, and a new \
-             Job resumes from them; this uses up neither an attempt nor `retries.infrastructure`.",
-            "Nothing.",
             after_failure: "Resume the submission.";
         START_DEADLINE = "StartDeadline",
             "No agent started within `deadlines.startSeconds` after the Pod was scheduled and its images were pulled, or the images were \

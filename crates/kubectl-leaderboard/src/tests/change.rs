@@ -128,7 +128,7 @@ fn nothing_else_is_resumed_and_the_next_step_is_named() {
         (
             submission(&running()),
             "submission-42 is Running; only Failed and Cancelled",
-            "cancel submission-42 -n carla",
+            "resume submission-42 -n carla --restart",
         ),
         (
             submission(&finished()),

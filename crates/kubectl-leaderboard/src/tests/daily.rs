@@ -1,7 +1,6 @@
-//! `status`, `top`, `submit` and `rerun`, as they print.
+//! `status`, `top` and `submit`, as they print.
 
 use clap::Parser;
-use kube::ResourceExt;
 use serde_json::{Value, json};
 
 use super::docs::assert_documented;
@@ -11,8 +10,7 @@ use super::{
 };
 use crate::board::Observed;
 use crate::submit::{Submit, object};
-use crate::{rerun, status, top, why};
-use leaderboard_api::Attempt;
+use crate::{status, top, why};
 
 /// The text, which docs/plugin.md has to show.
 fn shown(lines: &[String]) -> String {
@@ -240,28 +238,4 @@ fn a_submission_is_made_of_the_flags() {
     assert_eq!(full["metadata"]["name"], "mine");
     assert_eq!(full["spec"]["team"], json!({"id": "7", "name": "Team Seven"}));
     assert_eq!(full["spec"]["priority"], -5);
-}
-
-#[test]
-fn only_what_the_infrastructure_failed_is_run_again() {
-    let mut check = named("check-a", &node_lost());
-    check.spec.check = true;
-    let mut again = named("again", &node_lost());
-    again.spec.attempt = Attempt(2);
-    let all = [
-        named("b-lost", &node_lost()),
-        named("a-lost", &node_lost()),
-        named("crashed", &crashed()),
-        named("done", &finished()),
-        named("stopped", &cancelled()),
-        check,
-        again,
-    ];
-    let chosen = |reason| {
-        let found = rerun::chosen(&all, reason).into_iter().map(ResourceExt::name_any);
-        found.collect::<Vec<_>>()
-    };
-    assert_eq!(chosen(None), ["a-lost", "b-lost"]);
-    assert_eq!(chosen(Some("NodeLost")), ["a-lost", "b-lost"]);
-    assert_eq!(chosen(Some("SimulationCrashed")), Vec::<String>::new());
 }

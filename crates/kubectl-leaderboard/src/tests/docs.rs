@@ -10,9 +10,8 @@ use super::{
 use crate::board::Observed;
 use crate::change::{Request, plan};
 use crate::error::Error;
-use crate::requeue;
 use crate::transitions::Waiting;
-use crate::{overview, why};
+use crate::{overview, resume, why};
 use leaderboard_api::{Attempt, Submission};
 
 const DOCS: &str = include_str!("../../../../docs/plugin.md");
@@ -94,11 +93,11 @@ fn the_states_on_the_way_are_documented_as_they_are_printed() {
 }
 
 #[test]
-fn requeue_is_documented_as_it_is_printed() {
+fn resume_of_many_is_documented_as_it_is_printed() {
     let simulator = "registry.example/carla/simulator:0.9.15-3";
     let of = |status, id, team| ran_with(of_team(status, id, team), simulator);
     let crashed = named("submission-42", &of(crashed(), "7", "Team Seven"));
     let lost = named("submission-39", &of(node_lost(), "8", "Team Eight"));
-    assert_documented(&requeue::dry_run("requeue", &[&lost, &crashed], frame()));
-    assert_documented(&planned(Request::Requeue(None), &submission(&running())).unwrap());
+    assert_documented(&resume::dry_run("resume", &[&lost, &crashed], frame()));
+    assert_documented(&planned(Request::Restart, &submission(&running())).unwrap());
 }

@@ -10,7 +10,7 @@ mod help;
 mod messages;
 mod overview;
 mod pages;
-mod requeue;
+mod resume;
 mod shown;
 mod why;
 

@@ -10,9 +10,9 @@ use super::{
 };
 use crate::board::Observed;
 use crate::change::{Request, plan};
-use crate::requeue::{self, Requeue};
+use crate::resume::{self, Resume};
 use crate::transitions::Waiting;
-use crate::{overview, rerun, status, top, why};
+use crate::{overview, status, top, why};
 use leaderboard_api::{Attempt, Submission};
 
 fn some() -> Vec<Submission> {
@@ -78,19 +78,6 @@ fn why_of_one_is_printed_as_its_files_show() {
             why::explain(&submission(&status), Observed::Found(&board), frame)
         });
     }
-    let mut requeued = submission(&with(
-        driving(),
-        &json!({"requeued": {"number": 1, "time": "2026-11-01T11:30:00Z"}}),
-    ));
-    requeued.spec.requeue =
-        serde_json::from_value(json!({"number": 1, "reason": "The simulator image was broken."})).unwrap();
-    assert_shown("why-requeued", |frame| {
-        why::explain(&requeued, Observed::Found(&board), frame)
-    });
-    requeued.spec.requeue.as_mut().unwrap().number = 2;
-    assert_shown("why-requeue-requested", |frame| {
-        why::explain(&requeued, Observed::Found(&board), frame)
-    });
 }
 
 #[test]
@@ -148,9 +135,8 @@ fn changes_are_printed_as_their_files_show() {
         ("cancel-preparing", Request::Cancel, prepared),
         ("resume", Request::Resume, crashed()),
         ("resume-without-results", Request::Resume, unstored),
-        ("rerun", Request::Rerun, node_lost()),
-        ("requeue-run", Request::Requeue(None), running()),
-        ("requeue-failed", Request::Requeue(None), crashed()),
+        ("resume-many", Request::ResumeMany, node_lost()),
+        ("restart", Request::Restart, running()),
     ] {
         assert_shown(name, |frame| {
             plan(request, &submission(&status), Observed::Found(&board), frame)
@@ -190,38 +176,27 @@ fn changes_are_printed_as_their_files_show() {
 #[derive(Parser)]
 struct Line {
     #[command(flatten)]
-    requeue: Requeue,
+    resume: Resume,
 }
 
 #[test]
-fn requeue_is_printed_as_its_files_show() {
+fn what_is_chosen_is_printed_as_its_files_show() {
     let all = some();
-    let wanted = Line::parse_from(["requeue", "--all", "--state", "failed,running"]).requeue;
-    assert_shown("requeue", |frame| {
-        requeue::lines(&wanted.chosen(&all, frame.now), frame)
+    let of = |words: &str| Line::parse_from(words.split(' ')).resume;
+    assert_shown("resume-dry", |frame| {
+        resume::dry_run("resume", &of("resume --all").chosen(&all), frame)
     });
-    assert_shown("requeue-end", |frame| {
+    assert_shown("restart-dry", |frame| {
+        resume::dry_run("restart", &of("resume --all --restart").chosen(&all), frame)
+    });
+    assert_shown("resume-end", |frame| {
         [
-            requeue::summary(38, 38, "carla", frame),
-            requeue::summary(37, 38, "carla", frame),
-            requeue::summary(0, 2, "carla", frame),
-            requeue::none(7, "carla", frame),
-            requeue::none(1, "carla", frame),
-        ]
-        .concat()
-    });
-}
-
-#[test]
-fn rerun_is_printed_as_its_files_show() {
-    let all = some();
-    assert_shown("rerun-dry", |frame| {
-        requeue::dry_run("resume", &rerun::chosen(&all, Some("NodeLost")), frame)
-    });
-    assert_shown("rerun-none", |frame| {
-        [
-            rerun::none(7, None, "carla", frame),
-            rerun::none(7, Some("SimulationCrashed"), "carla", frame),
+            resume::summary(38, 38, "carla", frame),
+            resume::summary(37, 38, "carla", frame),
+            resume::summary(0, 2, "carla", frame),
+            of("resume --all").none(7, "carla", frame),
+            of("resume --all --restart").none(1, "carla", frame),
+            of("resume --all --infrastructure --reason SimulationCrashed,NodeLost").none(7, "carla", frame),
         ]
         .concat()
     });

@@ -279,10 +279,7 @@ fn what_lasts_or_is_requested_is_shown() {
     let mut higher = submission(&crashed());
     higher.spec.attempt = Attempt(2);
     let text = printed(&higher, Observed::Found(&leaderboard()));
-    assert!(
-        text.contains("attempt 2 is requested and starts when the operator processes it"),
-        "{text}"
-    );
+    assert!(text.contains("attempt 2 is requested and follows it"), "{text}");
     assert!(!text.contains("Log:"), "the log is the old attempt's: {text}");
 }
 

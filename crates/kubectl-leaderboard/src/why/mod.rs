@@ -62,7 +62,6 @@ pub fn explain(submission: &Submission, leaderboard: Observed<'_>, frame: Frame)
     explanation.belongs_to();
     explanation.reason();
     explanation.rerun();
-    explanation.requeued();
     explanation.failure();
     explanation.line();
     explanation.attempt();
@@ -125,22 +124,6 @@ impl Explanation<'_> {
         }
     }
 
-    /// That a host has put it back in line, or has asked for it.
-    fn requeued(&mut self) {
-        let wanted = self.submission.spec.requeue.as_ref();
-        let done = self.status.requeued.as_ref();
-        let when = match (wanted, done) {
-            (Some(wanted), done) if done.is_none_or(|done| done.number < wanted.number) => {
-                "requested by a host; not carried out yet".to_owned()
-            }
-            (_, Some(done)) => format!("by a host {}", when(done.time.0, self.now)),
-            (_, None) => return,
-        };
-        let why = wanted.and_then(|wanted| wanted.reason.as_deref());
-        let why = why.map(|why| format!(": {why}")).unwrap_or_default();
-        self.page.row("Requeued", &sentence(&format!("{when}{why}")));
-    }
-
     fn failure(&mut self) {
         let Some(failure) = &self.status.failure else { return };
         let pair = failure.pair.map(|pair| format!(" in pair {pair}")).unwrap_or_default();
@@ -198,7 +181,7 @@ impl Explanation<'_> {
         }
         if is_attempt_requested(self.submission) {
             let wanted = self.submission.spec.attempt;
-            text = format!("{text}; attempt {wanted} is requested and starts when the operator processes it");
+            text = format!("{text}; attempt {wanted} is requested and follows it");
         }
         if self.submission.spec.cancel && !has_ended(self.submission) {
             text = format!("{text}; its cancellation is requested");

@@ -67,7 +67,7 @@ fn of(submission: &Submission, status: Option<&SubmissionStatus>) -> Class {
     if status.has_ended() {
         return urgent_or(is_deleting, if is_behind { Class::New } else { Class::Refresh });
     }
-    let stops = submission.spec.cancel || status.failure.is_some() || status.times.stopping.is_some();
+    let stops = is_behind || submission.spec.cancel || status.failure.is_some() || status.times.stopping.is_some();
     let has_job = status.job_name.is_some();
     urgent_or(is_deleting || stops, if has_job { Class::Refresh } else { Class::New })
 }

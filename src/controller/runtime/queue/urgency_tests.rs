@@ -42,6 +42,11 @@ fn a_submission_is_as_urgent_as_what_it_shows() {
             json!({"status": {"attempt": 1, "jobName": "j"}}),
             [Refresh, Refresh, Urgent],
         ),
+        (
+            "restarted",
+            json!({"spec": {"attempt": 2}, "status": {"attempt": 1, "jobName": "j"}}),
+            [Urgent; 3],
+        ),
         ("cancelled", json!({"spec": {"cancel": true}}), [Urgent; 3]),
         (
             "cancelled with a Job",

@@ -5,7 +5,7 @@ use std::time::Duration;
 use k8s_openapi::apimachinery::pkg::apis::meta::v1::Time;
 
 use super::plan_builder::{PlanBuilder, after};
-use super::{clock, crashes, disk, failure, interruption, provoked, reading, reported, requeue};
+use super::{clock, crashes, disk, failure, interruption, provoked, reading, reported};
 use crate::controller::submissions::report_digest::ReportDigest;
 use crate::controller::submissions::view::{JobEnd, ObservedReport, Stage};
 use leaderboard_api::conditions::{self, Truth};
@@ -53,6 +53,11 @@ pub(super) fn decide(draft: &mut PlanBuilder<'_>, job_end: Option<&JobEnd>) {
     if let Some(report) = report.filter(|r| r.is_complete() && r.eligible) {
         return finished(draft, report);
     }
+    // A cancel is then the higher attempt's, and what else has ended it is forgiven.
+    if draft.is_followed() {
+        clock::count_use(draft, view.ended_at().unwrap_or(draft.now()));
+        return draft.restart();
+    }
     let report = report.filter(|r| reported::is_of_present_job(draft, r));
     if draft.is_cancelled() {
         let reason = cancel_reason(draft);
@@ -62,11 +67,6 @@ pub(super) fn decide(draft: &mut PlanBuilder<'_>, job_end: Option<&JobEnd>) {
             "The submission was cancelled; what it had reached is kept."
         };
         return cancelled(draft, reason, message);
-    }
-    // Whatever ended it meanwhile is forgiven.
-    if requeue::is_requested(draft) {
-        let found = requeue::failure(draft);
-        return retry(draft, &found);
     }
     let recorded = draft.status.failure.clone();
     let recorded = recorded.filter(|found| !report.is_some_and(|r| crashes::is_refusal(&draft.status, found, r)));
@@ -188,17 +188,15 @@ fn may_retry(draft: &PlanBuilder<'_>, found: &Failure) -> bool {
         reasons::SCHEDULE_DEADLINE,
     ];
     let can_recover = !FINAL.contains(&found.reason.as_str());
-    // A higher attempt that is already requested takes the place of a retry.
-    let is_latest = Some(draft.spec().attempt) <= draft.status.attempt;
     let is_left = interruption::is_one(found)
         || (provoked::leaves_a_job(draft, found)
             && interruption::other_failures(&draft.status) < draft.retries().infrastructure);
-    can_recover && is_latest && is_left
+    can_recover && is_left
 }
 
 fn retry(draft: &mut PlanBuilder<'_>, found: &Failure) {
     let failures = interruption::other_failures(&draft.status);
-    let (delay, next) = if interruption::is_one(found) || requeue::is_one(found) {
+    let (delay, next) = if interruption::is_one(found) {
         let next = "A new Job resumes from the results in S3; this costs neither an attempt nor a retry.";
         (0, next.to_owned())
     } else {
@@ -212,8 +210,6 @@ fn retry(draft: &mut PlanBuilder<'_>, found: &Failure) {
     clock::count_use(draft, draft.view.ended_at().unwrap_or(draft.now()));
     if interruption::is_one(found) {
         interruption::note(draft);
-    } else if requeue::is_one(found) {
-        requeue::note(draft, 1);
     }
     provoked::note(draft, found);
     draft.status.retry += 1;

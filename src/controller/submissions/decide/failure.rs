@@ -149,13 +149,12 @@ fn named_crash(report: &ReportDigest, pairs: &[PairStatus]) -> Failure {
     }
 }
 
-/// The stop that a failure calls for.
+/// The stop that a failure calls for, or a higher attempt.
 pub(super) fn stop_of(failure: Option<&Failure>) -> Stop {
     match failure.map(|failure| failure.reason.as_str()) {
         Some(reasons::TIME_LIMIT) => Stop::RunDeadline,
-        Some(reasons::NODE_INTERRUPTED) => Stop::Interruption,
-        // A host ends it, as by a cancel.
-        Some(reasons::REQUEUED) => Stop::Cancel,
+        // Without a failure it is stopped for a higher attempt.
+        Some(reasons::NODE_INTERRUPTED) | None => Stop::Interruption,
         _ => Stop::Retries,
     }
 }

@@ -55,11 +55,10 @@ pub(super) fn is_one(found: &Failure) -> bool {
     found.reason == reasons::NODE_INTERRUPTED
 }
 
-/// Jobs of the attempt that ended otherwise, because of the infrastructure, since a host has last requeued it.
+/// Jobs of the attempt that ended otherwise, because of the infrastructure.
 pub(super) fn other_failures(status: &SubmissionStatus) -> i32 {
     let interruptions = status.interruptions.as_ref().map_or(0, |past| past.number);
-    let forgiven = status.requeued.as_ref().map_or(0, |requeued| requeued.retries);
-    status.retry.saturating_sub(interruptions).saturating_sub(forgiven)
+    status.retry.saturating_sub(interruptions)
 }
 
 /// One more.

@@ -6,8 +6,7 @@ use std::time::Duration;
 use super::plan::{Action, EvalaiUpdate, TableUpdate};
 use super::plan_builder::{PlanBuilder, after};
 use super::{
-    accept, clock, crashes, disk, end, failure, interruption, isolation, line, reading, reported, requeue, restored,
-    start, stop,
+    accept, clock, crashes, disk, end, failure, interruption, isolation, line, reading, reported, restored, start, stop,
 };
 use crate::controller::submissions::job_spec;
 use crate::controller::submissions::report_digest::ReportDigest;
@@ -85,14 +84,13 @@ fn in_line(draft: &mut PlanBuilder<'_>) {
         } else {
             "The submission was cancelled"
         };
-        let when = if draft.status.retry > 0 {
+        let when = if draft.status.retry > 0 || draft.status.is_restart() {
             "between two tries; what it had reached is kept"
         } else {
             "before it started"
         };
         return end::cancelled(draft, reason, &format!("{what} {when}."));
     }
-    requeue::take_up(draft);
     if !accept::decide(draft) {
         return draft.requeue_in(BACKSTOP);
     }
@@ -265,9 +263,6 @@ fn with_job(draft: &mut PlanBuilder<'_>, job: &JobView) {
     }
     if let Some(lost) = stop::lost_pod(draft) {
         return stop::leave_lost_pod(draft, job, lost);
-    }
-    if !draft.is_to_stop() {
-        requeue::notice(draft);
     }
     if !draft.is_to_stop() {
         watch_run(draft);

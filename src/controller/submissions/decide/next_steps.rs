@@ -60,7 +60,6 @@ pub(super) fn infrastructure_for_participants(reason: &str) -> String {
         reasons::IMAGE_PULL => "An image could not be pulled.",
         reasons::NODE_LOST => "The machine that ran the submission was lost.",
         reasons::NODE_INTERRUPTED => "The machine that ran the submission was taken away.",
-        reasons::REQUEUED => "The challenge's hosts have put the submission back in line.",
         reasons::RESULTS_NOT_STORED => "The results could not be stored.",
         reasons::SIMULATION_CRASHED => "The simulator crashed.",
         reasons::NO_GPU => "The machine that ran the submission had no GPU for it.",

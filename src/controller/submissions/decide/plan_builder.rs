@@ -7,7 +7,7 @@ use k8s_openapi::apimachinery::pkg::apis::meta::v1::Time;
 
 use super::plan::{Action, Event, Plan, StatusWrite, job_name};
 use super::significance::{self, Change};
-use crate::controller::submissions::view::{EvalaiInfo, ReportDemand, View};
+use crate::controller::submissions::view::{EvalaiInfo, ObservedJob, ReportDemand, View};
 use leaderboard_api::conditions::{self, Truth};
 use leaderboard_api::{
     Attempt, BlockedSince, Deadlines, Failure, Ingested, LeaderboardSpec, Retries, RunPlan, Score, State, Submission,
@@ -125,11 +125,22 @@ impl<'a> PlanBuilder<'a> {
         finalizers.iter().any(|f| f == names::FINALIZER_SUBMISSION)
     }
 
-    /// A request to stop that is not a failure: a person's, EvalAI's, or the object's deletion. It holds for the whole
-    /// attempt: a higher attempt takes `spec.cancel` back while the present one is still being stopped.
+    /// A request to stop that is not a failure: a person's, EvalAI's, or the object's deletion. It holds for the whole attempt, unless a
+    /// higher one is asked for.
     pub(super) fn is_cancelled(&self) -> bool {
         let is_stopping = self.status.times.stopping.is_some() && self.status.failure.is_none();
-        is_stopping || self.spec().cancel || self.is_deleting() || self.is_ended_in_evalai()
+        (is_stopping && !self.is_followed()) || self.spec().cancel || self.is_deleting() || self.is_ended_in_evalai()
+    }
+
+    /// A higher attempt is asked for. It takes the place of a live one, once that has stored what it has reached.
+    pub(super) fn is_followed(&self) -> bool {
+        self.status.is_followed_by(self.spec().attempt)
+    }
+
+    /// A run is to stop for a higher attempt. One that has ended by itself is not asked to.
+    fn is_to_be_followed(&self) -> bool {
+        let pod = self.view.pod.as_ref();
+        self.is_followed() && pod.is_none_or(|pod| pod.run_ended.is_none())
     }
 
     /// What EvalAI last reported of it.
@@ -143,7 +154,7 @@ impl<'a> PlanBuilder<'a> {
 
     /// Nothing of this attempt's Job is to run any more.
     pub(super) fn is_to_stop(&self) -> bool {
-        self.is_cancelled() || self.status.failure.is_some()
+        self.is_cancelled() || self.status.failure.is_some() || self.is_to_be_followed()
     }
 
     pub(super) fn is_finished(&self) -> bool {
@@ -176,8 +187,8 @@ impl<'a> PlanBuilder<'a> {
         self.status.retry == 0 && self.status.recreated == 0
     }
 
-    /// Begins an attempt if a new one is requested: a first one, or a higher one after an end that is not Finished.
-    /// True if what this reconcile has read is of another attempt and can't be used.
+    /// Begins an attempt if a new one is requested: a first one, or a higher one after an end that is not Finished, or where no Job has to
+    /// be stopped before. True if what this reconcile has read is of another attempt and can't be used.
     pub(super) fn begin_attempt(&mut self) -> bool {
         let wanted = self.spec().attempt;
         match self.status.attempt {
@@ -187,7 +198,7 @@ impl<'a> PlanBuilder<'a> {
                 // Without a status the world was seen as the first attempt's.
                 wanted != Attempt::FIRST
             }
-            Some(present) if wanted > present && self.may_be_resumed() => {
+            Some(_) if self.is_followed() && (self.is_finished() || self.is_without_job()) => {
                 self.start_status(wanted);
                 self.show_unannounced(wanted);
                 true
@@ -196,9 +207,20 @@ impl<'a> PlanBuilder<'a> {
         }
     }
 
-    fn may_be_resumed(&self) -> bool {
-        let end = self.status.end();
-        end.is_some_and(|end| end.reason != reasons::FINISHED)
+    /// Whether nothing of the attempt is there that could be stopped.
+    fn is_without_job(&self) -> bool {
+        let is_seen = matches!(self.view.job, ObservedJob::Ours(_) | ObservedJob::Created);
+        self.status.job_name.is_none() && !is_seen
+    }
+
+    /// Begins the higher attempt in place of one whose run was stopped for it. EvalAI and the table hear of no end.
+    pub(super) fn restart(&mut self) {
+        let (before, wanted) = (self.status.attempt.unwrap_or_default(), self.spec().attempt);
+        self.start_status(wanted);
+        self.condition(conditions::FINISHED, Truth::False, reasons::REPLACING, "");
+        let message = format!("Attempt {before} was stopped; attempt {wanted} resumes from the results in S3.");
+        self.show(reasons::REPLACING, message);
+        self.requeue_in(Duration::ZERO);
     }
 
     /// The status of a new attempt, with what was pinned and what earlier attempts reached.
@@ -222,11 +244,6 @@ impl<'a> PlanBuilder<'a> {
             score: old.score.map(Score::so_far),
             results_url: old.results_url,
             rerun_of: old.rerun_of,
-            // Retries are counted anew.
-            requeued: old.requeued.map(|mut requeued| {
-                requeued.retries = 0;
-                requeued
-            }),
             usage: old.usage,
             times: leaderboard_api::Times {
                 submitted: old.times.submitted,

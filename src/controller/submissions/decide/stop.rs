@@ -7,7 +7,7 @@ use k8s_openapi::apimachinery::pkg::apis::meta::v1::Time;
 
 use super::plan::Action;
 use super::plan_builder::{PlanBuilder, after};
-use super::{failure, interruption, log, reading, requeue, start};
+use super::{failure, interruption, log, reading, start};
 use crate::controller::submissions::view::{JobView, ObservedNode, PodView};
 use crate::pod::run::Stop;
 use leaderboard_api::reasons;
@@ -99,7 +99,7 @@ fn show(draft: &mut PlanBuilder<'_>) {
             let what = failure.message.clone();
             return start::replacing(draft, &what);
         }
-        Some(failure) if interruption::is_one(failure) || requeue::is_one(failure) => {
+        Some(failure) if interruption::is_one(failure) => {
             let what = format!(
                 "{} Its results are being stored; a new Job resumes from them.",
                 failure.message
@@ -110,7 +110,13 @@ fn show(draft: &mut PlanBuilder<'_>) {
             "{} The run is being stopped; completed routes are kept.",
             failure.message
         ),
-        None => "Stopping as requested; completed routes are kept.".to_owned(),
+        None if draft.is_cancelled() => "Stopping as requested; completed routes are kept.".to_owned(),
+        None => {
+            let wanted = draft.spec().attempt;
+            let what =
+                format!("The run stops for attempt {wanted}, which resumes from its results; they are being stored.");
+            return start::replacing(draft, &what);
+        }
     };
     draft.show(reasons::STOPPING, message);
 }

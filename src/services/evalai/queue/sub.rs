@@ -118,14 +118,17 @@ impl Sub {
         }
     }
 
-    /// Begins a later attempt: every update of the earlier one is void, what was read stays.
+    /// Begins a later attempt: every update of the earlier one is void, what was read stays. An earlier one without an end is restarted, so
+    /// whatever ends the row that was live ends the later one.
     pub fn begin(&mut self, run: Run) {
+        let live_at = self.live_at.or(self.known_at).filter(|_| !self.has_end());
         let old = std::mem::take(&mut self.view);
         let fresh = Self::new(self.pk, self.leaderboard.clone(), self.challenge, run);
         *self = Self {
             read: self.read,
             outdated: self.outdated,
             wrote_at: self.wrote_at,
+            live_at,
             view: SubmissionState {
                 row: old.row,
                 read_at: old.read_at,

@@ -20,7 +20,7 @@ use crate::pod::report::{Report, ReportPair};
 use crate::pod::run::Stop;
 use leaderboard_api::conditions;
 use leaderboard_api::{
-    Attempt, Leaderboard, LeaderboardSpec, PairState, Requeue, State, Submission, SubmissionStatus, names, reasons,
+    Attempt, Leaderboard, LeaderboardSpec, PairState, State, Submission, SubmissionStatus, names, reasons,
 };
 use leaderboard_runner::verdict::{Verdict, What};
 
@@ -282,16 +282,6 @@ impl World {
         conditions::remove(&mut self.submission().status.as_mut().unwrap().conditions, system);
         self.in_evalai().end = None;
         self.view.record = Some(RecordView::default());
-    }
-
-    /// A host puts it back in line.
-    pub fn requeue(&mut self, reason: Option<&str>) {
-        let spec = &mut self.submission().spec;
-        let number = spec.requeue.as_ref().map_or(1, |requeue| requeue.number + 1);
-        spec.requeue = Some(Requeue {
-            number,
-            reason: reason.map(str::to_owned),
-        });
     }
 
     pub fn delete(&mut self) {

@@ -237,15 +237,9 @@ fn followed(mut world: World, stop: Stop) -> World {
 
 #[test]
 fn what_a_stopped_run_has_stored_is_no_verdict_on_the_job_that_follows() {
-    let mut requeued = World::evalai().running();
-    requeued.requeue(None);
     let mut crashed = World::evalai().running();
     crashed.see_alone(ended("simulator-1", 3, "exited", 1, 100));
-    for (world, stop) in [
-        (leaving(), Stop::Interruption),
-        (requeued, Stop::Cancel),
-        (crashed, Stop::Retries),
-    ] {
+    for (world, stop) in [(leaving(), Stop::Interruption), (crashed, Stop::Retries)] {
         let mut deleted = followed(world, stop);
         let mut ended = deleted.clone();
         deleted.job_gone();

@@ -27,7 +27,7 @@ mod properties;
 mod provoked;
 mod reading;
 mod record;
-mod requeue;
+mod restart;
 mod restored;
 mod resume;
 mod retention;

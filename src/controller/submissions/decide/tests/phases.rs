@@ -11,7 +11,7 @@ use crate::controller::submissions::spans;
 use crate::observability::trace_id::TraceId;
 use crate::observability::traces::{Kind, Span, Value};
 use leaderboard_api::State::{Failed, Finished, Pending, Running};
-use leaderboard_api::{names, reasons};
+use leaderboard_api::{Attempt, names, reasons};
 
 /// What ends with the next reconcile: phase, and the seconds at which it began and ended.
 type Lengths = Vec<(&'static str, i64, i64)>;
@@ -129,6 +129,27 @@ fn a_clock_that_is_ahead_makes_no_negative_length() {
     let annotations = [(names::ANNOTATION_INGESTED.to_owned(), late.to_string())];
     world.submission().metadata.annotations = Some(annotations.into());
     assert_eq!(pass(&mut world).1[0], ("intake", 0, 0));
+}
+
+#[test]
+fn a_restart_ends_the_run_and_the_attempt_that_it_follows() {
+    let mut world = World::local().running();
+    world.submission().spec.attempt = Attempt(2);
+    world.go_to(100);
+    assert_eq!(pass(&mut world).1, []);
+    world.go_to(120);
+    world.complete();
+    let plan = decide(&world.view);
+    let found = phases::ended(&world.view, &plan.status);
+    assert!(
+        spans::of(&world.view, &plan.status, &found)
+            .iter()
+            .all(|span| { span.attributes.contains(&("leaderboard.attempt", Value::Number(1))) })
+    );
+    assert_eq!(pass(&mut world).1, [("run", 10, 120), ("attempt", 0, 120)]);
+    world.job_gone();
+    world.go_to(121);
+    assert_eq!(pass(&mut world).1, [("accept", 120, 121), ("wait", 121, 121)]);
 }
 
 fn spans_of(world: &mut World) -> Vec<Span> {

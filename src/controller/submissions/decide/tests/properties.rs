@@ -41,7 +41,6 @@ enum Change {
     },
     Cancel,
     Resume,
-    Requeue,
     Delete,
     StatusLost,
 }
@@ -330,8 +329,7 @@ fn change() -> impl Strategy<Value = Change> {
             Change::Leaderboard { present, infrastructure, schedule_seconds }
         }),
         1 => Just(Change::Cancel),
-        3 => Just(Change::Resume),
-        2 => Just(Change::Requeue),
+        4 => Just(Change::Resume),
         1 => Just(Change::Delete),
         1 => Just(Change::StatusLost),
     ]
@@ -403,7 +401,6 @@ fn apply(world: &mut World, change: Change) {
             spec.attempt = spec.attempt.next();
             spec.cancel = false;
         }
-        Change::Requeue => world.requeue(None),
         Change::Delete => world.submission().metadata.deletion_timestamp = Some(Time(world.view.now)),
         Change::StatusLost => world.submission().status = None,
     }

@@ -248,6 +248,25 @@ fn what_was_stopped_keeps_its_end() {
 }
 
 #[test]
+fn what_was_stopped_to_be_restarted_goes_on() {
+    // The backup is older than the request, or has it.
+    for attempt in [Attempt(1), Attempt(2)] {
+        let known = || traces(Some(row("RUNNING", 1)), Some(stopped(Stop::Interruption)));
+        for mut world in [
+            restored(World::local(), known()),
+            in_evalai(Standing::Wanted, "running", known()),
+        ] {
+            world.submission().spec.attempt = attempt;
+            world.pass();
+            let plan = world.pass();
+            assert_eq!(plan.status.attempt, Some(attempt));
+            assert_ne!(plan.status.state, Some(Cancelled));
+            assert!(plan.status.plan.unwrap().resume);
+        }
+    }
+}
+
+#[test]
 fn what_ran_is_resumed_in_its_turn() {
     let live = || traces(Some(row("RUNNING", 2)), Some(report(2)));
     for mut world in [

@@ -281,6 +281,7 @@ fn a_wait_hears_evalai(view: &View, plan: &Plan) {
     let is_to_stop = spec.cancel
         || view.submission.metadata.deletion_timestamp.is_some()
         || status.failure.is_some()
+        || status.is_followed_by(spec.attempt)
         || status.times.stopping.is_some();
     // The next reconcile looks at an attempt that has just begun.
     let is_seen = plan.requeue != Some(std::time::Duration::ZERO);

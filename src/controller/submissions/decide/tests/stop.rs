@@ -5,8 +5,8 @@ use crate::controller::submissions::decide::{Action, EvalaiUpdate, TableUpdate};
 use crate::controller::submissions::view::{EvalaiEnd, JobEnd, ObservedReport, ObservedTexts};
 use crate::pod::report::Report;
 use crate::pod::run::Stop;
-use leaderboard_api::State::{Cancelled, Failed, Finished, Pending, Running};
-use leaderboard_api::{Attempt, names, reasons};
+use leaderboard_api::State::{Cancelled, Finished, Pending, Running};
+use leaderboard_api::{names, reasons};
 
 type Request = fn(&mut World);
 
@@ -297,33 +297,6 @@ fn a_stop_ends_though_the_clock_is_set_back() {
     world.job_gone();
     world.go_to(50);
     assert!(creates(&world.pass()), "a wait of seconds stays one");
-}
-
-#[test]
-fn a_higher_attempt_does_not_take_a_stop_back() {
-    let mut world = World::local().running();
-    world.submission().spec.cancel = true;
-    world.pass_to(Running, reasons::STOPPING);
-    world.submission().spec.cancel = false;
-    world.submission().spec.attempt = Attempt(2);
-    world.pass_to(Running, reasons::STOPPING);
-    world.complete();
-    world.pass_to(Cancelled, reasons::CANCELLED);
-    let plan = world.pass_to(Pending, reasons::PREPARING);
-    assert_eq!(plan.status.attempt, Some(Attempt(2)));
-}
-
-#[test]
-fn a_higher_attempt_takes_the_place_of_a_retry() {
-    let mut world = World::local().running();
-    world.submission().spec.attempt = Attempt(2);
-    world.pass_to(Running, reasons::RUNNING);
-    world.complete();
-    world.pass_to(Failed, reasons::RESULTS_NOT_STORED);
-    assert_eq!(
-        world.pass_to(Pending, reasons::PREPARING).status.attempt,
-        Some(Attempt(2))
-    );
 }
 
 #[test]

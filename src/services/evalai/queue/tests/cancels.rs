@@ -164,6 +164,29 @@ fn a_cancel_before_the_first_read_of_an_attempt_that_evalai_has_asked_for_stays(
 }
 
 #[test]
+fn a_row_that_was_live_before_a_restart_is_ended_by_what_ends_it_then() {
+    for (status, ended) in [
+        (Status::Cancelled, Some(Status::Cancelled)),
+        (Status::Failed, Some(Status::Failed)),
+        // Participants can write it.
+        (Status::Finished, None),
+        (Status::Running, None),
+    ] {
+        let mut bench = Bench::new();
+        bench.running(7);
+        bench.wait(1.0);
+        bench.ask(7, 2);
+        bench.get(7, row(7, status));
+        assert_eq!((bench.view(7).answered, bench.view(7).ended), (Some(Attempt(2)), ended));
+        if ended.is_none() {
+            bench.update(7, 2, DesiredUpdate::Queued);
+            bench.get(7, row(7, status));
+            bench.write("queued 7");
+        }
+    }
+}
+
+#[test]
 fn a_cancellation_while_a_later_attempt_waits_ends_it() {
     let mut bench = Bench::new();
     bench.ask(7, 2);

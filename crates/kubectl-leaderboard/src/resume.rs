@@ -1,0 +1,186 @@
+//! `resume`: which submissions get a higher attempt, and the table that is shown before many of them do. Pure.
+
+use clap::{ArgGroup, Args};
+use jiff::Timestamp;
+use kube::ResourceExt;
+use leaderboard_api::{FailureClass, State, Submission};
+
+use crate::change::Request;
+use crate::facts;
+use crate::table::table;
+use crate::text::{Frame, span};
+
+/// Which submissions.
+#[derive(Args, Debug)]
+#[allow(clippy::struct_excessive_bools, reason = "each is a flag of the command")]
+#[command(group = ArgGroup::new("which").required(true).multiple(false).args(["names", "selector", "all"]))]
+pub struct Resume {
+    /// Names of submissions.
+    #[arg(value_name = "NAME")]
+    pub names: Vec<String>,
+    /// Each Failed submission with these labels, such as `leaderboard.carla.org/phase=7`.
+    #[arg(short = 'l', long, value_name = "LABELS")]
+    pub selector: Option<String>,
+    /// Each Failed submission of the namespace.
+    #[arg(long)]
+    pub all: bool,
+    /// Only what nodes, network or storage have failed.
+    #[arg(long, conflicts_with = "names")]
+    pub infrastructure: bool,
+    /// Only failures for these reasons, such as NodeLost,ImagePull.
+    #[arg(long, value_delimiter = ',', value_name = "REASONS", conflicts_with = "names")]
+    pub reason: Vec<String>,
+    /// Choose live runs instead: each stores its results, stops, and goes on when its turn comes.
+    #[arg(long, conflicts_with_all = ["infrastructure", "reason"])]
+    pub restart: bool,
+    /// Only print which ones.
+    #[arg(long, conflicts_with = "names")]
+    pub dry_run: bool,
+    /// Do not ask.
+    #[arg(short, long, conflicts_with = "names")]
+    pub yes: bool,
+    /// Wait for the end of each, and print each state until then.
+    #[arg(long, conflicts_with_all = ["selector", "all"])]
+    pub wait: bool,
+}
+
+impl Resume {
+    /// What each of them is asked for.
+    pub fn request(&self) -> Request {
+        if self.restart {
+            Request::Restart
+        } else if self.names.len() == 1 {
+            Request::Resume
+        } else {
+            Request::ResumeMany
+        }
+    }
+
+    /// What is done, as a command.
+    pub fn verb(&self) -> &'static str {
+        if self.restart { "restart" } else { "resume" }
+    }
+
+    /// The submissions that fit, by name. A check is made anew instead.
+    pub fn chosen<'a>(&self, submissions: &'a [Submission]) -> Vec<&'a Submission> {
+        let is_chosen = |one: &&Submission| {
+            let fits = if self.restart {
+                facts::is_run(one)
+            } else {
+                self.is_failure(one)
+            };
+            let is_going = one.metadata.deletion_timestamp.is_some() || facts::is_attempt_requested(one);
+            fits && !is_going && !one.spec.check
+        };
+        let mut found: Vec<&Submission> = submissions.iter().filter(is_chosen).collect();
+        found.sort_by_key(|one| one.name_any());
+        found
+    }
+
+    fn is_failure(&self, one: &Submission) -> bool {
+        let status = one.status.as_ref();
+        let is_failed = status.and_then(facts::state) == Some(State::Failed);
+        let failure = status.and_then(|status| status.failure.as_ref()).filter(|_| is_failed);
+        failure.is_some_and(|failure| {
+            let is_class = !self.infrastructure || failure.class == FailureClass::Infrastructure;
+            is_class && (self.reason.is_empty() || self.reason.contains(&failure.reason))
+        })
+    }
+
+    /// What is shown where none of so many submissions fits.
+    pub fn none(&self, number: usize, namespace: &str, frame: Frame) -> Vec<String> {
+        let cause = if self.infrastructure {
+            " because of the infrastructure"
+        } else {
+            ""
+        };
+        let reason = match self.reason.as_slice() {
+            [] => String::new(),
+            reasons => format!(" for {}", reasons.join(" or ")),
+        };
+        let what = if self.restart {
+            "has a run to restart".to_owned()
+        } else {
+            format!("has failed{cause}{reason}")
+        };
+        let mut page = frame.page();
+        page.paragraph(&format!(
+            "None of {} {what}. `kubectl leaderboard status -n {namespace}` lists all.",
+            counted(number)
+        ));
+        page.into_lines()
+    }
+}
+
+/// What is chosen, with the class of each failure.
+pub fn lines(chosen: &[&Submission], frame: Frame) -> Vec<String> {
+    let rows: Vec<Vec<String>> = chosen.iter().map(|one| row(one, frame.now)).collect();
+    let head = ["NAME", "TEAM", "STATE", "REASON", "CLASS", "SINCE", "NODE", "SIMULATOR"];
+    table(&head, &rows, frame.width)
+}
+
+/// What a command would do.
+pub fn dry_run(verb: &str, chosen: &[&Submission], frame: Frame) -> Vec<String> {
+    let mut lines = lines(chosen, frame);
+    let number = counted(chosen.len());
+    lines.extend([
+        String::new(),
+        format!("Would {verb} {number}. Without --dry-run it does."),
+    ]);
+    lines
+}
+
+fn row(one: &Submission, now: Timestamp) -> Vec<String> {
+    let status = one.status.as_ref();
+    let failure = status.and_then(|status| status.failure.as_ref());
+    let class = failure.map_or("", |failure| match failure.class {
+        FailureClass::Participant => "Participant",
+        FailureClass::Infrastructure => "Infrastructure",
+    });
+    let plan = status.and_then(|status| status.plan.as_ref());
+    // The registry is the same for all, and the tag is what differs.
+    let simulator = plan.and_then(|plan| plan.simulator_image.rsplit('/').next());
+    let since = facts::since(one).map(|at| span(now.duration_since(at).as_secs()));
+    vec![
+        one.name_any(),
+        facts::team(one).unwrap_or_default(),
+        status.and_then(facts::state).map_or("", State::as_str).to_owned(),
+        status
+            .and_then(|status| status.reason.as_deref())
+            .unwrap_or_default()
+            .to_owned(),
+        class.to_owned(),
+        since.unwrap_or_default(),
+        status.and_then(|status| status.node_name.clone()).unwrap_or_default(),
+        simulator.unwrap_or_default().to_owned(),
+    ]
+}
+
+/// Asks for a yes.
+pub fn question(verb: &str, number: usize) -> String {
+    let (first, rest) = verb.split_at(1);
+    format!("{}{rest} {}?", first.to_uppercase(), counted(number))
+}
+
+/// What has become of all, after a line of each.
+pub fn summary(requested: usize, chosen: usize, namespace: &str, frame: Frame) -> Vec<String> {
+    let refused = match chosen - requested {
+        0 => String::new(),
+        1 => " One was refused; its reason is above.".to_owned(),
+        refused => format!(" {refused} were refused; the reasons are above."),
+    };
+    let mut page = frame.page();
+    page.paragraph(&format!(
+        "Requested for {requested} of {}.{refused} To follow them: `kubectl leaderboard status -n {namespace}`.",
+        counted(chosen)
+    ));
+    page.into_lines()
+}
+
+/// `1 submission`, `38 submissions`.
+pub fn counted(number: usize) -> String {
+    match number {
+        1 => "1 submission".to_owned(),
+        number => format!("{number} submissions"),
+    }
+}
