@@ -24,7 +24,6 @@ mod api {
     mod failures;
     mod images;
     mod import;
-    mod import_readers;
     mod inbox;
     mod intake;
     mod isolation;

@@ -51,12 +51,9 @@ INDIRECT: Mapping[tuple[str, str], str] = {
     ("kms", "kms:Decrypt"): "S3 asks KMS with the caller's rights: to read, and to join parts",
     ("kms", "kms:GenerateDataKey"): "S3 asks KMS with the caller's rights: to store",
 }
-# Asked for with a person's own rights, by a command and not by a program; and why.
-BY_PEOPLE: Mapping[str, str] = {"scan": "`import` reads a table of the earlier pipeline"}
 # Files that sign requests themselves, which the list of operations does not show, and what they ask for.
 SIGNED: Mapping[str, str] = {
     "src/services/registry/ecr.rs": "GetAuthorizationToken, which `ECR` finds",
-    "src/services/event_sources.rs": "ListPipes and ListEventSourceMappings, with a person's own rights",
 }
 # Policies that a host adds to a program's own where they are needed.
 ADDED = {"log-groups": "controller"}
@@ -124,7 +121,7 @@ class Source:
             uses = re.search(rf"\bservices::(?:\{{[^}}]*\b)?{service}\b", text)
             if uses and service != "archive":
                 found |= operations
-        return frozenset(found | closure(self.archive(), set(ARCHIVE_METHOD.findall(text)))) - BY_PEOPLE.keys()
+        return frozenset(found | closure(self.archive(), set(ARCHIVE_METHOD.findall(text))))
 
 
 def snake(name: str) -> str:
@@ -161,7 +158,6 @@ def faults(source: Source, folder: Path) -> Iterator[str]:
     """What is called and not allowed, or allowed and not called, by policy; and calls that the table does not have."""
     everything = {program: source.of_program(program) for program in PROGRAMS}
     all_operations = source.operations_of("\n".join(source.texts.values()))
-    all_operations -= BY_PEOPLE.keys()
     yield from (f"{name}: no action in awscalls.py" for name in sorted(all_operations - ACTIONS.keys()))
     nobodys = all_operations - frozenset().union(*everything.values())
     signed = {name for name, text in source.texts.items() if "aws_sigv4" in text}

@@ -25,8 +25,8 @@ PROGRAMS = {
     "workspace": "submission-worker",
     "logcopy": "submission-worker",
 }
-# They have a person's rights.
-PEOPLE = ("import", "tests")
+# It has a person's rights.
+TESTS = "tests"
 S3_SIGNED = re.compile(r"/s3/aws4_request\b")
 # A request of S3 is its method and the first of these that is in its query; "": the bucket or the object itself.
 S3: Mapping[tuple[str, str], str] = {
@@ -74,7 +74,7 @@ class Call:
 def call_of(method: str, path: str, query: str, headers: Mapping[str, str], body: bytes) -> Call | None:
     """A request to AWS; None: it is none of the operator's, or one that takes no right."""
     agent = APP.search(f"{headers.get('user-agent', '')} {headers.get('x-amz-user-agent', '')}")
-    if agent is None or agent[1] in PEOPLE:
+    if agent is None or agent[1] == TESTS:
         return None
     target = headers.get("x-amz-target")
     if target:

@@ -13,6 +13,44 @@ from pathlib import Path
 
 # kubectl itself starts it, for `kubectl leaderboard`.
 PLUGIN = "kubectl-leaderboard"
+# What the pipeline before this one has in Secrets Manager.
+SECRET = "aws secretsmanager get-secret-value --secret-id"
+IMAGES = "123456789012.dkr.ecr.us-west-2.amazonaws.com"
+
+
+def board(number: int) -> dict[str, str]:
+    """The entry of a Leaderboard."""
+    name = f"leaderboard-{number}"
+    keys = ("name", "s3_bucket", "dynamodb_submissions_table", "cloudwatch_log_group")
+    images = ("simulator", "leaderboard", "logcopy")
+    return {**dict.fromkeys(keys, name), **{f"{image}_image": f"{IMAGES}/{image}-{number}:latest" for image in images}}
+
+
+PHASES = {"4170": "10-sensors", "4171": "10-map", "4172": "20-sensors", "4173": "20-map"}
+ENTRIES = {
+    name: json.dumps(entry)
+    for name, entry in {
+        "evalai": {"auth_token": "local-host-token", "api_server": "https://eval.ai"},
+        "evalai-tracks": {phase: f"leaderboard-{track}" for phase, track in PHASES.items()},
+        "leaderboard-10": board(10),
+        "leaderboard-20": board(20),
+    }.items()
+}
+
+
+def answer(name: str) -> dict[str, str]:
+    """What `aws` prints of an entry without its text."""
+    return {"ARN": f"arn:aws:secretsmanager:us-west-2:123456789012:secret:{name}-Ab12Cd", "Name": name}
+
+
+# A run of this operator that goes on, as `aws dynamodb scan` prints it.
+ROW = {
+    "team_id": {"S": "7"},
+    "submission_id": {"S": "101"},
+    "submission_status": {"S": "RUNNING"},
+    "track_id": {"S": "4172"},
+    "attempt": {"N": "2"},
+}
 # What a stand-in prints, by the first words; a number of times, then nothing.
 MESSAGE = '{"Body": "{}", "ReceiptHandle": "handle"}'
 PRINTS: dict[str, tuple[str, int]] = {
@@ -20,8 +58,15 @@ PRINTS: dict[str, tuple[str, int]] = {
     "aws sqs receive-message --queue-url https://sqs.us-east-1.amazonaws.com/123456789012/queue --query": (MESSAGE, 2),
     "aws sqs receive-message": (f'{{"Messages": [{MESSAGE}]}}', 99),
     "aws sts get-caller-identity": ("123456789012", 99),
+    f"{SECRET} evalai --query {{ARN: ARN, Name: Name}}": (json.dumps(answer("evalai")), 99),
+    **{
+        f"{SECRET} {name} --output json": (json.dumps({**answer(name), "SecretString": text}), 99)
+        for name, text in ENTRIES.items()
+    },
     # EvalAI's stand-in takes this token.
-    "aws secretsmanager get-secret-value --secret-id evalai": ('{"auth_token": "local-host-token"}', 99),
+    f"{SECRET} evalai": (ENTRIES["evalai"], 99),
+    "aws dynamodb scan --table-name leaderboard-20 --output json": (json.dumps({"Items": [ROW]}), 99),
+    "aws ec2 describe-network-interfaces": ("192.168.255.5", 99),
     "aws ecr describe-repositories": ("challenge-participant-team-7", 99),
     "aws": ("stand-in", 99),
     "make --silent install-yaml": ("apiVersion: v1\nkind: ConfigMap\nmetadata: {name: installed}", 99),
@@ -29,11 +74,9 @@ PRINTS: dict[str, tuple[str, int]] = {
     PLUGIN: ("stand-in", 99),
 }
 # Behind these words, and behind `file://`, is the name of a file.
-FILES = ("--values", "--config-file", "--template-file", "--file", "--decisions")
+FILES = ("--values", "--config-file", "--template-file", "--file")
 # Commands of the plugin that ask no cluster.
-OFFLINE = ("completion", "man")
-# What `leaderboard-operator import` prints, in the folder: docs/import.md shows it.
-IMPORTED = "challenge.yaml"
+OFFLINE = ("completion", "import", "man")
 # Added behind the words of kubectl, where the last of two flags counts.
 BEHIND = {
     "delete": ["--dry-run=server", "--wait=false"],
@@ -66,7 +109,9 @@ def variable(program: str) -> str:
 def changed(words: Sequence[str]) -> list[str] | None:
     """The words with which a program runs in earnest; None if it does not."""
     words, what = list(words), verb(words)
-    if words[0] == "man" or (words[0] == PLUGIN and what in OFFLINE):
+    # In prose the name of the command stands alone.
+    is_name = what == "import" and words[-1] == what
+    if words[0] == "man" or (words[0] == PLUGIN and what in OFFLINE and not is_name):
         return words
     if words[0] == "curl":
         return [*words, "--fail"]
@@ -96,8 +141,6 @@ def missing(words: Sequence[str]) -> str:
 def printed(words: Sequence[str], folder: Path) -> str:
     """What a stand-in prints for these words now."""
     line = " ".join(words)
-    if line.startswith("leaderboard-operator import --region"):
-        return (folder / IMPORTED).read_text()
     begin = next((begin for begin in PRINTS if line.startswith(begin)), "")
     if not begin:
         return ""

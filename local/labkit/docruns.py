@@ -132,8 +132,6 @@ def typed(repository: Path, kube: Kube, folder: Path, found: Sequence[Block]) ->
     programs = folder / "programs"
     programs.mkdir()
     install(programs)
-    shown = [block.text for block in found if block.page == "docs/import.md" and block.language == "yaml"]
-    (folder / docprograms.IMPORTED).write_text("".join(shown))
     (folder / "notes").touch()
     for number, page in enumerate(dict.fromkeys(block.page for block in found)):
         home = folder / str(number)

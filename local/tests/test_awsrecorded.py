@@ -102,7 +102,7 @@ class Requests(unittest.TestCase):
 
     def test_what_others_ask_is_no_call_of_a_program(self) -> None:
         target = {"x-amz-target": "AmazonSQS.ReceiveMessage"}
-        for headers in ({"user-agent": "Boto3/1.43"}, agent("tests"), agent("import"), {}):
+        for headers in ({"user-agent": "Boto3/1.43"}, agent("tests"), {}):
             self.assertIsNone(awsrecorded.call_of("POST", "/", "", {**headers, **target}, b"{}"), headers)
         # A question to STS, and one to the registry.
         self.assertIsNone(awsrecorded.call_of("POST", "/", "", agent("logcopy"), b"Action=AssumeRoleWithWebIdentity"))

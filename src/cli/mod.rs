@@ -2,7 +2,6 @@
 //!
 //! Called by the binary alone. Every flag of a server can be given as an environment variable, as the chart does.
 
-mod import;
 mod labels;
 mod offline;
 #[cfg(test)]
@@ -56,9 +55,6 @@ enum Command {
     /// Merge and render checkpoint files without a cluster.
     #[command(after_help = offline::EXIT_CODES)]
     Results(offline::Results),
-    /// Print manifests for a pipeline that this operator takes over, or make Submissions from its table.
-    #[command(after_help = import::EXIT_CODES)]
-    Import(Box<import::Import>),
     /// Print the schema of a phase's leaderboard in EvalAI.
     Labels(labels::Labels),
 }
@@ -66,7 +62,7 @@ enum Command {
 impl Command {
     fn asks_aws(&self) -> bool {
         match self {
-            Self::Controller(_) | Self::Bridge(_) | Self::Workspace(_) | Self::Logcopy(_) | Self::Import(_) => true,
+            Self::Controller(_) | Self::Bridge(_) | Self::Workspace(_) | Self::Logcopy(_) => true,
             Self::Preflight(_) | Self::Crd | Self::Results(_) | Self::Labels(_) => false,
         }
     }
@@ -169,7 +165,6 @@ pub fn run() -> ExitCode {
     match cli.command {
         Command::Crd => offline::print_crds(),
         Command::Results(results) => results.run(),
-        Command::Import(import) => import.run(),
         Command::Labels(labels) => labels.run(),
         Command::Controller(options) => serve::controller(options),
         Command::Bridge(options) => serve::bridge(options),

@@ -5,7 +5,6 @@ pub mod archive;
 pub mod aws;
 pub mod endpoints;
 pub mod evalai;
-pub mod event_sources;
 pub mod fault;
 pub mod held_text;
 pub mod log_groups;

@@ -7,7 +7,6 @@ mod keys;
 mod ledger;
 mod read;
 mod recorder;
-mod rows;
 mod trial;
 
 use std::collections::{BTreeMap, HashMap};
@@ -24,7 +23,6 @@ use keys::Key;
 pub use ledger::{RowState, TableId};
 pub use read::ObservedRow;
 pub use recorder::Recorder;
-pub use rows::StoredRow;
 
 use crate::services::aws::Aws;
 use crate::services::fault::{self, Fault};

@@ -14,7 +14,7 @@ use sha2::{Digest, Sha256};
 use super::aws::Aws;
 
 /// How long before its end a token's renewal is asked for.
-pub const WARN_BEFORE: SignedDuration = SignedDuration::from_hours(30 * 24);
+const WARN_BEFORE: SignedDuration = SignedDuration::from_hours(30 * 24);
 
 /// Where a token comes from.
 #[derive(Clone, PartialEq, Eq)]
@@ -99,7 +99,7 @@ impl fmt::Debug for TokenSource {
 }
 
 /// The text of an entry of Secrets Manager; an error shows what the service has answered.
-pub async fn secret_text(aws: &Aws, id: &str, region: Option<&str>, endpoint: Option<&str>) -> Result<String, String> {
+async fn secret_text(aws: &Aws, id: &str, region: Option<&str>, endpoint: Option<&str>) -> Result<String, String> {
     let request = aws.secrets(region, endpoint).get_secret_value().secret_id(id).send();
     let answer = aws.meter().aws("secretsmanager", "GetSecretValue", request).await;
     let answer = answer.map_err(|error| reason(&error))?;

@@ -1,18 +1,19 @@
-//! `leaderboard-operator import` as a person runs it: against the AWS stand-in, with what it prints applied to the API server.
+//! `kubectl leaderboard import` as a person runs it: what it prints is applied to the API server, alone and with the decisions of the
+//! documents laid over it.
+#![cfg(test)]
 
-mod rows;
-
-use std::io::Write as _;
-use std::process::{Output, Stdio};
+use std::os::unix::fs::PermissionsExt as _;
+use std::path::Path;
+use std::process::{Command, Output};
 
 use serde_json::{Value, json};
-use tokio::process::Command;
+use tempfile::TempDir;
 
-use super::bridge::StandIn;
+use super::plugin::plugin;
 use crate::support::apiserver::server;
 
-const REGION: &str = "us-west-2";
 const TOKEN: &str = "local-host-token";
+const FILE: &str = "entries.json";
 
 /// The four entries, as the original has them.
 fn entries() -> [(&'static str, Value); 4] {
@@ -37,18 +38,36 @@ fn entries() -> [(&'static str, Value); 4] {
     ]
 }
 
-async fn import(arguments: &[&str]) -> Output {
-    let mut command = Command::new(env!("CARGO_BIN_EXE_leaderboard-operator"));
+/// What `aws secretsmanager get-secret-value --output json` prints of them.
+fn answers(entries: &[(&str, Value)]) -> String {
+    let answer = |(name, entry): &(&str, Value)| {
+        let arn = format!("arn:aws:secretsmanager:us-west-2:123456789012:secret:{name}-Ab12Cd");
+        format!(
+            "{:#}\n",
+            json!({"ARN": arn, "Name": name, "SecretString": entry.to_string()})
+        )
+    };
+    entries.iter().map(answer).collect()
+}
+
+/// A folder with a file of answers.
+fn folder(text: &str, mode: u32) -> TempDir {
+    let folder = tempfile::tempdir().unwrap();
+    let file = folder.path().join(FILE);
+    std::fs::write(&file, text).unwrap();
+    std::fs::set_permissions(&file, std::fs::Permissions::from_mode(mode)).unwrap();
+    folder
+}
+
+/// Runs the command of the documents in a folder, where no cluster is known.
+fn import(folder: &Path, more: &[&str]) -> Output {
+    let queue = "https://sqs.us-west-2.amazonaws.com/123456789012/leaderboard";
+    let mut command = Command::new(plugin());
+    command.env_clear().current_dir(folder);
     command
-        .env_clear()
-        .env("AWS_ACCESS_KEY_ID", "test")
-        .env("AWS_SECRET_ACCESS_KEY", "test")
-        .env("AWS_EC2_METADATA_DISABLED", "true")
-        .env("KUBECONFIG", server().await.kubeconfig())
-        .arg("import")
-        .args(arguments)
-        .stdin(Stdio::null());
-    command.output().await.unwrap()
+        .args(["import", FILE, "--challenge", "2098", "--queue", queue])
+        .args(more);
+    command.output().unwrap()
 }
 
 fn texts(output: &Output) -> (String, String) {
@@ -56,8 +75,8 @@ fn texts(output: &Output) -> (String, String) {
     (text(&output.stdout), text(&output.stderr))
 }
 
-/// What kubectl answers to a stream of manifests.
-async fn dry_run(manifests: &str) -> (bool, String) {
+/// What kubectl answers to a file of manifests: the objects that it names.
+async fn dry_run(file: &Path) -> Vec<String> {
     let mut command = server().await.kubectl();
     command.args([
         "apply",
@@ -66,172 +85,72 @@ async fn dry_run(manifests: &str) -> (bool, String) {
         "--dry-run=server",
         "--output",
         "name",
-        "--filename",
-        "-",
     ]);
-    let mut kubectl = command
-        .stdin(Stdio::piped())
-        .stdout(Stdio::piped())
-        .stderr(Stdio::piped())
-        .spawn()
-        .unwrap();
-    kubectl.stdin.take().unwrap().write_all(manifests.as_bytes()).unwrap();
-    let output = kubectl.wait_with_output().unwrap();
+    let output = command.arg("--filename").arg(file).output().unwrap();
     let (out, err) = texts(&output);
-    (output.status.success(), format!("{out}{err}"))
+    assert!(output.status.success() && err.is_empty(), "{err}");
+    out.lines().map(str::to_owned).collect()
 }
 
 #[tokio::test]
-async fn what_is_printed_from_secrets_manager_is_accepted_by_the_api_server() {
-    let aws = StandIn::start().await;
-    let secrets = aws.aws.secrets(Some(REGION), Some(&aws.endpoint));
-    for (name, entry) in entries() {
-        let request = secrets.create_secret().name(name).secret_string(entry.to_string());
-        request.send().await.unwrap();
-    }
+async fn what_is_printed_is_accepted_by_the_api_server() {
     let namespace = server().await.namespace("import").await;
-    let queue = "https://sqs.us-west-2.amazonaws.com/123456789012/leaderboard";
-    let role = "arn:aws:iam::123456789012:role/leaderboard-submission-worker";
-    let always = [
-        "--region",
-        REGION,
-        "--endpoint",
-        &aws.endpoint,
-        "--challenge",
-        "2098",
-        "--namespace",
-        &namespace,
-    ];
-    let dead = format!("{queue}-dead");
-    for more in [
-        vec![],
-        vec!["--two-operators", "--queue", queue],
-        vec![
-            "--queue",
-            queue,
-            "--dead-letter",
-            &dead,
-            "--role-arn",
-            role,
-            "--egress",
-            "10.0.1.10/32",
-            "--taint",
-            "nvidia.com/gpu:NoSchedule",
-        ],
-        vec!["--only", "leaderboard-20"],
-    ] {
-        let output = import(&[always.as_slice(), more.as_slice()].concat()).await;
-        let (manifests, notes) = texts(&output);
-        assert!(output.status.success(), "{notes}");
-        assert!(!manifests.contains(TOKEN) && !notes.contains(TOKEN));
-        let (accepted, shown) = dry_run(&manifests).await;
-        assert!(accepted && !shown.contains("Warning"), "{shown}\n{manifests}");
-        let boards = if more.contains(&"--only") { 1 } else { 2 };
-        assert_eq!(shown.lines().count(), 2 + boards, "{shown}");
-        assert!(
-            shown.contains("leaderboard.leaderboard.carla.org/leaderboard-20\n"),
-            "{shown}"
-        );
-        for note in ["leaderboard-20: certificate_authority", "evalai.challenge: is 2098"] {
-            assert!(notes.contains(note) && manifests.contains(note), "{note}: {notes}");
-        }
-    }
+    let folder = folder(&answers(&entries()), 0o600);
+    let output = import(folder.path(), &["--namespace", &namespace]);
+    let (manifests, notes) = texts(&output);
+    assert!(output.status.success(), "{notes}");
+    assert!(!manifests.contains(TOKEN) && !notes.contains(TOKEN));
+    assert!(
+        notes.contains("not taken over: leaderboard-20: certificate_authority"),
+        "{notes}"
+    );
+    let file = folder.path().join("challenge.yaml");
+    std::fs::write(&file, manifests).unwrap();
+    let objects = dry_run(&file).await;
+    assert_eq!(objects.len(), 4, "{objects:?}");
+    assert_eq!(objects[3], "leaderboard.leaderboard.carla.org/leaderboard-20");
 }
 
-#[tokio::test]
-async fn entries_that_cannot_be_used_are_refused_and_nothing_is_printed() {
-    let folder = tempfile::tempdir().unwrap();
-    let path = folder.path().to_str().unwrap();
-    let run = async |more: &[&str]| {
-        let arguments = ["--from-files", path, "--region", REGION];
-        let output = import(&[arguments.as_slice(), more].concat()).await;
-        let (out, err) = texts(&output);
-        assert_eq!(out, "");
-        (output.status.code(), err)
-    };
-    let (code, text) = run(&[]).await;
-    assert!(code == Some(2) && text.contains("--challenge"), "{text}");
-    let (code, text) = run(&["--challenge", "1"]).await;
-    assert!(code == Some(1) && text.contains("evalai.json"), "{text}");
-    for (name, mut entry) in entries() {
-        if name == "leaderboard-10" {
-            entry.as_object_mut().unwrap().remove("s3_bucket");
-        }
-        std::fs::write(folder.path().join(format!("{name}.json")), entry.to_string()).unwrap();
-    }
-    let (code, text) = run(&["--challenge", "1"]).await;
-    assert_eq!(code, Some(2));
-    let why = "leaderboard-operator import: the entry leaderboard-10 lacks s3_bucket; add what is missing\n";
-    assert_eq!(text, why);
-    let only = import(&[
-        "--from-files",
-        path,
-        "--region",
-        REGION,
-        "--challenge",
-        "1",
-        "--only",
-        "leaderboard-20",
-    ])
-    .await;
-    assert!(only.status.success(), "the other entry is not read");
-}
-
-/// The file of decisions that a page has its reader write, with addresses in place of the shell's.
+/// The lines with which a page has its reader lay decisions over the manifests, from one that begins with `first`.
 fn decisions_of(page: &str) -> String {
-    let page = std::path::Path::new(env!("CARGO_MANIFEST_DIR")).join("docs").join(page);
+    let page = Path::new(env!("CARGO_MANIFEST_DIR")).join("docs").join(page);
     let page = std::fs::read_to_string(page).unwrap();
-    let (_, rest) = page.split_once("> decisions.yaml <<END\n").unwrap();
-    let (file, _) = rest.split_once("\nEND\n").unwrap();
-    let file = file.replace("$egress", "    - {cidr: 192.168.255.5/32, ports: [443]}");
-    let lines = file.lines().map(|line| match line.split_once("$(aws sqs") {
-        Some((field, _)) => format!("{field}https://sqs.us-west-2.amazonaws.com/123456789012/dead"),
-        None => line
-            .replace("$s3", "https://bucket.example")
-            .replace("$account", "123456789012")
-            .replace("$challenge", "2098"),
-    });
-    lines.collect::<Vec<_>>().join("\n")
+    let (_, rest) = page.split_once("\ncat > kustomization.yaml <<END\n").unwrap();
+    let (file, _) = rest.split_once("\nkubectl apply").unwrap();
+    format!("cat > kustomization.yaml <<END\n{file}\n")
 }
 
 #[tokio::test]
-async fn the_decisions_of_the_documents_leave_no_question_and_the_api_server_accepts_what_comes_of_them() {
+async fn the_api_server_accepts_the_manifests_with_the_decisions_of_the_documents() {
     let namespace = server().await.namespace("decisions").await;
-    let folder = tempfile::tempdir().unwrap();
-    for (name, entry) in entries() {
-        std::fs::write(folder.path().join(format!("{name}.json")), entry.to_string()).unwrap();
-    }
-    let (path, file) = (folder.path().to_str().unwrap(), folder.path().join("decisions.yaml"));
-    let file = file.to_str().unwrap();
-    // Nobody answers there, who would list other readers of the queue.
-    let always = [
-        "--from-files",
-        path,
-        "--region",
-        REGION,
-        "--endpoint",
-        "http://127.0.0.1:9",
-        "--decisions",
-        file,
-    ];
-    let queue = "https://sqs.us-west-2.amazonaws.com/123456789012/leaderboard";
-    let more = ["--namespace", &namespace, "--queue", queue];
+    let mut given = entries();
+    // The page's reader leaves the token out.
+    given[0].1 = json!({"api_server": "https://eval.ai"});
     for page in ["import.md", "migrate.md"] {
-        std::fs::write(file, decisions_of(page)).unwrap();
-        let (manifests, notes) = texts(&import(&[always.as_slice(), more.as_slice()].concat()).await);
-        assert!(!notes.contains("to decide:"), "{page}: {notes}");
-        // What the cluster has of them belongs to other tests.
-        let has_group = page == "migrate.md";
-        assert_eq!(notes.contains("\nlog collectors: "), has_group, "{page}: {notes}");
-        assert!(!notes.contains("log collectors: not known"), "{page}: {notes}");
-        let (accepted, shown) = dry_run(&manifests).await;
-        assert!(accepted && !shown.contains("Warning"), "{page}: {shown}\n{manifests}");
-        assert_eq!(shown.lines().count(), 4, "{page}: {shown}");
+        let folder = folder(&answers(&given), 0o644);
+        let (manifests, notes) = texts(&import(folder.path(), &["--namespace", &namespace]));
+        assert!(!manifests.is_empty(), "{notes}");
+        std::fs::write(folder.path().join("challenge.yaml"), manifests).unwrap();
+        let kubectl = server().await.kubectl();
+        let path = Path::new(kubectl.get_program()).parent().unwrap().to_owned();
+        let shell = Command::new("bash")
+            .args([
+                "-euc",
+                &format!("aws() {{ echo https://sqs.example/1/dead; }}\n{}", decisions_of(page)),
+            ])
+            .env("PATH", format!("{}:{}", path.display(), std::env::var("PATH").unwrap()))
+            .env("s3", "https://bucket.example")
+            .env("egress", "        - {cidr: 192.168.255.5/32, ports: [443]}")
+            .current_dir(folder.path())
+            .output()
+            .unwrap();
+        assert!(shell.status.success(), "{page}: {}", texts(&shell).1);
+        let file = folder.path().join("leaderboards.yaml");
+        assert_eq!(dry_run(&file).await.len(), 4, "{page}");
+        let text = std::fs::read_to_string(file).unwrap();
+        assert!(
+            text.contains("enforcement: Require") && !text.contains(": null"),
+            "{page}: {text}"
+        );
     }
-    std::fs::write(file, "all: {concurency: {total: 1}}").unwrap();
-    let refused = import(&[always.as_slice(), more.as_slice()].concat()).await;
-    let (out, err) = texts(&refused);
-    assert_eq!((refused.status.code(), out.as_str()), (Some(2), ""));
-    let why = "leaderboard-operator import: decisions.yaml: all.concurency is no field of a Leaderboard; there are ";
-    assert!(err.starts_with(why), "{err}");
 }

@@ -12,6 +12,7 @@ mod terminal;
 
 use serde_json::json;
 
+pub use self::terminal::plugin;
 use self::terminal::{Terminal, assert_has, condition, end, evalai, failed, finished, running, waiting};
 use super::objects::Kind;
 

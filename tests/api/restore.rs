@@ -2,6 +2,8 @@
 //! with other UIDs. A real API server, S3, DynamoDB and EvalAI know the rest.
 #![cfg(test)]
 
+mod newer;
+
 use std::collections::BTreeMap;
 use std::time::Duration;
 

@@ -1,6 +1,8 @@
 //! The original's entries in Secrets Manager, imported and applied: one submission of each Leaderboard runs to its score.
 
 use std::collections::BTreeMap;
+use std::path::Path;
+use std::process::{Output, Stdio};
 use std::time::Duration;
 
 use evalai_stand_in::model::Status;
@@ -10,6 +12,7 @@ use kube::core::{GroupVersionKind, TypeMeta};
 use leaderboard_api::{Leaderboard, State, Submission};
 use leaderboard_operator::services::aws::Aws;
 use serde_json::{Value, json};
+use tokio::io::AsyncWriteExt as _;
 use tokio::process::Command;
 
 use super::expected::{assert_finished, assert_row};
@@ -22,8 +25,8 @@ use crate::scene::{Scene, USER_AGENT, scenario, state};
 const ENTRIES: &str = "us-west-2";
 const LIMIT: Duration = Duration::from_mins(5);
 
-/// Stores the four entries, as the original has them.
-async fn store_entries(scene: &Scene, evalai: &Evalai) {
+/// Stores the four entries, as the original has them, and gives what `aws secretsmanager get-secret-value` prints of them.
+async fn store_entries(scene: &Scene, evalai: &Evalai) -> String {
     let secrets = Aws::load("tests")
         .await
         .secrets(Some(ENTRIES), Some(&scene.cloud.endpoint));
@@ -36,6 +39,7 @@ async fn store_entries(scene: &Scene, evalai: &Evalai) {
             "s3_bucket": BUCKET, "dynamodb_submissions_table": table,
         })
     };
+    let mut printed = Vec::new();
     for (name, entry) in [
         ("evalai", json!({"auth_token": HOST_TOKEN, "api_server": evalai.url})),
         (
@@ -55,7 +59,11 @@ async fn store_entries(scene: &Scene, evalai: &Evalai) {
             .send()
             .await
             .unwrap();
+        let stored = secrets.get_secret_value().secret_id(name).send().await.unwrap();
+        let answer = json!({"ARN": stored.arn, "Name": stored.name, "SecretString": stored.secret_string});
+        printed.push(format!("{answer:#}\n"));
     }
+    printed.concat()
 }
 
 /// What a host of this cluster decides: it has no GPUs and one small node, AWS and EvalAI are stand-ins, and nothing enforces policies.
@@ -65,56 +73,66 @@ fn decisions(scene: &Scene) -> Value {
         "limits": {"ephemeral-storage": "4Gi"},
     });
     let (region, endpoint) = (REGION, &scene.cloud.endpoint);
-    let track = |name: &str| json!({"tracks": [{"name": name, "nodeSelector": null, "tolerations": []}]});
     json!({
-        "all": {
-            "evalai": {"challenge": 1, "token": {"secretsManager": {"id": "evalai"}}},
-            "gpu": {"mode": "None", "resourceName": null},
-            "simulator": {"resources": resources, "securityContext": null, "display": "Offscreen"},
-            "agent": {"resources": resources, "images": [], "env": [{"name": "ROUTE_MS", "value": "100"}]},
-            "storage": {"region": region, "endpoint": endpoint, "prefix": scene.cloud.prefix},
-            "table": {"region": region, "endpoint": scene.gate.url},
-            "queue": {"region": region, "endpoint": scene.gate.url},
-            "podIdentity": {"secretName": "aws"},
-            "network": {"dns": "None", "enforcement": "Off"},
-            "concurrency": {"total": 2, "perTeam": 2},
-            "deadlines": {"runSeconds": 0},
-            "syncPeriodSeconds": 2,
+        "evalai": {"token": {"secretsManager": {"endpoint": endpoint}}},
+        "gpu": {"mode": "None", "resourceName": null},
+        "simulator": {"resources": resources, "securityContext": null, "display": "Offscreen"},
+        "agent": {"resources": resources, "images": [], "env": [{"name": "ROUTE_MS", "value": "100"}]},
+        "storage": {"region": region, "endpoint": endpoint, "prefix": scene.cloud.prefix},
+        "table": {"region": region, "endpoint": scene.gate.url},
+        "queue": {"region": region, "endpoint": scene.gate.url, "deadLetterURL": scene.cloud.dead_url},
+        "podIdentity": {"secretName": "aws", "serviceAccountName": null, "roleARN": null},
+        "network": {
+            "dns": "None", "enforcement": "Off", "egress": [{"cidr": format!("{}/32", scene.lab.host), "ports": [443]}],
         },
-        "leaderboard-10": track("map"),
-        "leaderboard-20": track("sensors"),
+        "concurrency": {"total": 2, "perTeam": 2},
+        "syncPeriodSeconds": 2,
     })
 }
 
-/// What the command prints, with the cluster's decisions in a file.
-async fn import(scene: &Scene) -> String {
-    let folder = tempfile::tempdir().unwrap();
-    let file = folder.path().join("decisions.yaml");
-    std::fs::write(&file, serde_saphyr::to_string(&decisions(scene)).unwrap()).unwrap();
-    let mut command = Command::new(env!("CARGO_BIN_EXE_leaderboard-operator"));
+/// The same as a file of kubectl's kustomize, over what the command has printed.
+fn kustomization(scene: &Scene) -> Value {
+    let spec = json!({
+        "apiVersion": "leaderboard.carla.org/v1alpha1", "kind": "Leaderboard", "metadata": {"name": "both"},
+        "spec": decisions(scene),
+    });
+    let nodes = json!([
+        {"op": "remove", "path": "/spec/tracks/0/nodeSelector"}, {"op": "remove", "path": "/spec/tracks/0/tolerations"},
+    ]);
+    let patches = [spec, nodes].map(|patch| json!({"target": {"kind": "Leaderboard"}, "patch": patch.to_string()}));
+    json!({"resources": ["challenge.yaml"], "patches": patches})
+}
+
+async fn ended(command: &mut Command, input: &str) -> Output {
     command
-        .args(["import", "--region", ENTRIES, "--endpoint", &scene.cloud.endpoint])
-        .args(["--queue", &scene.cloud.queue_url, "--queue-region", REGION])
-        .args(["--dead-letter", &scene.cloud.dead_url, "--namespace", &scene.namespace])
-        .args(["--egress", &format!("{}/32", scene.lab.host)])
-        .arg("--decisions")
-        .arg(&file);
-    let output = command.output().await.unwrap();
-    let (out, err) = (
-        String::from_utf8(output.stdout).unwrap(),
-        String::from_utf8(output.stderr).unwrap(),
-    );
-    assert!(output.status.success(), "{err}");
-    assert!(!out.contains(HOST_TOKEN) && !err.contains(HOST_TOKEN));
-    assert!(!err.contains("to decide:"), "the file leaves no question: {err}");
-    // The lab's stand-in has neither of the two services, which must not keep anybody from the manifests.
-    for unread in [
-        "EventBridge Pipes could not be listed",
-        "Lambda's event source mappings could not be listed",
-    ] {
-        assert!(err.contains(unread), "{err}");
-    }
-    out
+        .stdin(Stdio::piped())
+        .stdout(Stdio::piped())
+        .stderr(Stdio::piped());
+    let mut child = command.spawn().unwrap();
+    child.stdin.take().unwrap().write_all(input.as_bytes()).await.unwrap();
+    let output = child.wait_with_output().await.unwrap();
+    assert!(output.status.success(), "{}", String::from_utf8_lossy(&output.stderr));
+    output
+}
+
+/// What the command prints of the entries, with the cluster's decisions laid over it.
+async fn import(scene: &Scene, entries: &str) -> String {
+    let program = Path::new(env!("CARGO_BIN_EXE_leaderboard-operator")).with_file_name("kubectl-leaderboard");
+    let mut command = Command::new(program);
+    command
+        .env_clear()
+        .args(["import", "-", "--challenge", "1", "--queue", &scene.cloud.queue_url])
+        .args(["--namespace", &scene.namespace]);
+    let output = ended(&mut command, entries).await;
+    let all = [&output.stdout[..], &output.stderr].concat();
+    assert!(!String::from_utf8(all).unwrap().contains(HOST_TOKEN));
+    let folder = tempfile::tempdir().unwrap();
+    std::fs::write(folder.path().join("challenge.yaml"), output.stdout).unwrap();
+    let file = folder.path().join("kustomization.yaml");
+    std::fs::write(file, kustomization(scene).to_string()).unwrap();
+    let mut kubectl = Command::new("kubectl");
+    let laid_over = ended(kubectl.arg("kustomize").arg(folder.path()), "").await;
+    String::from_utf8(laid_over.stdout).unwrap()
 }
 
 /// Applies what was printed, object by object, as `kubectl apply --server-side` does.
@@ -141,8 +159,8 @@ async fn apply(scene: &Scene, manifests: &str) {
 async fn what_import_prints_runs_a_submission_of_each_leaderboard() {
     scenario("import", async |scene: &Scene| {
         let evalai = Evalai::start(scene).await;
-        Box::pin(store_entries(scene, &evalai)).await;
-        let manifests = import(scene).await;
+        let entries = Box::pin(store_entries(scene, &evalai)).await;
+        let manifests = import(scene, &entries).await;
         apply(scene, &manifests).await;
         let (_controller, _bridge) = (controller(scene), bridge(scene));
         for name in ["leaderboard-10", "leaderboard-20"] {

@@ -1,17 +1,11 @@
-//! Submissions that were made from the rows of a table, after their end.
-//!
-//! Kubernetes takes no status with a new object. Until it has one the annotation [`names::ANNOTATION_IMPORTED`] keeps the controller
-//! away, which would otherwise run it. Pure.
+//! Submissions whose object lost its status after their end. Pure.
 
 use k8s_openapi::apimachinery::pkg::apis::meta::v1::Time;
 
 use crate::conditions::{self, FINISHED, PUBLISHED, RECORDED, Truth};
-use crate::{
-    Failure, FailureClass, Progress, Score, Submission, SubmissionSpec, SubmissionStatus, TeamStatus, Times, names,
-    reasons,
-};
+use crate::{Failure, FailureClass, Progress, Score, SubmissionSpec, SubmissionStatus, TeamStatus, Times, reasons};
 
-/// How a submission ended before it was imported.
+/// How a submission ended before its status was lost.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 pub enum ImportedState {
     Finished,
@@ -19,7 +13,7 @@ pub enum ImportedState {
     Cancelled,
 }
 
-/// What a row shows of a submission that has ended.
+/// What the other systems show of a submission that has ended.
 #[derive(Clone, Debug, PartialEq)]
 pub struct ImportedEnd {
     /// How it ended.
@@ -38,22 +32,7 @@ pub struct ImportedEnd {
     pub table: String,
 }
 
-impl Submission {
-    /// Whether it is being imported: its status, which shows its end, is still to come.
-    pub fn awaits_import(&self) -> bool {
-        let annotations = self.metadata.annotations.as_ref();
-        let is_imported = annotations.is_some_and(|all| all.contains_key(names::ANNOTATION_IMPORTED));
-        is_imported && self.status.as_ref().is_none_or(|status| status.attempt.is_none())
-    }
-}
-
 impl SubmissionStatus {
-    /// The status of a submission that ended before it was imported. Every system has its end, so nothing is written anywhere.
-    pub fn of_imported(spec: &SubmissionSpec, end: ImportedEnd, generation: i64, now: &Time) -> Self {
-        let what = format!("Imported from the table {}, where it has ended.", end.table);
-        Self::of_ended(spec, end, &what, generation, now)
-    }
-
     /// The status of a submission whose end every system has, for a cause that `what` names.
     pub fn of_ended(spec: &SubmissionSpec, end: ImportedEnd, what: &str, generation: i64, now: &Time) -> Self {
         let (reason, failure) = match end.state {
@@ -133,36 +112,19 @@ mod tests {
     }
 
     #[test]
-    fn the_state_of_an_imported_submission_is_that_of_its_row() {
+    fn the_state_is_that_of_the_end() {
         let now = Time(Timestamp::UNIX_EPOCH);
         for (state, shown) in [
             (ImportedState::Finished, State::Finished),
             (ImportedState::Failed, State::Failed),
             (ImportedState::Cancelled, State::Cancelled),
         ] {
-            let status = SubmissionStatus::of_imported(&spec(), end(state), 1, &now);
+            let status = SubmissionStatus::of_ended(&spec(), end(state), "It had ended.", 1, &now);
             assert_eq!((status.state, status.attempt), (Some(shown), Some(Attempt(2))));
             assert_eq!(status.state_of_conditions(), shown);
             assert_eq!(status.failure.is_some(), shown == State::Failed);
             let is_theirs = |failure: Box<Failure>| failure.class == FailureClass::Participant;
             assert!(!status.failure.is_some_and(is_theirs));
         }
-    }
-
-    #[test]
-    fn only_an_imported_object_without_its_status_is_left_alone() {
-        let mut submission = Submission::new("submission-77", spec());
-        assert!(!submission.awaits_import(), "a person made it");
-        let table = ("leaderboard.carla.org/imported".to_owned(), "t".to_owned());
-        submission.metadata.annotations = Some([table].into());
-        assert!(submission.awaits_import());
-        let now = Time(Timestamp::UNIX_EPOCH);
-        submission.status = Some(SubmissionStatus::of_imported(
-            &submission.spec,
-            end(ImportedState::Failed),
-            1,
-            &now,
-        ));
-        assert!(!submission.awaits_import(), "from now on it is resumed as any other");
     }
 }

@@ -21,8 +21,6 @@ pub const OPERATOR: &str = "leaderboard-operator";
 
 /// Annotation on a Submission: which message made or bumped it; see [`super::Ingested`].
 pub const ANNOTATION_INGESTED: &str = "leaderboard.carla.org/ingested";
-/// Annotation on a Submission: the table that it was imported from. Without a status it is left alone.
-pub const ANNOTATION_IMPORTED: &str = "leaderboard.carla.org/imported";
 /// Annotation on a Submission, `true`: a person hands it over that another program has begun, or that was restored; it takes up what is
 /// stored.
 pub const ANNOTATION_ADOPT: &str = "leaderboard.carla.org/adopt";

@@ -44,7 +44,7 @@ pub struct Target {
     context: Option<String>,
     /// Namespace [default: the context's].
     #[arg(short, long, global = true)]
-    namespace: Option<String>,
+    pub namespace: Option<String>,
 }
 
 /// Which submissions of which namespaces.

@@ -52,6 +52,8 @@ pub fn offer(command: &Command, words: &[String]) -> Offer {
             fitting(verbs.map(|verb| verb.get_name().to_owned()), last)
         }
         Some(verb) if verb.get_positionals().next().is_none() => Offer::Words(Vec::new()),
+        // These name files.
+        Some(verb) if ["import", "man"].contains(&verb.get_name()) => Offer::Words(Vec::new()),
         Some(verb) if verb.get_name() == "check" => Offer::Leaderboards,
         Some(_) => Offer::Submissions,
     }
@@ -129,6 +131,7 @@ mod tests {
             (&["check", ""], Offer::Leaderboards),
             (&["submit", "--leaderboard", ""], Offer::Leaderboards),
             (&["top", ""], words(&[])),
+            (&["import", ""], words(&[])),
         ] {
             let line: Vec<String> = line.iter().map(|word| (*word).to_owned()).collect();
             assert_eq!(offer(&crate::Cli::command(), &line), expected, "{line:?}");

@@ -1,8 +1,8 @@
 //! `kubectl leaderboard`: explains why a submission waits, runs or failed, and cancels or resumes it.
 //!
 //! `why`, `status`, `overview`, `top`, `change`, `resume` and `transitions` are pure and hold what is printed and decided; `cluster` talks to
-//! the API server; `commands` and `changes` bring both together. It shows what the status holds, and contacts neither EvalAI nor AWS;
-//! where that helps, it starts the person's own `aws` program.
+//! the API server; `commands` and `changes` bring both together. `import` makes text of text. The plugin shows what the status holds, and
+//! contacts neither EvalAI nor AWS; where that helps, it starts the person's own `aws` program.
 
 mod board;
 mod bucket;
@@ -18,6 +18,7 @@ mod dashboard;
 mod error;
 mod facts;
 mod foreign;
+mod import;
 mod lines;
 mod logs;
 mod manual;
@@ -110,6 +111,13 @@ enum Command {
     Resume(resume::Resume),
     /// Write what a person who helps needs into one archive, without secrets, routes and names of teams.
     Report(report::Report),
+    /// Print manifests for a pipeline of Step Functions that this operator takes over. It asks neither AWS nor a cluster.
+    #[command(
+        override_usage = "kubectl leaderboard import [OPTIONS] --challenge <ID> --queue <URL>\n       <FILE>...",
+        after_help = "Without --namespace the objects are in `leaderboard`.\n\nExit code 0: the manifests are printed. 1: an entry or a file is \
+                      refused, and nothing is printed. docs/import.md explains them."
+    )]
+    Import(import::Import),
     /// Print the program with which kubectl completes these commands in a shell.
     #[command(
         after_help = "Example: kubectl leaderboard completion > ~/bin/kubectl_complete-leaderboard; chmod +x ~/bin/kubectl_complete-leaderboard"
@@ -200,6 +208,7 @@ async fn carry_out(cli: Cli) -> Result<ExitCode, Error> {
             Ok(ExitCode::SUCCESS)
         }
         Command::Man(wanted) => manual::write(Cli::command(), &wanted),
+        Command::Import(wanted) => import::import(&wanted, cli.target.namespace),
         command => {
             let cluster = Cluster::connect(cli.target).await?;
             let done = carry_out_there(command, &cluster).await;
@@ -211,7 +220,7 @@ async fn carry_out(cli: Cli) -> Result<ExitCode, Error> {
 /// Carries out what needs a cluster.
 async fn carry_out_there(command: Command, cluster: &Cluster) -> Result<ExitCode, Error> {
     match command {
-        Command::Completion | Command::Complete { .. } | Command::Man(_) => Ok(ExitCode::SUCCESS),
+        Command::Completion | Command::Complete { .. } | Command::Man(_) | Command::Import(_) => Ok(ExitCode::SUCCESS),
         Command::Why(Show {
             name: Some(name),
             output,

@@ -9,7 +9,7 @@
 
 use std::process::{Command, Output};
 
-const COMMANDS: [&str; 11] = [
+const COMMANDS: [&str; 12] = [
     "why",
     "status",
     "top",
@@ -19,6 +19,7 @@ const COMMANDS: [&str; 11] = [
     "cancel",
     "resume",
     "report",
+    "import",
     "completion",
     "man",
 ];

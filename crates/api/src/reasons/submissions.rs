@@ -256,8 +256,8 @@ reasons! {
              days): Kubernetes removed it before its end was read. There is no further Job.",
             "Look at the stored results and logs, then resume the submission.";
         IMPORTED_FAILURE = "ImportedFailure",
-            "The Submission had failed before it was imported (`leaderboard-operator import --from-table`) or restored from a backup \
-             without its status. Neither the row nor the bucket holds why.",
+            "The Submission had failed before it was restored from a backup without its status. Neither the row nor the bucket \
+             holds why.",
             "Look at the results and logs that are stored for it. To run it again, resume it in EvalAI, or raise `spec.attempt`.";
         JOB_FAILED = "JobFailed",
             "Kubernetes ended the Job for a reason that no container explains.",

@@ -5,7 +5,7 @@ mod check;
 mod daily;
 mod docs;
 mod documents;
-mod golden;
+pub(crate) mod golden;
 mod help;
 mod messages;
 mod overview;

@@ -55,11 +55,6 @@ pub use reading::awaits_publication;
 /// Decides one reconcile.
 pub fn decide(view: &View) -> Plan {
     let mut draft = PlanBuilder::new(view);
-    if view.submission.awaits_import() {
-        // Its status shows an end, and comes with the next write.
-        draft.keeps_status();
-        return draft.into_plan(None);
-    }
     if draft.begin_attempt() {
         // What was observed is of another attempt.
         after::leave_job(&mut draft);

@@ -14,7 +14,6 @@ mod failure;
 mod finalizer;
 mod foreign;
 mod image;
-mod imported;
 mod interruption;
 mod isolation;
 mod line;
