@@ -251,8 +251,11 @@ async fn complete(words: &[String]) {
     let last = words.last().map(String::as_str).unwrap_or_default();
     // The flags that name the cluster may be among the words; the last one may be half of anything.
     let before = words.split_last().map_or(&[][..], |(_, before)| before);
-    let target = Cli::try_parse_from(std::iter::once("kubectl-leaderboard").chain(before.iter().map(String::as_str)));
-    let target = target.map(|cli| cli.target).unwrap_or_default();
+    let before = std::iter::once("kubectl-leaderboard").chain(before.iter().map(String::as_str));
+    // What the command requires may not be there yet.
+    let matches = Cli::command().ignore_errors(true).try_get_matches_from(before);
+    let target = matches.ok().and_then(|matches| Target::from_arg_matches(&matches).ok());
+    let target = target.unwrap_or_default();
     let names = match offered {
         Offer::Words(words) => words,
         of_cluster => {

@@ -171,6 +171,7 @@ async fn a_shell_gets_names_from_the_cluster() {
     };
     let here = &terminal.namespace;
     assert_eq!(complete(&["why", "-n", here, "sub"]).await, "submission-7\n:4\n");
+    assert_eq!(complete(&["cancel", "-n", here, ""]).await, "submission-7\n:4\n");
     assert_eq!(complete(&["check", "-n", here, ""]).await, "local\n:4\n");
     assert_eq!(complete(&["re"]).await, "report\nresume\n:4\n");
 }
