@@ -76,7 +76,7 @@ def prepare(repository: Path, kube: Kube) -> None:
     given = json.dumps({"apiVersion": "v1", "kind": "List", "items": items})
     kube.run("kubectl", "apply", "--server-side", "--validate=strict", "--filename=-", given=given)
     for namespace in FURNISHED:
-        for names, types in ((SUBMISSIONS, ("Finished",)), (LEADERBOARDS, ("Ready", "Checked"))):
+        for names, types in ((SUBMISSIONS, ("Finished",)), (LEADERBOARDS, ("Ready",))):
             kind = "submissions" if names == SUBMISSIONS else "leaderboards"
             patch = f"--patch={json.dumps({'status': {'conditions': [condition(name) for name in types]}})}"
             argv = ["patch", kind, *names, f"--namespace={namespace}", "--subresource=status", "--type=merge", patch]

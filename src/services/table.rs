@@ -80,8 +80,6 @@ pub struct Row {
     pub gpu_seconds: String,
     /// Name of the Submission that a host made of it by a re-run in EvalAI.
     pub rerun_as: String,
-    /// Nothing is written: DynamoDB is only asked whether it would take a row.
-    pub is_trial: bool,
     /// Metric columns and their values; none removes the column: only a finished submission has metrics.
     pub metrics: Vec<(String, Option<String>)>,
 }
@@ -227,9 +225,6 @@ impl Table {
 
     /// Writes a row, unless the table holds a later one. Safe twice.
     pub async fn write(&self, row: &Row) -> Result<Written, TableError> {
-        if row.is_trial {
-            return self.try_write(row).await;
-        }
         let columns = self.columns(row);
         let request = set_columns(self.request(row)?, row, &columns).send();
         match self.meter.aws("dynamodb", "UpdateItem", request).await {

@@ -163,7 +163,6 @@ async fn leaderboards_fill_their_columns() {
         "conditions": [
             condition("Terminating", "InUse"),
             condition("Ready", "TokenRefused"),
-            condition("Checked", "CheckOutdated"),
         ],
     });
     let patch = Patch::Merge(json!({ "status": status }));
@@ -178,14 +177,6 @@ async fn leaderboards_fill_their_columns() {
 NAME       READY    REASON         PAUSED   PENDING   RUNNING   FINISHED   FAILED   CANCELLED   AGE
 carla-20   False    TokenRefused   false    3         2         40         1        0           <age>
 new        <none>   <none>         false    <none>    <none>    <none>     <none>   <none>      <age>
-"
-    );
-    assert_eq!(
-        table(&client, Kind::Leaderboard, &namespace, true).await,
-        "\
-NAME       READY    REASON         PAUSED   PENDING   RUNNING   FINISHED   FAILED   CANCELLED   CHECKED         AGE
-carla-20   False    TokenRefused   false    3         2         40         1        0           CheckOutdated   <age>
-new        <none>   <none>         false    <none>    <none>    <none>     <none>   <none>      <none>          <age>
 "
     );
 }

@@ -90,32 +90,28 @@ fn row(attempt: i64, status: &str) -> Row {
     }
 }
 
-/// A check asks so whether the table would take a row.
 #[tokio::test]
 async fn a_trial_is_answered_and_writes_nothing() {
     let stand_in = StandIn::start().await;
-    let trial = Row {
-        is_trial: true,
+    let (spec, table) = usual(&stand_in).await;
+    assert_eq!(table.try_write().await, Ok(()));
+    assert_eq!(rows(&stand_in, &spec.name).await.len(), 0);
+    let same_keys = Row {
+        team_id: "0".into(),
+        run_id: "0".into(),
         ..row(1, "FINISHED")
     };
-    let (spec, table) = usual(&stand_in).await;
-    assert_eq!(table.write(&trial).await, Ok(Written::Stored));
-    assert_eq!(rows(&stand_in, &spec.name).await.len(), 0);
-    assert_eq!(table.write(&row(1, "FINISHED")).await, Ok(Written::Stored));
+    assert_eq!(table.write(&same_keys).await, Ok(Written::Stored));
     let before = rows(&stand_in, &spec.name).await;
-    assert_eq!(table.write(&trial).await, Ok(Written::Stored));
-    assert_eq!(
-        rows(&stand_in, &spec.name).await,
-        before,
-        "a row of these keys is left as it is"
-    );
+    assert_eq!(table.try_write().await, Ok(()));
+    assert_eq!(rows(&stand_in, &spec.name).await, before, "no row is changed");
     client(&stand_in)
         .delete_table()
         .table_name(&spec.name)
         .send()
         .await
         .unwrap();
-    let refused = table.write(&trial).await.unwrap_err();
+    let refused = table.try_write().await.unwrap_err();
     assert!(refused.to_string().contains("does not exist"), "{refused}");
 }
 

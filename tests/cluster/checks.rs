@@ -4,7 +4,7 @@ use std::path::Path;
 use std::process::Stdio;
 use std::time::Duration;
 
-use leaderboard_api::{Leaderboard, Submission, conditions};
+use leaderboard_api::{Leaderboard, Submission};
 use leaderboard_operator::services::aws::Aws;
 use serde_json::{Value, json};
 use tokio::process::Command;
@@ -13,7 +13,7 @@ use tokio::time::timeout;
 use crate::operator::controller;
 use crate::scene::{Scene, scenario};
 
-/// A check pulls, prepares, drives one route and stores it; a broken one is given up after a minute of the same fault.
+/// A check pulls, prepares, drives one route and stores it; a broken one ends by its deadline, or is given up.
 const LIMIT: Duration = Duration::from_mins(8);
 
 /// What the default command does, and a line.
@@ -34,10 +34,10 @@ pub(super) async fn plugin(scene: &Scene, words: &[&str]) -> (Option<i32>, Strin
     )
 }
 
-/// Runs a check of this Leaderboard.
-async fn check(scene: &Scene, board: &str, agent: &str) -> (Option<i32>, String) {
+/// Runs a check of this Leaderboard for so many seconds at most.
+async fn check(scene: &Scene, board: &str, agent: &str, seconds: &str) -> (Option<i32>, String) {
     let image = scene.lab.challenge(agent);
-    plugin(scene, &["check", board, "--timeout", "400", "--image", &image]).await
+    plugin(scene, &["check", board, "--timeout", seconds, "--image", &image]).await
 }
 
 /// The streams of a log group, without the run before the slash.
@@ -56,7 +56,7 @@ fn has(text: &str, expected: &[&str]) {
 }
 
 #[tokio::test]
-async fn a_good_leaderboard_passes_while_it_is_paused_and_notes_that() {
+async fn a_good_leaderboard_passes_while_it_is_paused() {
     scenario("check-good", async |scene: &Scene| {
         let table = json!({"name": scene.cloud.table, "region": crate::aws::REGION, "endpoint": scene.gate.url});
         let (region, endpoint) = (crate::aws::REGION, scene.cloud.endpoint.as_str());
@@ -69,25 +69,16 @@ async fn a_good_leaderboard_passes_while_it_is_paused_and_notes_that() {
         scene.leaderboard("lb", change).await;
         let _controller = controller(scene);
         scene.ready("lb").await;
-        let (code, text) = check(scene, "lb", "agent:standard").await;
+        let (code, text) = check(scene, "lb", "agent:standard", "400").await;
         assert_eq!(code, Some(0), "{text}");
-        assert!(!text.contains('✘'), "{text}");
         has(
             &text,
             &[
-                "Leaderboard    Ready",
-                "✔ Slot           granted",
-                "✔ Node           leaderboard-local",
-                "✔ Images         pulled",
-                "✔ Contents       copied",
-                "✔ Simulator      started",
-                "✔ Agent          ran",
-                "✔ Bucket         has the results",
-                "✔ Route          1/1 done",
-                "✔ Table          would take a row; a check writes none",
-                "✔ CloudWatch     takes the lines",
-                "✔ Log collectors no DaemonSet collects the lines of containers",
-                "The check passed",
+                "is Finished since",
+                "1/1 done",
+                "S3:          Stored",
+                "Ready:       True, Ready",
+                "The check passed.",
             ],
         );
         let names = streams(&logs, group).await;
@@ -95,26 +86,17 @@ async fn a_good_leaderboard_passes_while_it_is_paused_and_notes_that() {
             assert!(names.contains(&container.to_owned()), "{container}: {names:?}");
         }
         assert_eq!(scene.all::<Submission>().await.len(), 0, "it is deleted");
-        assert_eq!(
-            scene.cloud.rows(&scene.cloud.table).await.len(),
-            0,
-            "the table has no row"
-        );
+        let rows = scene.cloud.rows(&scene.cloud.table).await;
+        assert_eq!(rows.len(), 0, "the table has no row");
         let board = scene.api::<Leaderboard>().get("lb").await.unwrap();
-        let status = board.status.unwrap();
-        assert!(
-            conditions::is_true(&status.conditions, conditions::CHECKED),
-            "{:?}",
-            status.conditions
-        );
-        let counts = status.counts.unwrap_or_default();
+        let counts = board.status.unwrap().counts.unwrap_or_default();
         assert_eq!(counts.finished, 0, "a check is in no count");
         println!("{text}");
     })
     .await;
 }
 
-/// A name, what of the Leaderboard is broken, the agent of its check, and what the check reports.
+/// A name, what of the Leaderboard is broken, the agent of its check, and what the check shows.
 fn broken_parts(missing: &str) -> [(&'static str, Value, &'static str, &'static [&'static str]); 4] {
     let root = json!([{"name": "LEADERBOARD_ROOT", "value": "/nothing"}]);
     [
@@ -122,64 +104,48 @@ fn broken_parts(missing: &str) -> [(&'static str, Value, &'static str, &'static 
             "image",
             json!({"simulator": {"image": missing}}),
             "agent:standard",
-            &[
-                "✘ Images         ImagePull: The image of simulator-1 cannot be pulled",
-                "→ Fix what this names, then run the check again.",
-            ],
+            &["ImagePull: ", "The image of simulator-1 cannot be pulled"],
         ),
         (
             "bucket",
             json!({"storage": {"bucket": "leaderboard-tests-none"}}),
             "agent:standard",
-            &[
-                "✘ Bucket         ",
-                "– Leaderboard    not Ready: see Bucket",
-                "– Route          not reached",
-            ],
+            &["Ready:       False, BucketUnreachable:"],
         ),
         (
             "contents",
             json!({"contents": {"env": root}}),
             "agent:standard",
-            &[
-                "✘ Contents       ",
-                "✔ Node           leaderboard-local",
-                "– Agent          not reached",
-            ],
+            &["StartDeadline: ", "ontents"],
         ),
         (
             "agent",
             json!({}),
             "agent:print-routes",
-            &[
-                "✘ Agent          AgentCrashed",
-                "✔ Simulator      started",
-                "→ Correct the image of the check, or name another one with --image.",
-            ],
+            &["AgentCrashed: ", "agent1/leaderboard.log"],
         ),
     ]
 }
 
-/// What is broken, the part that the check marks, and the step that it names.
+/// What is broken, and what the check shows of it. What keeps a Pod from starting has a short time here.
 #[tokio::test]
-async fn each_broken_part_is_marked_with_its_next_step() {
+async fn each_broken_part_is_named() {
     scenario("check-broken", async |scene: &Scene| {
         let _controller = controller(scene);
         let missing = scene.lab.challenge("simulator:does-not-exist");
         let cases = broken_parts(&missing);
-        let runs = cases.into_iter().map(async |(name, change, agent, expected)| {
+        let runs = cases.into_iter().map(async |(name, mut change, agent, expected)| {
+            change["deadlines"] = json!({"startSeconds": 120});
             scene.leaderboard(name, change).await;
-            let (code, text) = check(scene, name, agent).await;
+            // An end waits for the bucket, which a person has to make.
+            let seconds = if name == "bucket" { "90" } else { "400" };
+            let (code, text) = check(scene, name, agent, seconds).await;
             assert_eq!(code, Some(1), "{name}: {text}");
             has(&text, expected);
             println!("{name}:\n{text}");
         });
         futures::future::join_all(runs).await;
         assert_eq!(scene.all::<Submission>().await.len(), 0, "all are deleted");
-        let board = scene.api::<Leaderboard>().get("image").await.unwrap();
-        let status = board.status.unwrap();
-        assert!(!conditions::is_true(&status.conditions, conditions::CHECKED));
-        assert_eq!(status.last_check.unwrap().reason, "ImagePull");
     })
     .await;
 }

@@ -25,7 +25,7 @@ pub const COMPARED: &str = "Compared";
 pub const STALLED: &str = "Stalled";
 /// The scores follow from the infractions; only there once they did not.
 pub const PLAUSIBLE: &str = "Plausible";
-/// CloudWatch takes the lines of the run; only there for a check, and once it did not.
+/// CloudWatch takes the lines of the run; only there once it did not.
 pub const LOGGED: &str = "Logged";
 /// The submission has come to its end: True in Finished, Failed and Cancelled.
 pub const FINISHED: &str = "Finished";
@@ -33,8 +33,6 @@ pub const FINISHED: &str = "Finished";
 pub const READY: &str = "Ready";
 /// The Pods of a Leaderboard reach nothing that its policy forbids: measured, not assumed.
 pub const ISOLATED: &str = "Isolated";
-/// The last check of a Leaderboard passed, and its spec has not changed since.
-pub const CHECKED: &str = "Checked";
 /// A Leaderboard that is being deleted waits for its submissions.
 pub const TERMINATING: &str = "Terminating";
 

@@ -10,12 +10,11 @@ use kube::KubeSchema;
 use kube::ResourceExt;
 use serde::{Deserialize, Serialize};
 
-use super::check::{CheckImage, LastCheck};
 use super::conditions::{self, Condition};
 use super::evalai_mode::EvalaiMode;
 use super::leaderboard_parts::{
-    AgentContainer, Concurrency, ContentsContainer, Deadlines, Evalai, Gpu, LogGroup, Network, PodIdentity, Queue,
-    Retries, SimulatorContainer, Storage, Table, Track,
+    AgentContainer, CheckImage, Concurrency, ContentsContainer, Deadlines, Evalai, Gpu, LogGroup, Network, PodIdentity,
+    Queue, Retries, SimulatorContainer, Storage, Table, Track,
 };
 use super::leaderboard_parts::{LeaderboardVersion, Verify};
 use super::retention::Retention;
@@ -44,7 +43,6 @@ use super::submission_use::{MAX_USING_TEAMS, TeamUse};
     printcolumn = r#"{"name":"Finished","type":"integer","jsonPath":".status.counts.finished"}"#,
     printcolumn = r#"{"name":"Failed","type":"integer","jsonPath":".status.counts.failed"}"#,
     printcolumn = r#"{"name":"Cancelled","type":"integer","jsonPath":".status.counts.cancelled"}"#,
-    printcolumn = r#"{"name":"Checked","type":"string","priority":1,"jsonPath":".status.conditions[?(@.type==\"Checked\")].reason"}"#,
     printcolumn = r#"{"name":"Age","type":"date","jsonPath":".metadata.creationTimestamp"}"#
 )]
 #[serde(rename_all = "camelCase")]
@@ -237,10 +235,7 @@ pub struct LeaderboardStatus {
     #[x_kube(merge_strategy = ListMerge::Map(vec!["name".into()]))]
     #[schemars(length(max = 32))]
     pub tracks: Vec<TrackStatus>,
-    /// The check that ended last.
-    #[serde(default, skip_serializing_if = "Option::is_none")]
-    pub last_check: Option<LastCheck>,
-    /// `Ready`, `Isolated`, `Checked`, `Terminating`.
+    /// `Ready`, `Isolated`, `Terminating`.
     #[serde(default, skip_serializing_if = "Vec::is_empty")]
     #[schemars(schema_with = "super::conditions::schema")]
     pub conditions: Vec<Condition>,

@@ -197,6 +197,14 @@ pub struct SimulatorContainer {
     pub graphics_adapter: Option<i32>,
 }
 
+/// What `kubectl leaderboard check` runs.
+#[derive(Serialize, Deserialize, JsonSchema, Clone, Debug, PartialEq, Eq)]
+pub struct CheckImage {
+    /// The image of an agent of the host's own, which drives one route. `agent.images` need not allow it.
+    #[schemars(length(min = 1, max = 512), regex(pattern = r"^[a-z0-9][!-~]*$"))]
+    pub image: String,
+}
+
 /// How the submitted image is run in each pair.
 #[derive(Serialize, Deserialize, KubeSchema, Clone, Debug, PartialEq)]
 #[serde(rename_all = "camelCase")]

@@ -4,7 +4,6 @@
 
 mod attempt;
 pub mod byte_quantity;
-pub mod check;
 #[cfg(feature = "client-errors")]
 pub mod client_errors;
 pub mod conditions;
@@ -43,7 +42,6 @@ pub mod text;
 mod waiting;
 
 pub use attempt::Attempt;
-pub use check::{CheckEnd, CheckImage, CheckResult, LastCheck};
 pub use conditions::Condition;
 pub use evalai_mode::EvalaiMode;
 pub use evalai_queue::EvalaiQueue;

@@ -31,8 +31,6 @@ pub enum Class {
     Leaderboard,
     /// The condition `Isolated` of a Leaderboard.
     Isolation,
-    /// The condition `Checked` of a Leaderboard.
-    Check,
 }
 
 /// One reason.

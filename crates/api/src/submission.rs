@@ -53,7 +53,7 @@ use super::team::Team;
     validation = Rule::new("has(self.evalai) == has(oldSelf.evalai) && (!has(self.evalai) || self.evalai == oldSelf.evalai)").message("evalai is immutable; apply a new Submission"),
     validation = Rule::new("has(self.track) == has(oldSelf.track) && (!has(self.track) || self.track == oldSelf.track)").message("track is immutable; apply a new Submission"),
     validation = Rule::new("(has(self.check) && self.check) == (has(oldSelf.check) && oldSelf.check)").message("check is immutable; run another check"),
-    validation = Rule::new("!has(self.check) || !self.check || !has(self.evalai)").message("a check has no evalai: nothing of it is published"),
+    validation = Rule::new("!has(self.check) || !self.check || !(has(self.evalai) || has(self.team))").message("a check has neither evalai nor team: it is published and recorded nowhere"),
     validation = Rule::new("has(self.evalai) != has(self.track)").message("a Submission has either evalai (its phase names the track) or a track, not both and not neither"),
     validation = Rule::new("has(self.evalai) || has(self.image)").message("a Submission without evalai needs an image"),
     validation = Rule::new("self.attempt >= oldSelf.attempt").message("attempt may only grow"),

@@ -104,9 +104,6 @@ pub struct SubmissionStatus {
     /// What is run, pinned at acceptance.
     #[serde(default, skip_serializing_if = "Option::is_none")]
     pub plan: Option<RunPlan>,
-    /// Of a check: generation of the Leaderboard that it runs with.
-    #[serde(default, skip_serializing_if = "Option::is_none")]
-    pub checked_generation: Option<i64>,
     /// What the participant's image was when its registry was asked; absent where none was, or none answered.
     #[serde(default, skip_serializing_if = "Option::is_none")]
     pub image: Option<PinnedImage>,

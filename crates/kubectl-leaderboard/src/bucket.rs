@@ -7,11 +7,6 @@ pub fn print(object: &str, storage: Option<&Storage>) -> String {
     format!("aws s3 cp {} -{}", word(object), flags(storage))
 }
 
-/// Removes all objects below a prefix.
-pub fn remove(prefix: &str, storage: Option<&Storage>) -> String {
-    format!("aws s3 rm --recursive {}{}", word(prefix), flags(storage))
-}
-
 /// A word of a command that people copy: an imported address is a text of a table's row, and no shell may run any part of it.
 fn word(text: &str) -> String {
     let is_plain = |c: char| c.is_ascii_alphanumeric() || "/._:-=@+,".contains(c);
@@ -41,7 +36,6 @@ mod tests {
         let hostile = "s3://b/$(reboot)';reboot;#";
         let quoted = r"'s3://b/$(reboot)'\'';reboot;#'";
         assert_eq!(print(hostile, None), format!("aws s3 cp {quoted} -"));
-        assert_eq!(remove(hostile, None), format!("aws s3 rm --recursive {quoted}"));
     }
 
     #[test]

@@ -116,7 +116,7 @@ pub async fn submit(cluster: &Cluster, wanted: &submit::Submit) -> Result<ExitCo
     if matches!(leaderboard, Fetched::Missing) {
         return Err(cluster.unknown_leaderboard(&wanted.leaderboard).await?);
     }
-    submit::fits(wanted, leaderboard.observed()).map_err(Error::Unfit)?;
+    submit::fits(&wanted.leaderboard, &wanted.track, leaderboard.observed()).map_err(Error::Unfit)?;
     let created = cluster.create(&submit::object(wanted)).await?;
     let name = created.name_any();
     print(&submit::lines(&created, leaderboard.observed(), frame()));

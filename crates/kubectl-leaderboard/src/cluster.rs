@@ -9,7 +9,6 @@ use std::time::Duration;
 
 use clap::Args;
 use futures::{Stream, StreamExt, TryFutureExt, TryStreamExt};
-use k8s_openapi::api::apps::v1::DaemonSet;
 use k8s_openapi::api::core::v1::Pod;
 use k8s_openapi::api::events::v1::Event;
 use kube::api::{DeleteParams, ListParams, LogParams, PartialObjectMeta, Patch, PatchParams, PostParams};
@@ -132,23 +131,6 @@ impl Cluster {
         list(self, &self.api::<Event>(), None).await
     }
 
-    /// All `DaemonSets` of the cluster.
-    pub async fn daemon_sets(&self) -> Result<Vec<DaemonSet>, Error> {
-        list(self, &Api::all(self.client.clone()), None).await
-    }
-
-    /// The uids of what owns the Pods of a namespace that are on a node.
-    pub async fn owners_on_node(&self, namespace: &str, node: &str) -> Result<Vec<String>, Error> {
-        let api: Api<Pod> = Api::namespaced(self.client.clone(), namespace);
-        let params = ListParams::default().fields(&format!("spec.nodeName={node}"));
-        let pods = self.in_time(api.list_metadata(&params)).await??;
-        let owners = pods
-            .items
-            .into_iter()
-            .flat_map(|pod| pod.metadata.owner_references.unwrap_or_default());
-        Ok(owners.map(|owner| owner.uid).collect())
-    }
-
     /// The newest Pod of a submission.
     pub async fn pod(&self, submission: &str) -> Result<Option<Pod>, Error> {
         let selector = format!("{LABEL_SUBMISSION}={submission}");
@@ -238,20 +220,6 @@ impl Cluster {
             Err(kube::Error::Api(status)) if status.is_not_found() => Ok(()),
             answer => Ok(answer.map(|_| ())?),
         }
-    }
-
-    /// Waits until a Leaderboard fulfils a condition, for this time at most.
-    pub async fn await_leaderboard(&self, name: &str, limit: Duration, fulfils: impl Fn(&Leaderboard) -> bool) {
-        let mut changes = watch_object(self.api::<Leaderboard>(), name).default_backoff().boxed();
-        let fulfilled = async {
-            while let Some(change) = changes.next().await {
-                if matches!(&change, Ok(Some(leaderboard)) if fulfils(leaderboard)) {
-                    return;
-                }
-            }
-        };
-        // What is not there in time is not shown.
-        let _ = tokio::time::timeout(limit, fulfilled).await;
     }
 
     /// A submission each time it changes; none once it is gone.

@@ -89,7 +89,8 @@ pub async fn show_status(cluster: &Cluster, show: &Show, watch: bool) -> Result<
     };
     let submission = cluster.submission(name).await?;
     if watch {
-        return follow(cluster, name, format).await;
+        follow(cluster, name, |one, board| screen(one, board, format)).await?;
+        return Ok(ExitCode::SUCCESS);
     }
     let leaderboard = cluster.leaderboard(&submission.spec.leaderboard_name).await?;
     print(&screen(&submission, &leaderboard, format));
@@ -101,10 +102,16 @@ fn screen(submission: &Submission, leaderboard: &Fetched, format: Format) -> Vec
     lines.unwrap_or_else(|| status::screen(submission, leaderboard.observed(), frame()))
 }
 
-/// Draws the screen of a submission each time it changes, until it has ended; on a terminal its times go on in between.
-async fn follow(cluster: &Cluster, name: &str, format: Format) -> Result<ExitCode, Error> {
+/// Draws the screen of a submission each time it changes, until it has ended; on a terminal its times go on in between. Returns the two
+/// objects as they were at the end.
+pub async fn follow(
+    cluster: &Cluster,
+    name: &str,
+    screen: impl Fn(&Submission, &Fetched) -> Vec<String>,
+) -> Result<(Submission, Fetched), Error> {
     let mut drawn = Screen::default();
     let mut last: Option<(Submission, Fetched)> = None;
+    let mut printed = String::new();
     let mut changes = pin!(cluster.changes(name));
     let mut ticks = tokio::time::interval(TICK);
     loop {
@@ -112,7 +119,7 @@ async fn follow(cluster: &Cluster, name: &str, format: Format) -> Result<ExitCod
             change = changes.next() => change,
             _ = ticks.tick(), if Screen::is_live() => {
                 if let Some((submission, leaderboard)) = &last {
-                    drawn.draw(&screen(submission, leaderboard, format));
+                    drawn.draw(&screen(submission, leaderboard));
                 }
                 continue;
             }
@@ -120,19 +127,15 @@ async fn follow(cluster: &Cluster, name: &str, format: Format) -> Result<ExitCod
         match change {
             Some(Ok(Some(submission))) => {
                 let leaderboard = cluster.leaderboard(&submission.spec.leaderboard_name).await?;
-                drawn.draw(&screen(&submission, &leaderboard, format));
+                drawn.draw(&screen(&submission, &leaderboard));
                 if facts::has_ended(&submission) {
-                    return Ok(ExitCode::SUCCESS);
+                    return Ok((submission, leaderboard));
                 }
                 last = Some((submission, leaderboard));
             }
             Some(Ok(None)) => return Err(Error::Gone(name.to_owned())),
-            Some(Err(error)) => {
-                if let Some(permanent) = error::permanent(error) {
-                    return Err(permanent);
-                }
-            }
-            None => return Ok(ExitCode::SUCCESS),
+            Some(Err(error)) => note_interruption(error, &mut printed)?,
+            None => return Err(Error::Api("the watch has ended".to_owned())),
         }
     }
 }

@@ -13,7 +13,7 @@ const OF_AWS: [&str; 4] = [
     ".api.amazonwebservices.com.cn",
 ];
 /// Variables by which a person names the endpoint that the own program asks.
-const OWN: [&str; 3] = ["AWS_ENDPOINT_URL", "AWS_ENDPOINT_URL_S3", "AWS_ENDPOINT_URL_SQS"];
+const OWN: [&str; 2] = ["AWS_ENDPOINT_URL", "AWS_ENDPOINT_URL_S3"];
 
 /// The endpoint, if it is neither AWS's nor one that the person's own variables name.
 pub fn endpoint(named: Option<&String>) -> Option<&str> {

@@ -10,7 +10,6 @@ mod bucket_log;
 mod change;
 mod changes;
 mod check;
-mod checking;
 mod cluster;
 mod commands;
 mod complete;
@@ -92,11 +91,11 @@ enum Command {
     Dashboard(dashboard::Dashboard),
     /// Print what the agents of a submission print.
     Logs(logs::Logs),
-    /// Drive one route with one pair, and show which parts of a Leaderboard work.
+    /// Drive one route with an agent of your own, and show whether the Leaderboard works.
     #[command(
-        after_help = "Exit code 0: the check passed; 1: a part is broken, or an error. docs/check.md explains the table."
+        after_help = "Exit code 0: its route is Finished and the Leaderboard Ready; 1: one of them is not, or an error. docs/check.md has more."
     )]
-    Check(checking::Check),
+    Check(check::Check),
     /// Stop a submission. Completed routes are kept.
     #[command(
         after_help = "Exit code 0: the cancellation is requested; with --wait, the submission has ended. 1: it had already ended, or an error."
@@ -239,7 +238,7 @@ async fn carry_out_there(command: Command, cluster: &Cluster) -> Result<ExitCode
             .map(|()| ExitCode::SUCCESS),
         Command::Logs(wanted) => Box::pin(logs::logs(cluster, &wanted)).await,
         Command::Report(wanted) => report::report(cluster, &wanted).await.map(|()| ExitCode::SUCCESS),
-        Command::Check(wanted) => Box::pin(checking::check(cluster, &wanted)).await,
+        Command::Check(wanted) => Box::pin(check::check(cluster, &wanted)).await,
         Command::Cancel(target) => changes::cancel(cluster, &target).await,
         Command::Resume(wanted) => changes::resume(cluster, &wanted).await,
     }

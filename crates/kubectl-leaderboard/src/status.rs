@@ -233,7 +233,6 @@ pub fn value(submission: &Submission) -> Value {
         "name": submission.name_any(),
         "namespace": submission.namespace(),
         "leaderboard": submission.spec.leaderboard_name,
-        "isCheck": submission.spec.check,
         "status": submission.status,
     })
 }

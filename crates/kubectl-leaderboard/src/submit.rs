@@ -39,18 +39,16 @@ pub struct Submit {
 }
 
 /// Whether the Leaderboard has the track; the text has the next step. Of one that cannot be read, the operator will know.
-pub fn fits(wanted: &Submit, leaderboard: Observed<'_>) -> Result<(), String> {
+pub fn fits(name: &str, track: &str, leaderboard: Observed<'_>) -> Result<(), String> {
     let Some(found) = leaderboard.leaderboard() else {
         return Ok(());
     };
     let tracks: Vec<&str> = found.spec.tracks.iter().map(|track| track.name.as_str()).collect();
-    if tracks.contains(&wanted.track.as_str()) {
+    if tracks.contains(&track) {
         return Ok(());
     }
     Err(format!(
-        "Leaderboard {} has no track {}. It has {}",
-        wanted.leaderboard,
-        wanted.track,
+        "Leaderboard {name} has no track {track}. It has {}",
         tracks.join(", ")
     ))
 }

@@ -199,7 +199,6 @@ fn a_wrong_name_or_namespace_is_answered_with_the_right_one() {
             &["cancel", "submision-42"],
             &["logs", "42"],
             &["resume", "something-else"],
-            &["check", "-n", "default"],
             &["check", "carla-20", "-n", "default"],
             &[
                 "submit",
@@ -236,7 +235,7 @@ fn without_rights_each_command_names_what_is_missing() {
             &["cancel", "submission-42"],
             &["resume", "--all"],
             &["logs", "submission-42"],
-            &["check"],
+            &["check", "carla-20"],
             &[
                 "submit",
                 "--leaderboard",

@@ -6,7 +6,6 @@ use jiff::Timestamp;
 use k8s_openapi::apimachinery::pkg::apis::meta::v1::Time;
 use kube::ResourceExt;
 
-use super::check;
 use super::claims::Claims;
 use super::isolation;
 use super::reach::Unreachable;
@@ -19,8 +18,8 @@ use crate::services::evalai::{InboxTrouble, Usage};
 use leaderboard_api::conditions::{self, Truth};
 use leaderboard_api::leaderboard::Counts;
 use leaderboard_api::{
-    CheckEnd, Evalai, EvalaiBacklog, EvalaiUse, Leaderboard, LeaderboardStatus, TableUse, TeamUse, Track, TrackStatus,
-    effective, names, reasons,
+    Evalai, EvalaiBacklog, EvalaiUse, Leaderboard, LeaderboardStatus, TableUse, TeamUse, Track, TrackStatus, effective,
+    names, reasons,
 };
 
 const CLAIMS_NOT_SERVED: &str = "gpu.mode is Claim, and the API server does not serve resource.k8s.io/v1, which Kubernetes has from 1.34 on. \
@@ -38,8 +37,6 @@ pub struct LeaderboardView {
     /// All Leaderboards that the operator watches, this one included.
     pub all: Vec<Arc<Leaderboard>>,
     pub counts: Counts,
-    /// The check that ended last, as far as its Submission was seen.
-    pub check: Option<CheckEnd>,
     /// Its teams that have used the most.
     pub gpu_use: Vec<TeamUse>,
     /// Submissions that are live or not yet published and recorded.
@@ -105,11 +102,6 @@ pub fn decide(view: &LeaderboardView) -> LeaderboardPlan {
     }
     let isolated = isolation::condition(leaderboard, &view.policy, view.measured.as_ref());
     set(&mut status, conditions::ISOLATED, isolated);
-    let fault = conditions::get(&status.conditions, conditions::READY).filter(|ready| ready.status != "True");
-    let fault = fault.map(|ready| ready.reason.as_str());
-    status.last_check = check::last(status.last_check.take(), view.check.as_ref(), fault, generation);
-    let checked = check::condition(leaderboard, status.last_check.as_ref());
-    set(&mut status, conditions::CHECKED, checked);
     let deleting = leaderboard.metadata.deletion_timestamp.is_some();
     let is_in_use = view.in_use > 0 || view.pods > 0;
     if deleting && is_in_use {

@@ -46,7 +46,6 @@ fn view(mine: &Arc<Leaderboard>, all: &[Arc<Leaderboard>]) -> LeaderboardView {
         leaderboard: Arc::clone(mine),
         all: all.to_vec(),
         counts: Counts::default(),
-        check: None,
         gpu_use: Vec::new(),
         in_use: 0,
         pods: 0,

@@ -4,7 +4,6 @@
 //! it. What its token is, and whether bucket, table and queues answer, is found by `looks`, in a task of its own that wakes this
 //! reconcile; it waits for the API server alone, and gives the way to EvalAI to `external`. `decide`, `probe::due` and `reach` are pure.
 
-mod check;
 pub mod claims;
 pub mod decide;
 pub mod isolation;
@@ -198,7 +197,6 @@ fn observe(
         leaderboard: Arc::clone(leaderboard),
         all: stores.leaderboards.state(),
         counts,
-        check: uses.slots.last_check(leaderboard),
         gpu_use: uses.teams.gpu_use(leaderboard),
         in_use,
         pods: isolation::pods_left(stores, leaderboard),

@@ -16,7 +16,7 @@ use crate::services::fault::Fault;
 use crate::services::log_groups::{self, LogGroupError};
 use crate::services::queue::{self, QueueError, Reading};
 use crate::services::table::{Table, TableError};
-use leaderboard_api::Leaderboard;
+use leaderboard_api::{self as api, Leaderboard};
 
 /// Time one answer may take.
 const LIMIT: Duration = Duration::from_secs(10);
@@ -70,7 +70,7 @@ pub(super) async fn look(
         match place {
             AwsResource::Queue => readings.queue = read,
             AwsResource::DeadLetterQueue => readings.dead_letters = read,
-            AwsResource::Bucket | AwsResource::Table | AwsResource::LogGroup => {}
+            AwsResource::Bucket | AwsResource::Table | AwsResource::Rows | AwsResource::LogGroup => {}
         }
         if let Finding::Bad(why) | Finding::Hidden(why) | Finding::Silent(why) = &found {
             tracing::warn!(leaderboard = %key_of(leaderboard), place = address, why, "the bucket, table, queue or log group cannot be reached");
@@ -95,6 +95,9 @@ fn named(leaderboard: &Leaderboard) -> Vec<(AwsResource, String)> {
         let keys = keys.map(|(team, submission)| format!(" by {team} and {submission}"));
         let (keys, at) = (keys.unwrap_or_default(), at(&table.region, &table.endpoint));
         places.push((AwsResource::Table, format!("the table {}{keys}{at}", table.name)));
+        if !spec.observes() {
+            places.push((AwsResource::Rows, format!("the rows of {}{keys}{at}", table.name)));
+        }
     }
     if let Some(queue) = &spec.queue {
         let at = at(&queue.region, &queue.endpoint);
@@ -128,6 +131,7 @@ fn ask<'a>(
         (AwsResource::Table, Some(table), _) => {
             async move { (of_table(Table::describe(aws, table).await), None) }.boxed()
         }
+        (AwsResource::Rows, Some(table), _) => async move { (of_table(try_rows(aws, table).await), None) }.boxed(),
         (AwsResource::Queue, _, Some(queue)) => {
             async move { of_queue(queue::check(aws, queue, &queue.url).await) }.boxed()
         }
@@ -138,6 +142,11 @@ fn ask<'a>(
         // It is named by nobody.
         _ => async { (Finding::Good, None) }.boxed(),
     }
+}
+
+/// Whether the table takes rows. The right to describe it does not include that.
+async fn try_rows(aws: &Aws, table: &api::Table) -> Result<(), TableError> {
+    Table::describe(aws, table).await?.try_write().await
 }
 
 /// What an answer means; a cause that passes is as none.
@@ -253,10 +262,14 @@ mod tests {
         let all = [
             "the bucket bucket",
             "the table rows at eu-west-1",
+            "the rows of rows at eu-west-1",
             "the queue https://sqs/one",
             "the dead-letter queue https://sqs/dead",
         ];
         assert_eq!(places(&spec), all);
+        let mut observing = spec.clone();
+        observing["evalai"]["mode"] = json!("Observe");
+        assert!(!places(&observing).contains(&all[2].to_owned()), "none is written");
         // A group that is the host's own is left alone.
         spec["logGroup"] = json!({"name": "logs"});
         assert_eq!(places(&spec), all);

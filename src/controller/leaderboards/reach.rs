@@ -26,6 +26,7 @@ const PATIENCE: SignedDuration = SignedDuration::from_mins(2);
 pub enum AwsResource {
     Bucket,
     Table,
+    Rows,
     Queue,
     DeadLetterQueue,
     LogGroup,
@@ -39,8 +40,8 @@ impl AwsResource {
             Self::Table => Some(reasons::TABLE_UNREACHABLE),
             Self::Queue => Some(reasons::QUEUE_UNREACHABLE),
             Self::DeadLetterQueue => Some(reasons::DEAD_LETTER_QUEUE_UNREACHABLE),
-            // No result depends on lines in CloudWatch.
-            Self::LogGroup => None,
+            // No result depends on lines in CloudWatch, and rows wait for their table.
+            Self::Rows | Self::LogGroup => None,
         }
     }
 }
@@ -204,15 +205,17 @@ mod tests {
     use super::*;
 
     #[test]
-    fn a_log_group_that_cannot_be_made_is_a_note_and_holds_nothing_up() {
-        let mut reach = Reach::default();
-        reach.take(AwsResource::LogGroup, "the log group logs", 1, bad(), at(0));
-        assert_eq!(reach.unreachable(at(0)), None);
-        assert_eq!(reach.notes(at(0)), ["It does not exist; create it."]);
-        reach.take(AwsResource::Table, "the table rows", 1, bad(), at(0));
-        assert_eq!(reach.unreachable(at(0)).unwrap().reason, reasons::TABLE_UNREACHABLE);
-        reach.take(AwsResource::LogGroup, "the log group logs", 1, Finding::Good, at(5));
-        assert_eq!(reach.notes(at(5)), Vec::<String>::new());
+    fn a_log_group_that_cannot_be_made_and_rows_that_are_refused_are_notes_and_hold_nothing_up() {
+        for place in [AwsResource::LogGroup, AwsResource::Rows] {
+            let mut reach = Reach::default();
+            reach.take(place, "the place", 1, bad(), at(0));
+            assert_eq!(reach.unreachable(at(0)), None);
+            assert_eq!(reach.notes(at(0)), ["It does not exist; create it."]);
+            reach.take(AwsResource::Table, "the table rows", 1, bad(), at(0));
+            assert_eq!(reach.unreachable(at(0)).unwrap().reason, reasons::TABLE_UNREACHABLE);
+            reach.take(place, "the place", 1, Finding::Good, at(5));
+            assert_eq!(reach.notes(at(5)), Vec::<String>::new());
+        }
     }
 
     fn at(second: i64) -> Timestamp {

@@ -6,7 +6,7 @@ use std::mem::discriminant;
 use super::member::{Kind, Member, Stand};
 use crate::controller::slots::turns::{InLine, Limits, Past, RUNS, Turn, turns};
 use leaderboard_api::leaderboard::Counts;
-use leaderboard_api::{Attempt, CheckEnd, State};
+use leaderboard_api::{Attempt, State};
 
 #[cfg(test)]
 #[path = "tests/histories.rs"]
@@ -31,8 +31,6 @@ pub(super) struct Line {
     is_past_stale: bool,
     counts: Counts,
     in_use: usize,
-    /// The check that ended last, also when its Submission is gone.
-    pub(super) last_check: Option<CheckEnd>,
     /// Something has changed since slots were allocated last.
     pub(super) is_dirty: bool,
 }
@@ -73,10 +71,9 @@ impl Line {
         self.place(owner);
     }
 
-    /// Takes in a Submission, or none if it is gone. Returns whether the counts or the last check have changed.
+    /// Takes in a Submission, or none if it is gone. Returns whether the counts have changed.
     pub(super) fn member(&mut self, uid: &str, new: Option<Member>) -> bool {
         let before = (self.counts, self.in_use);
-        let is_checked = new.as_ref().is_some_and(|new| self.note_check(new));
         let old = match new {
             Some(new) => self.shown(uid, new),
             None => self.gone(uid),
@@ -85,20 +82,7 @@ impl Line {
             self.count(old, -1);
         }
         self.place(uid);
-        is_checked || before != (self.counts, self.in_use)
-    }
-
-    /// Returns whether it is the check that ended last.
-    fn note_check(&mut self, new: &Member) -> bool {
-        let Kind::Check(Some(end)) = &new.kind else {
-            return false;
-        };
-        let known = self.last_check.as_ref();
-        let is_new = known.is_none_or(|known| end.time >= known.time && end != known);
-        if is_new {
-            self.last_check = Some(end.clone());
-        }
-        is_new
+        before != (self.counts, self.in_use)
     }
 
     fn shown(&mut self, uid: &str, new: Member) -> Option<Member> {
@@ -136,7 +120,7 @@ impl Line {
         let holds = |reserved: &Reserved| {
             reserved.waiting.attempt == attempt && (reserved.is_started || reserved.limits == limits)
         };
-        let is_held = limits.paused && !self.members.get(uid).is_some_and(|member| member.is_check());
+        let is_held = limits.paused && !self.members.get(uid).is_some_and(|member| member.kind == Kind::Check);
         if self.reserved.get(uid).is_some_and(holds) || (!is_held && self.has_slot(uid, attempt)) {
             return Turn::Go;
         }
@@ -324,7 +308,7 @@ impl Line {
         if member.needs_leaderboard {
             self.in_use = self.in_use.saturating_add_signed(if by > 0 { 1 } else { -1 });
         }
-        if member.is_check() {
+        if member.kind == Kind::Check {
             return;
         }
         let counts = &mut self.counts;

@@ -2,7 +2,7 @@
 
 use jiff::Timestamp;
 
-use leaderboard_api::{CheckEnd, JobNumber, State, Submission, SubmissionStatus, conditions, names, reasons};
+use leaderboard_api::{JobNumber, State, Submission, SubmissionStatus, conditions, names, reasons};
 
 pub(super) struct Member {
     pub(super) name: String,
@@ -22,15 +22,14 @@ pub(super) struct Member {
     pub(super) state: State,
     /// It is live, or its end is not yet published and recorded.
     pub(super) needs_leaderboard: bool,
-    /// Whether it is a check of the Leaderboard.
     pub(super) kind: Kind,
 }
 
-/// Whose run it is.
+#[derive(Clone, Copy, PartialEq, Eq)]
 pub(super) enum Kind {
     OfTeam,
-    /// A check: in no count and no estimate. Its end, once it has nothing left to do.
-    Check(Option<CheckEnd>),
+    /// It is in no count and no estimate.
+    Check,
 }
 
 /// The team as which a check stands in line: its own, so that no limit of a team holds it up.
@@ -88,21 +87,13 @@ impl Member {
             ended: ended.filter(|_| !spec.check).map(|time| time.0),
             state: status.state_of_conditions(),
             needs_leaderboard: needs_leaderboard(status),
-            kind: if spec.check {
-                Kind::Check(submission.check_end())
-            } else {
-                Kind::OfTeam
-            },
+            kind: if spec.check { Kind::Check } else { Kind::OfTeam },
         }
     }
 
     /// Name of the Job that runs or is to run next.
     pub(super) fn job(&self) -> String {
         names::job(&self.name, self.number)
-    }
-
-    pub(super) fn is_check(&self) -> bool {
-        matches!(self.kind, Kind::Check(_))
     }
 
     /// Whether what is known of past runs stays right by adding what is new here.

@@ -26,7 +26,7 @@ use crate::controller::slots::turns::{InLine, Limits, Turn};
 use crate::kubernetes::objects::Job;
 use crate::lock::lock;
 use leaderboard_api::leaderboard::Counts;
-use leaderboard_api::{CheckEnd, Leaderboard, Submission};
+use leaderboard_api::{Leaderboard, Submission};
 use line::Line;
 use member::Member;
 
@@ -85,7 +85,7 @@ impl SlotAllocator {
         }
     }
 
-    /// The watch shows a Submission. Returns whether the counts or the last check of its Leaderboard have changed.
+    /// The watch shows a Submission. Returns whether the counts of its Leaderboard have changed.
     pub fn submission(&self, object: &Submission, is_gone: bool) -> bool {
         let uid = object.uid().unwrap_or_default();
         self.change(&board_of(object), |line| {
@@ -146,12 +146,6 @@ impl SlotAllocator {
             .woken
             .extend(names.iter().map(|name| ObjectRef::new(name).within(&key.0)));
         self.changed.notify_one();
-    }
-
-    /// The check of a Leaderboard that ended last, as far as the watch has shown one.
-    pub fn last_check(&self, leaderboard: &Leaderboard) -> Option<CheckEnd> {
-        let lines = lock(&self.lines);
-        lines.by_board.get(&key_of(leaderboard))?.last_check.clone()
     }
 
     /// How many Submissions of a Leaderboard there are by state, and how many still need it.

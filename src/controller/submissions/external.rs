@@ -164,11 +164,7 @@ impl ExternalSystems {
             return;
         };
         let submission = view.submission.as_ref();
-        let row = match update {
-            TableUpdate::Trial => Some(result_texts::trial(status)),
-            TableUpdate::Progress | TableUpdate::End => result_texts::row(view.report.ours().map(Arc::as_ref), status),
-        };
-        if let Some(row) = row {
+        if let Some(row) = result_texts::row(view.report.ours().map(Arc::as_ref), status) {
             let is_end = update != TableUpdate::Progress;
             self.recorder
                 .record(table, &key_of(submission), row, is_end, log_span_of(submission));

@@ -82,18 +82,6 @@ pub(super) fn add_log(payload: &mut Payload, tail: Option<Tail>, readers: LogTai
     payload.environment_log = tail.for_hosts();
 }
 
-/// What a table is asked for a check: whether it would take a row. The keys fit a table of strings and one of numbers, and are
-/// nobody's: EvalAI counts teams and submissions from 1.
-pub(super) fn trial(status: &SubmissionStatus) -> Row {
-    Row {
-        team_id: "0".to_owned(),
-        run_id: "0".to_owned(),
-        attempt: attempt_of_run(status),
-        is_trial: true,
-        ..Row::default()
-    }
-}
-
 /// The row of a submission as it stands; none before it has a team. Only a finished one has metrics, those of its report, as in
 /// the original's table: of every other the columns are absent, whatever an earlier operator has written there.
 pub(super) fn row(report: Option<&ReportDigest>, status: &SubmissionStatus) -> Option<Row> {
@@ -117,7 +105,6 @@ pub(super) fn row(report: Option<&ReportDigest>, status: &SubmissionStatus) -> O
         results: status.results_url.clone().unwrap_or_default(),
         progress: status.progress.as_ref().map(|p| p.text.clone()).unwrap_or_default(),
         gpu_seconds: gpu_seconds(status),
-        is_trial: false,
         rerun_as: status
             .rerun_as
             .as_ref()

@@ -67,9 +67,16 @@ fn checks() -> Vec<Case> {
             named("a", &check),
         ),
         create(
-            "a check has no evalai",
+            "a check has neither evalai nor team",
             named("check-a", &check),
             named("check-a", &evalai),
+        ),
+        update(
+            Submission,
+            "a check has neither evalai nor team",
+            &check,
+            &json!({"team": {"id": "7"}}),
+            &json!({"priority": 5}),
         ),
         update(
             Submission,

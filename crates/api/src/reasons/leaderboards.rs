@@ -101,19 +101,4 @@ reasons! {
              lacks list and watch. No Job is created.",
             "As the message asks. The operator retries every 10 s.";
     }
-    Check {
-        CHECK_PASSED = "CheckPassed",
-            "True: the last check drove its route, its results were stored, and the Leaderboard was Ready then. The spec has not changed \
-             since.",
-            "Nothing.";
-        CHECK_FAILED = "CheckFailed",
-            "The last check did not finish, or the Leaderboard was not Ready at its end. The message has the reason.",
-            "Do what the reason asks, then run `kubectl leaderboard check` again.";
-        CHECK_OUTDATED = "CheckOutdated",
-            "The spec has changed since the last check, which passed.",
-            "Run `kubectl leaderboard check` again.";
-        NEVER_CHECKED = "NeverChecked",
-            "No check of this Leaderboard has ended yet.",
-            "Run `kubectl leaderboard check` before participants submit.";
-    }
 }

@@ -1,84 +1,17 @@
-//! The whole output of `check`, `submit`, `logs` and `report`.
+//! The whole output of `submit`, `logs` and `report`.
 
 use std::fmt::Write as _;
 
 use serde_json::{Value, json};
 
-use super::check::{check, failed, good_leaderboard, noted_leaderboard, passed, table};
 use super::golden::{assert_golden, assert_shown};
-use super::{condition, crashed, leaderboard, now, ran_with, submission, waiting, with};
+use super::{crashed, leaderboard, now, ran_with, submission, waiting, with};
 use crate::board::Observed;
-use crate::check::{Reader, Readers, begun, kept, left};
 use crate::logs::{Whose, in_bucket};
 use crate::output::labelled;
 use crate::text::{Frame, log_line};
-use crate::transitions::Waiting;
 use crate::{report, submit};
-use leaderboard_api::{Attempt, Leaderboard, Submission};
-
-const TRIED: &str = "The image of simulator-1 cannot be pulled: not found. It was tried for 60 s.";
-
-/// All that a check prints, from its beginning to its end.
-fn checked(
-    board: &Leaderboard,
-    status: &Value,
-    given_up: Option<&str>,
-    readers: &Readers,
-    frame: Frame,
-) -> Vec<String> {
-    let check = check(status);
-    let mut wait = Waiting::new(Attempt::FIRST).within(frame.width);
-    let mut lines = begun(&check, frame);
-    lines.extend(wait.observe(&check, frame.now).lines);
-    lines.push(String::new());
-    lines.extend(table(board, status, given_up, readers, frame.width).0);
-    lines.extend(left(&check, frame));
-    lines
-}
-
-#[test]
-fn a_check_is_printed_as_its_files_show() {
-    let good = good_leaderboard();
-    assert_shown("check-passed", |frame| {
-        checked(&good, &passed(), None, &Readers::Nobody, frame)
-    });
-    let pulled = failed("Infrastructure", "ImagePull", TRIED);
-    assert_shown("check-failed", |frame| {
-        let mut lines = checked(&good, &pulled, None, &Readers::Nobody, frame);
-        lines.extend(kept(&check(&pulled), frame));
-        lines
-    });
-    let waits = json!({"attempt": 1, "reason": "Unschedulable", "jobName": "check-carla-20-x7k2p-1",
-                       "message": "0/3 nodes are available: 3 Insufficient nvidia.com/gpu.",
-                       "conditions": [condition("Accepted", "True", "Accepted", "")]});
-    let unknown = Readers::Unknown {
-        why: "the program aws is not on the PATH".to_owned(),
-        commands: vec![
-            "aws sqs get-queue-attributes --queue-url https://sqs.us-east-1.amazonaws.com/1/carla".to_owned(),
-        ],
-    };
-    let why = "The check did not end within 600 s (--timeout).";
-    assert_shown("check-given-up", |frame| {
-        checked(&good, &waits, Some(why), &unknown, frame)
-    });
-    let cancelled = with(
-        failed("Infrastructure", "Cancelled", "The submission was cancelled."),
-        &json!({"failure": null}),
-    );
-    assert_shown("check-cancelled", |frame| {
-        checked(&good, &cancelled, None, &Readers::Nobody, frame)
-    });
-}
-
-#[test]
-fn a_check_with_notes_is_printed_as_its_file_shows() {
-    let readers = Readers::Found(vec![Reader {
-        what: "EventBridge Pipe old-pipeline".to_owned(),
-        stop: "aws pipes stop-pipe --name old-pipeline".to_owned(),
-    }]);
-    let noted = noted_leaderboard();
-    assert_shown("check-notes", |frame| checked(&noted, &passed(), None, &readers, frame));
-}
+use leaderboard_api::Submission;
 
 fn submitted() -> Submission {
     let object = json!({

@@ -219,6 +219,7 @@ impl Explanation<'_> {
             (conditions::ARCHIVED, "S3"),
             (conditions::PUBLISHED, "EvalAI"),
             (conditions::RECORDED, "DynamoDB"),
+            (conditions::LOGGED, "CloudWatch"),
         ];
         for (type_, system) in systems {
             if let Some(condition) = conditions::get(&self.status.conditions, type_) {

@@ -50,7 +50,8 @@ fn next_step(failure: Option<&Failure>, reason: &str) -> Option<&'static str> {
 
 /// The command of this plugin for the next step.
 pub(super) fn verb(submission: &Submission, status: &SubmissionStatus) -> Option<&'static str> {
-    if submission.metadata.deletion_timestamp.is_some() {
+    // A check is run again, not resumed.
+    if submission.metadata.deletion_timestamp.is_some() || submission.spec.check {
         return None;
     }
     let reason = status.reason.as_deref().unwrap_or_default();

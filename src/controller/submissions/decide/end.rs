@@ -98,10 +98,7 @@ pub(super) fn of_complete_run(draft: &mut PlanBuilder<'_>) -> bool {
 
 /// Whether the end still waits until the bucket can be read.
 fn wait_for_bucket(draft: &mut PlanBuilder<'_>, why: &str) -> bool {
-    // A host waits for a check, and an unreadable bucket is what it is to show.
-    let limit = if draft.spec().check {
-        READ_AT_LEAST_SECONDS
-    } else if draft.is_cancelled() {
+    let limit = if draft.is_cancelled() {
         draft.deadlines().cancel_seconds.max(READ_AT_LEAST_SECONDS)
     } else {
         READ_SECONDS

@@ -4,8 +4,7 @@ use std::time::Duration;
 
 use serde_json::Value;
 
-use super::failure::{charged, infrastructure, participant};
-use super::next_steps::for_both;
+use super::failure::{charged, infrastructure};
 use super::plan::Action;
 use super::plan_builder::PlanBuilder;
 use crate::controller::submissions::images::Question;
@@ -47,11 +46,6 @@ pub(super) fn not_allowed(draft: &PlanBuilder<'_>, leaderboard: &LeaderboardSpec
     if is_allowed && !is_hosts {
         return None;
     }
-    if draft.spec().check {
-        let what = "The image of the check is neither check.image of the Leaderboard nor allowed by agent.images.";
-        let step = "Name it in check.image of the Leaderboard, and run the check again.";
-        return Some(participant(reasons::IMAGE_NOT_ALLOWED, what, &for_both(step)));
-    }
     let what = "The submitted image is not one that your team may submit to this leaderboard.";
     Some(charged(reasons::IMAGE_NOT_ALLOWED, what))
 }
@@ -70,9 +64,7 @@ fn patterns(draft: &PlanBuilder<'_>, leaderboard: &LeaderboardSpec) -> Option<Ve
         Some(images) => Some(images.clone()),
         None => {
             let of_evalai = || vec![ImagePattern(image_pattern::OF_EVALAI.to_owned())];
-            // A check proves that the operator can ask a registry as it does for participants.
-            let is_asked = draft.spec().evalai.is_some() || (draft.spec().check && leaderboard.evalai.is_some());
-            is_asked.then(of_evalai)
+            draft.spec().evalai.is_some().then(of_evalai)
         }
     }
 }

@@ -6,7 +6,8 @@ use std::time::Duration;
 use super::plan::{Action, EvalaiUpdate, TableUpdate};
 use super::plan_builder::{PlanBuilder, after};
 use super::{
-    accept, clock, crashes, disk, end, failure, interruption, isolation, line, reading, reported, restored, start, stop,
+    accept, clock, crashes, disk, end, failure, interruption, isolation, line, reading, record, reported, restored,
+    start, stop,
 };
 use crate::controller::submissions::job_spec;
 use crate::controller::submissions::report_digest::ReportDigest;
@@ -335,7 +336,7 @@ fn update_evalai(draft: &mut PlanBuilder<'_>) {
 }
 
 fn record(draft: &mut PlanBuilder<'_>) {
-    if draft.view.record.is_some() && !draft.spec().check {
+    if record::has_row(draft) {
         draft.act(Action::Record(TableUpdate::Progress));
     }
 }

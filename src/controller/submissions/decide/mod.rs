@@ -95,8 +95,7 @@ fn look_up_node(draft: &mut PlanBuilder<'_>) {
 
 /// A deletion waits only for another system that has heard of the submission, or will, and not of its end.
 fn needs_finalizer(draft: &PlanBuilder<'_>) -> bool {
-    let is_recorded = draft.view.record.is_some() && !draft.spec().check;
-    let is_owed = draft.spec().evalai.is_some() || is_recorded;
+    let is_owed = draft.spec().evalai.is_some() || record::has_row(draft);
     let has_begun = draft.status.has_run();
     let is_requested = draft.does(|action| matches!(action, Action::UpdateEvalai(_) | Action::Record(_)));
     let is_settled = draft.does(|action| *action == Action::Forget);

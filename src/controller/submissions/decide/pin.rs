@@ -37,10 +37,6 @@ pub(super) fn pin(draft: &mut PlanBuilder<'_>, terms: Terms<'_>, image: String) 
             }
         }
     };
-    if draft.spec().check && draft.status.checked_generation.is_none() {
-        let checked = draft.view.leaderboard.as_ref();
-        draft.status.checked_generation = checked.and_then(|leaderboard| leaderboard.metadata.generation);
-    }
     draft.status.results_url = Some(effective::results_url(&plan.storage, &plan.run_id));
     draft.status.plan = Some(plan);
     if draft.status.times.accepted.is_none() {

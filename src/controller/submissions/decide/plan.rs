@@ -136,8 +136,6 @@ pub enum TableUpdate {
     /// How a run stands, with the next write of its row.
     Progress,
     End,
-    /// For a check: whether the table would take a row. None is written.
-    Trial,
 }
 
 /// An event of Kubernetes, published after the status was written.

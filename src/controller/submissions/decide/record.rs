@@ -8,8 +8,6 @@ use leaderboard_api::conditions::{self, Truth};
 use leaderboard_api::reasons;
 use leaderboard_api::text::sentence;
 
-/// What a check finds of the table.
-const TRIED: &str = "The table would take a row; a check writes none.";
 /// Shown of an end that is settled without a row: another try would be refused again.
 const SUPERSEDED: &str = "The table has a later attempt or another end of this run, and its row was left as it was. Correct the row by \
                           hand if this end is the one that counts.";
@@ -34,8 +32,7 @@ pub(super) fn decide(draft: &mut PlanBuilder<'_>, is_shown: bool) -> Delivery {
     }
     let view = draft.view.record.clone().unwrap_or_default();
     if view.end_written {
-        let message = if draft.spec().check { TRIED } else { "" };
-        draft.condition(conditions::RECORDED, Truth::True, reasons::RECORDED, message);
+        draft.condition(conditions::RECORDED, Truth::True, reasons::RECORDED, "");
         return Delivery::Done;
     }
     let mut unread = None;
@@ -62,31 +59,30 @@ pub(super) fn decide(draft: &mut PlanBuilder<'_>, is_shown: bool) -> Delivery {
 
 /// Why the end has no row of its own; none if it has one, or will.
 fn why_without_row(draft: &PlanBuilder<'_>) -> Option<&'static str> {
-    let has_team = draft.status.team.as_ref().is_some_and(|team| team.id.is_some());
     if draft.view.record.is_none() {
         Some("")
     } else if draft.status.plan.is_none() {
         Some("The submission was never accepted, so the table has no row for it.")
-    } else if !has_team && !draft.spec().check {
-        Some("The row needs a team; give spec.team.id to a submission that is not EvalAI's.")
+    } else if !has_row(draft) {
+        Some("The row needs a team: give spec.team.id to a submission that is not EvalAI's. A check has none.")
     } else {
         is_superseded(draft).then_some(SUPERSEDED)
     }
 }
 
-/// A check only learns whether the table would take its row.
+/// Whether the table has a row for it: without a team's id, as a check has none, there is no key.
+pub(super) fn has_row(draft: &PlanBuilder<'_>) -> bool {
+    let team = draft.status.team.as_ref();
+    draft.view.record.is_some() && team.is_some_and(|team| team.id.is_some())
+}
+
 pub(super) fn record_end(draft: &mut PlanBuilder<'_>) {
-    let is_check = draft.spec().check;
-    draft.act(Action::Record(if is_check {
-        TableUpdate::Trial
-    } else {
-        TableUpdate::End
-    }));
+    draft.act(Action::Record(TableUpdate::End));
 }
 
 /// Whether all that the row shows is there: only that of a finished submission has metrics.
 pub(super) fn row_of_end(draft: &mut PlanBuilder<'_>) -> Reading {
-    if draft.is_successful() && !draft.spec().check {
+    if draft.is_successful() {
         reading::report_of_end(draft)
     } else {
         Reading::Done

@@ -68,7 +68,7 @@ fn note_scores(draft: &mut PlanBuilder<'_>, report: &ReportDigest) {
     draft.condition(conditions::PLAUSIBLE, truth, reason, &message);
 }
 
-/// Reports that CloudWatch refuses the lines of the run, and that it takes them again; of a check, whether it takes them at all.
+/// Reports that CloudWatch refuses the lines of the run, and that it takes them again.
 fn note_logs(draft: &mut PlanBuilder<'_>, report: &ReportDigest) {
     let is_known = draft.status.condition(conditions::LOGGED).is_some();
     match &report.logs {
@@ -76,7 +76,7 @@ fn note_logs(draft: &mut PlanBuilder<'_>, report: &ReportDigest) {
             let why = sentence(why);
             draft.condition(conditions::LOGGED, Truth::False, reasons::LOGS_REFUSED, &why);
         }
-        Some(Logs::Sent) if is_known || draft.spec().check => {
+        Some(Logs::Sent) if is_known => {
             draft.condition(conditions::LOGGED, Truth::True, reasons::LOGS_SENT, "");
         }
         _ => {}

@@ -28,8 +28,6 @@ const REPORTED_MINUTES: [i64; 6] = [2, 5, 10, 20, 30, 60];
 /// How long a new Job may be refused its Pod, or a new Pod find no node, before that is shown: the Pod whose slot it got may still be
 /// leaving.
 const SETTLE_SECONDS: i64 = 5;
-/// How long something may keep a check from starting that seldom resolves itself. A host waits for it.
-const CHECK_SECONDS: i64 = 60;
 /// How long no node may accept a Pod, without an autoscaler that adds one, before a person has to look: `Stalled` is True then.
 const NODE_SECONDS: i64 = 15 * 60;
 /// How long a Job may take to make its Pod before that is shown.
@@ -109,14 +107,13 @@ fn node_of(pod: &PodView) -> String {
         .map_or_else(|| "its node".to_owned(), |node| format!("node {node}"))
 }
 
-/// For how many seconds the same thing has held up a check, or a node has not started a container again in mid-run, if that is too long: such
-/// a container has no end that would count as a crash. If it is not yet, it is looked at again then.
+/// For how many seconds a node has not started a container again in mid-run, if that is too long: such a container has no end that would
+/// count as a crash. If it is not yet, it is looked at again then.
 fn lasts(draft: &mut PlanBuilder<'_>, found: &Trouble) -> Option<i64> {
-    let seconds = match found.is_start {
-        true if draft.spec().check => CHECK_SECONDS,
-        false if found.cause == Cause::Node => draft.deadlines().start_seconds,
-        _ => return None,
-    };
+    if found.is_start || found.cause != Cause::Node {
+        return None;
+    }
+    let seconds = draft.deadlines().start_seconds;
     let since = draft.blocked_since(found.reason).unwrap_or(draft.now());
     let until = after(since, seconds);
     draft.requeue_at(until);
@@ -307,13 +304,7 @@ fn is_late(draft: &mut PlanBuilder<'_>, job: &JobView, reason: &str, message: &s
     } else {
         job.created
     };
-    // A node may still come; what refuses the Pod stays.
-    let is_refused = draft.spec().check && reason != reasons::UNSCHEDULABLE;
-    let limit = if is_refused {
-        CHECK_SECONDS
-    } else {
-        draft.deadlines().schedule_seconds
-    };
+    let limit = draft.deadlines().schedule_seconds;
     if limit > 0 {
         let deadline = after(since.unwrap_or(draft.now()), limit);
         if draft.now() >= deadline {

@@ -81,11 +81,12 @@ fn a_partial_result_has_metrics_where_its_phase_shows_them() {
 }
 
 #[test]
-fn an_end_is_a_row_and_that_of_a_check_a_trial() {
-    for is_check in [false, true] {
+fn only_of_a_team_is_there_a_row() {
+    for has_team in [true, false] {
         let mut world = World::local();
-        world.submission().spec.check = is_check;
-        world.submission().spec.team.take_if(|_| is_check);
+        world.submission().metadata.finalizers = None;
+        world.submission().spec.team.take_if(|_| !has_team);
+        assert_eq!(has(&world.pass(), |a| *a == Action::AddFinalizer), has_team);
         let mut world = world.running();
         let updates = |world: &mut World| -> Vec<TableUpdate> {
             let actions = world.pass().actions.into_iter();
@@ -95,13 +96,12 @@ fn an_end_is_a_row_and_that_of_a_check_a_trial() {
             };
             actions.filter_map(of).collect()
         };
-        let live: &[_] = if is_check { &[] } else { &[TableUpdate::Progress] };
-        assert_eq!(updates(&mut world), live);
+        let of = |update| has_team.then_some(update).into_iter().collect::<Vec<_>>();
+        assert_eq!(updates(&mut world), of(TableUpdate::Progress));
         world.submission().spec.cancel = true;
         world.pass();
         world.complete();
-        let end = if is_check { TableUpdate::Trial } else { TableUpdate::End };
-        assert_eq!(updates(&mut world), [end]);
+        assert_eq!(updates(&mut world), of(TableUpdate::End));
     }
 }
 
