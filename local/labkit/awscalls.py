@@ -40,20 +40,12 @@ ACTIONS: Mapping[str, tuple[str, ...]] = {
     "put_retention_policy": ("logs:PutRetentionPolicy",),
     # Of the roles' trust, not of a policy.
     "assume_role_with_web_identity": (),
-    # Signed by the program itself; see `ECR`.
-    "get_authorization_token": ("ecr:GetAuthorizationToken",),
 }
 # Granted although no call has this name, and why. By policy.
 INDIRECT: Mapping[tuple[str, str], str] = {
-    ("controller", "ecr:BatchGetImage"): "ECR checks it when the registry is asked for a manifest",
-    ("controller", "ecr:GetDownloadUrlForLayer"): "ECR checks it when the registry is asked for a config",
     ("log-groups", "logs:TagResource"): "CloudWatch checks it when a group is made with tags",
     ("kms", "kms:Decrypt"): "S3 asks KMS with the caller's rights: to read, and to join parts",
     ("kms", "kms:GenerateDataKey"): "S3 asks KMS with the caller's rights: to store",
-}
-# Files that sign requests themselves, which the list of operations does not show, and what they ask for.
-SIGNED: Mapping[str, str] = {
-    "src/services/registry/ecr.rs": "GetAuthorizationToken, which `ECR` finds",
 }
 # Policies that a host adds to a program's own where they are needed.
 ADDED = {"log-groups": "controller"}
@@ -62,7 +54,6 @@ FUNCTION = re.compile(r"^ *(?:pub(?:\([a-z]+\))? )?(?:async )?fn (\w+)", re.MULT
 METHOD = re.compile(r"\.(\w+)\(\)")
 OWN_METHOD = re.compile(r"\bself\s*\.(\w+)\(")
 ARCHIVE_METHOD = re.compile(r"\barchive\s*\.(\w+)\(")
-ECR = re.compile(r'"AmazonEC2ContainerRegistry_V\d+\.(\w+)"')
 ACTION = re.compile(r"\b(?:s3|sqs|dynamodb|logs|secretsmanager|ecr|kms):[A-Z]\w+\b")
 TESTS = re.compile(r"^#\[cfg\(test\)\].*", re.MULTILINE | re.DOTALL)
 
@@ -94,8 +85,7 @@ class Source:
         return "\n".join(text for name, text in self.texts.items() if name.startswith((f"{folder}/", f"{folder}.rs")))
 
     def operations_of(self, text: str) -> frozenset[str]:
-        of_ecr = {snake(name) for name in ECR.findall(text)}
-        return frozenset(self.operations & set(METHOD.findall(text))) | of_ecr
+        return frozenset(self.operations & set(METHOD.findall(text)))
 
     def services(self) -> dict[str, frozenset[str]]:
         """Module of src/services -> its operations; those without any are left out."""
@@ -161,7 +151,7 @@ def faults(source: Source, folder: Path) -> Iterator[str]:
     yield from (f"{name}: no action in awscalls.py" for name in sorted(all_operations - ACTIONS.keys()))
     nobodys = all_operations - frozenset().union(*everything.values())
     signed = {name for name, text in source.texts.items() if "aws_sigv4" in text}
-    yield from (f"{name} signs requests: say in awscalls.py which" for name in sorted(signed - SIGNED.keys()))
+    yield from (f"{name} signs requests, which the list of operations does not show" for name in sorted(signed))
     yield from (f"{name}: no program that awscalls.py knows calls it" for name in sorted(nobodys))
     for program, operations in everything.items():
         policies = [program, *(policy for policy, of in ADDED.items() if of == program)]

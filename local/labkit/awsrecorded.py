@@ -43,10 +43,6 @@ S3: Mapping[tuple[str, str], str] = {
 QUERIES = ("list-type", "partNumber", "uploads", "uploadId")
 # Allowed and maybe not called in a run of the cluster's tests, and why it is allowed all the same.
 RARE: Mapping[tuple[str, str], str] = {
-    (
-        "controller",
-        "ecr:GetAuthorizationToken",
-    ): "only for a registry of Amazon, as src/services/registry/tests.rs has it",
     ("log-groups", "logs:DescribeLogGroups"): "only with logGroup.retentionDays, as tests/api/log_groups.rs has it",
     ("log-groups", "logs:CreateLogGroup"): "only with logGroup.retentionDays, as tests/api/log_groups.rs has it",
     ("log-groups", "logs:PutRetentionPolicy"): "only with logGroup.retentionDays, as tests/api/log_groups.rs has it",

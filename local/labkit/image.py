@@ -137,7 +137,6 @@ def run_config(spec: ImageSpec) -> dict[str, object]:
         "Cmd": list(spec.cmd),
         "User": spec.user,
         "WorkingDir": spec.workdir,
-        "Volumes": {path: {} for path in spec.volumes},
     }
     return {key: value for key, value in values.items() if value}
 

@@ -55,7 +55,6 @@ class ImageSpec:
     cmd: tuple[str, ...]
     user: str
     workdir: str
-    volumes: tuple[str, ...]
 
     @property
     def name(self) -> str:
@@ -163,7 +162,6 @@ def parse_image(table: object, place: str) -> ImageSpec:
         cmd=reader.texts("cmd"),
         user=reader.text("user", ""),
         workdir=reader.text("workdir", ""),
-        volumes=reader.texts("volumes"),
     )
     reader.done()
     return spec

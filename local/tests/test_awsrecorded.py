@@ -91,12 +91,6 @@ class Requests(unittest.TestCase):
                 "stream/77/a",
             ),
             ("Logs_20140328.DescribeLogGroups", {"logGroupNamePrefix": "g"}, "describe_log_groups", "group"),
-            (
-                "AmazonEC2ContainerRegistry_V20150921.GetAuthorizationToken",
-                {},
-                "get_authorization_token",
-                "",
-            ),
         ):
             self.assertEqual(json_call("controller", target, members), Call("controller", operation, resource))
 
@@ -104,9 +98,8 @@ class Requests(unittest.TestCase):
         target = {"x-amz-target": "AmazonSQS.ReceiveMessage"}
         for headers in ({"user-agent": "Boto3/1.43"}, agent("tests"), {}):
             self.assertIsNone(awsrecorded.call_of("POST", "/", "", {**headers, **target}, b"{}"), headers)
-        # A question to STS, and one to the registry.
+        # A question to STS.
         self.assertIsNone(awsrecorded.call_of("POST", "/", "", agent("logcopy"), b"Action=AssumeRoleWithWebIdentity"))
-        self.assertIsNone(awsrecorded.call_of("GET", "/v2/agent/manifests/1", "", agent("controller"), b""))
 
     def test_the_stand_in_writes_down_what_it_answers(self) -> None:
         lines: list[str] = []
@@ -187,9 +180,7 @@ class Differences(unittest.TestCase):
             for _, arns in awscalls.actions(POLICIES / f"{name}.json")
             for arn in arns
         }
-        self.assertEqual(
-            kinds, {"object", "bucket", "queue", "dead letters", "table", "secret", "stream", "group", "ecr", "*"}
-        )
+        self.assertEqual(kinds, {"object", "bucket", "queue", "dead letters", "table", "secret", "stream", "group"})
 
 
 if __name__ == "__main__":

@@ -3,7 +3,6 @@
 import unittest
 
 from labkit.errors import LabError
-from labkit.image import run_config
 from labkit.image_spec import DirSpec, FileSpec, LinkSpec, parse
 
 WHOLE = """
@@ -23,7 +22,6 @@ entrypoint = ["/bin/bash"]
 cmd = ["-c", "true"]
 user = "1000:1000"
 workdir = "/root"
-volumes = ["/data"]
 
 [[image]]
 repository = "challenge/agent"
@@ -53,9 +51,7 @@ class Taken(unittest.TestCase):
         self.assertEqual(list(first.env), ["A", "B"])
         self.assertEqual((first.entrypoint, first.cmd), (("/bin/bash",), ("-c", "true")))
         self.assertEqual((first.user, first.workdir), ("1000:1000", "/root"))
-        self.assertEqual(run_config(first)["Volumes"], {"/data": {}})
         self.assertEqual((second.files, second.env, second.user), ((), {}, ""))
-        self.assertNotIn("Volumes", run_config(second))
 
 
 class Refused(unittest.TestCase):
@@ -79,7 +75,6 @@ class Refused(unittest.TestCase):
             ): "mode = '0899' must be three or four octal digits",
             image('files = [{from = "text:x", to = "/b", libs = "yes"}]'): "libs must be true or false",
             image('dirs = [{path = "/b", uid = -1}]'): "dir 1: uid must be a number from 0 on",
-            image('volumes = "/data"'): "f: image 1 (a:1): volumes must be a list of texts",
             image("") + image(""): "f has a:1 twice",
         }
         for text, words in cases.items():

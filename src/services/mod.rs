@@ -12,7 +12,6 @@ pub mod logs;
 pub mod meter;
 pub mod public;
 pub mod queue;
-pub mod registry;
 pub mod table;
 pub mod token;
 

@@ -36,21 +36,14 @@ impl Default for Reach {
 
 impl Reach {
     /// Another rule than the internet's.
+    #[cfg(test)]
     pub const fn of(rule: fn(IpAddr) -> bool) -> Self {
         Self(rule)
     }
 
     /// A client that connects nowhere else. It follows no redirect.
     pub fn limit(self, builder: ClientBuilder) -> ClientBuilder {
-        self.resolve(builder, proxies(|name| std::env::var(name).ok()))
-    }
-
-    /// As `limit`, and through no proxy, which would connect to addresses that nobody has checked.
-    pub fn limit_without_proxy(self, builder: ClientBuilder) -> ClientBuilder {
-        self.resolve(builder.no_proxy(), Vec::new())
-    }
-
-    fn resolve(self, builder: ClientBuilder, proxies: Vec<String>) -> ClientBuilder {
+        let proxies = proxies(|name| std::env::var(name).ok());
         builder
             .redirect(reqwest::redirect::Policy::none())
             .dns_resolver(Arc::new(Resolver { reach: self, proxies }))

@@ -71,7 +71,7 @@ async fn a_minimal_leaderboard_reads_back_whole() {
         "leaderboardVersion": "V2",
         "contents": {"image": "contents:1"},
         "simulator": {"image": "simulator:1", "display": "Offscreen"},
-        "agent": {"logSizeLimit": "2Gi", "imageSizeLimit": "60Gi"},
+        "agent": {"logSizeLimit": "2Gi"},
         "pairs": 4,
         "routes": 20,
         "retries": {"perPair": 3, "infrastructure": 2},
@@ -124,12 +124,12 @@ fn half_filled_runs() -> Vec<HalfFilled> {
         (
             "agent",
             json!({"command": ["a"]}),
-            json!({"command": ["a"], "logSizeLimit": "2Gi", "imageSizeLimit": "60Gi"}),
+            json!({"command": ["a"], "logSizeLimit": "2Gi"}),
         ),
         (
             "agent",
             json!({"images": []}),
-            json!({"logSizeLimit": "2Gi", "images": [], "imageSizeLimit": "60Gi"}),
+            json!({"logSizeLimit": "2Gi", "images": []}),
         ),
         (
             "retries",
@@ -310,7 +310,7 @@ async fn a_null_is_as_good_as_a_field_left_out() {
             },
             "deadlines": {"runSeconds": null},
             "concurrency": {"total": null, "perTeam": null},
-            "agent": {"command": null, "args": null, "resources": null, "logSizeLimit": null, "images": null, "imageSizeLimit": null},
+            "agent": {"command": null, "args": null, "resources": null, "logSizeLimit": null, "images": null},
             "contents": {"image": "contents:1", "command": null, "args": null, "securityContext": null},
         }),
     ];

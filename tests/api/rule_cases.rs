@@ -458,11 +458,6 @@ fn sizes_and_images() -> Vec<Case> {
             &json!({"agent": {"logSizeLimit": "1M"}}),
         ),
         case(
-            "agent.imageSizeLimit must be",
-            &json!({"agent": {"imageSizeLimit": "1Ti"}}),
-            &json!({"agent": {"imageSizeLimit": "2Ti"}}),
-        ),
-        case(
             "team 7 would get the images of team 17",
             &images("*.dkr.ecr.*.amazonaws.com/*-participant-team-{team}"),
             &images("r.example/*{team}"),

@@ -11,7 +11,6 @@ use serde_json::{Value, json};
 
 use super::matrix::{Case, together};
 use crate::evalai::{Evalai, FIRST_PHASE};
-use crate::gate::Gate;
 use crate::operator::{bridge, controller};
 use crate::registry::{Registry, image_for_other_machines};
 use crate::scene::{Scene, containers, done, lay_over, scenario};
@@ -99,23 +98,8 @@ fn with(mut change: Value, more: Value) -> Value {
     change
 }
 
-/// An image of the challenge whose registry is asked about it before a Job is made. It is on loopback, where the operator speaks plain HTTP.
-fn asked_for(name: &'static str, tag: &str, gate: &Gate, expected: &'static str) -> Row {
-    let repository = format!("{}/challenge/agent", gate.url.trim_start_matches("http://"));
-    Row {
-        image: format!("{repository}:{tag}"),
-        ..row(name, json!({"agent": {"images": [repository]}}), expected)
-    }
-}
-
-fn of_images(other_machines: String, private: &Registry, gate: &Gate) -> Vec<Row> {
+fn of_images(other_machines: String, private: &Registry) -> Vec<Row> {
     vec![
-        asked_for(
-            "image with volumes",
-            "volumes",
-            gate,
-            "Failed ImageVolumes (participant, charged); EvalAI failed",
-        ),
         unpullable(
             "image missing",
             "agent:nobody-pushed-this".to_owned(),
@@ -247,7 +231,7 @@ fn of_simulators() -> Vec<Row> {
 async fn each_failure_ends_with_its_reason_and_whose_it_is() {
     scenario("matrix-runs", async |scene: &Scene| {
         let private = Registry::that_refuses().await;
-        let rows: Vec<_> = of_images(image_for_other_machines(&scene.lab).await, &private, &scene.gate)
+        let rows: Vec<_> = of_images(image_for_other_machines(&scene.lab).await, &private)
             .into_iter()
             .chain(of_agents())
             .chain(of_results())

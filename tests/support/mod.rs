@@ -3,7 +3,6 @@
 
 pub mod apiserver;
 pub mod files;
-pub mod images;
 pub mod ministack;
 pub mod throttle;
 pub mod tools;

@@ -84,13 +84,6 @@ impl ImagePattern {
         };
         has_registry(registry, repository.registry) && has_path(path, &repository.path, team)
     }
-
-    /// Whether it names this registry, letter by letter.
-    pub fn names_registry(&self, registry: &str) -> bool {
-        self.0
-            .split_once('/')
-            .is_some_and(|(named, _)| named == registry && !named.contains('*'))
-    }
 }
 
 fn has_registry(pattern: &str, registry: &str) -> bool {

@@ -129,10 +129,3 @@ fn one_repository_is_known_in_every_spelling() {
         assert_eq!(same(one, other), is_same, "{one} {other}");
     }
 }
-
-#[test]
-fn only_a_registry_without_a_star_is_named() {
-    let names = |pattern: &str| ImagePattern(pattern.into()).names_registry("127.0.0.1:5000");
-    assert!(names("127.0.0.1:5000/*"));
-    assert!(!names("127.0.0.*:5000/*") && !names("*/a") && !names("127.0.0.1/a"));
-}

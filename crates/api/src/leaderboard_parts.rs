@@ -210,7 +210,6 @@ pub struct CheckImage {
 #[serde(rename_all = "camelCase")]
 #[x_kube(
     validation = Rule::new("!has(self.logSizeLimit) || (quantity(self.logSizeLimit).compareTo(quantity('1Mi')) >= 0 && quantity(self.logSizeLimit).compareTo(quantity('1Ti')) <= 0)").message("agent.logSizeLimit must be 1Mi to 1Ti"),
-    validation = Rule::new("!has(self.imageSizeLimit) || (quantity(self.imageSizeLimit).compareTo(quantity('1Mi')) >= 0 && quantity(self.imageSizeLimit).compareTo(quantity('1Ti')) <= 0)").message("agent.imageSizeLimit must be 1Mi to 1Ti"),
     validation = Rule::new("!has(self.shmSize) || (quantity(self.shmSize).compareTo(quantity('1Mi')) >= 0 && quantity(self.shmSize).compareTo(quantity('1Ti')) <= 0)").message("agent.shmSize must be 1Mi to 1Ti"),
     validation = Rule::new("!has(self.images) || self.images.all(p, !p.matches('[a-z0-9*}][{]team[}]|[{]team[}][a-z0-9*{]'))").message("an entry of agent.images has a letter, a digit or * next to {team}: team 7 would get the images of team 17; put -, _, . or / between"),
     validation = Rule::new("!has(self.args) || has(self.command)").message("agent.args without agent.command would be added to the default command; write the command too")
@@ -238,14 +237,11 @@ pub struct AgentContainer {
     /// Size of each agent's `/dev/shm`, in memory: `1Mi` to `1Ti`. What lies there counts to the agent's memory limit. Absent: 64 MiB, as the container runtime makes it.
     #[serde(default, skip_serializing_if = "Option::is_none")]
     pub shm_size: Option<ByteQuantity>,
-    /// Images that may be submitted, such as `registry.example/team-{team}/*`: `{team}` is the id of the submission's team, `*` one or more characters between two slashes. Their registries are asked for size and digest before a Job is made. Default for EvalAI's submissions: `*.dkr.ecr.*.amazonaws.com/*-participant-team-{team}`. `[]`: any image, and no registry is asked. The images of contents and simulator are never among them.
+    /// Images that may be submitted, such as `registry.example/team-{team}/*`: `{team}` is the id of the submission's team, `*` one or more characters between two slashes. Default for EvalAI's submissions: `*.dkr.ecr.*.amazonaws.com/*-participant-team-{team}`. `[]`: any image. The images of contents and simulator are never among them.
     #[serde(default, skip_serializing_if = "Option::is_none")]
     #[schemars(length(max = 32))]
     #[x_kube(merge_strategy = ListMerge::Atomic)]
     pub images: Option<Vec<ImagePattern>>,
-    /// Largest sum of an image's layers as the registry stores them, compressed: `1Mi` to `1Ti`. Checked where a registry is asked.
-    #[serde(default = "defaults::image_size_limit")]
-    pub image_size_limit: ByteQuantity,
 }
 
 /// What is forgiven before a submission fails.
@@ -362,7 +358,6 @@ impl Default for AgentContainer {
             log_size_limit: defaults::log_size_limit(),
             shm_size: None,
             images: None,
-            image_size_limit: defaults::image_size_limit(),
         }
     }
 }
@@ -402,9 +397,6 @@ mod defaults {
 
     pub(super) fn log_size_limit() -> ByteQuantity {
         ByteQuantity::gibibytes(2)
-    }
-    pub(super) fn image_size_limit() -> ByteQuantity {
-        ByteQuantity::gibibytes(60)
     }
     pub(super) fn retries_per_pair() -> i32 {
         3

@@ -104,7 +104,7 @@ pub struct SubmissionStatus {
     /// What is run, pinned at acceptance.
     #[serde(default, skip_serializing_if = "Option::is_none")]
     pub plan: Option<RunPlan>,
-    /// What the participant's image was when its registry was asked; absent where none was, or none answered.
+    /// The participant's image as the first agent ran it. Every later Job runs the same, wherever its tag moves.
     #[serde(default, skip_serializing_if = "Option::is_none")]
     pub image: Option<PinnedImage>,
     /// Routes that are done.
@@ -259,12 +259,12 @@ pub struct RunPlan {
     pub submission_uid: Option<String>,
 }
 
-/// The participant's image as it is run by every Job of the submission, wherever its tag moves.
+/// The participant's image as the first agent ran it.
 #[derive(Serialize, Deserialize, JsonSchema, Clone, Debug, PartialEq, Eq)]
 #[serde(rename_all = "camelCase")]
 pub struct PinnedImage {
-    /// Digest of the manifest for linux/amd64.
-    #[schemars(length(max = 160), regex(pattern = r"^sha(256|384|512):[0-9a-f]+$"))]
+    /// Digest in its repository.
+    #[schemars(length(max = 71), regex(pattern = r"^sha256:[0-9a-f]{64}$"))]
     pub digest: String,
 }
 

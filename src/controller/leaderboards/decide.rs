@@ -41,6 +41,8 @@ pub struct LeaderboardView {
     pub gpu_use: Vec<TeamUse>,
     /// Submissions that are live or not yet published and recorded.
     pub in_use: usize,
+    /// The note about images that several teams lack.
+    pub image_note: Option<String>,
     /// Its Pods that have not ended, counted while it is being deleted.
     pub pods: usize,
     /// How the NetworkPolicy of its Pods stands.
@@ -181,7 +183,7 @@ fn found(view: &LeaderboardView) -> (Truth, &'static str, String) {
 }
 
 /// A Leaderboard that is ready shows what its host should know all the same: that a new controller waits with its first write to
-/// EvalAI, which runs have no limit, and what its Pods give to strangers.
+/// EvalAI, which runs have no limit, which images several teams lack, and what its Pods give to strangers.
 fn with_notes(view: &LeaderboardView, ready: (Truth, &'static str, String)) -> (Truth, &'static str, String) {
     let (truth, reason, message) = ready;
     if truth != Truth::True {
@@ -196,6 +198,7 @@ fn with_notes(view: &LeaderboardView, ready: (Truth, &'static str, String)) -> (
         without_limit(&view.leaderboard),
     ];
     let texts = [Some(message)].into_iter().chain(notes).flatten();
+    let texts = texts.chain(view.image_note.clone());
     let texts = texts.chain(view.pod_notes.iter().chain(&view.place_notes).cloned());
     let texts: Vec<String> = texts.filter(|text| !text.is_empty()).collect();
     (truth, reason, texts.join(" "))

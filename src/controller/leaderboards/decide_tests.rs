@@ -48,6 +48,7 @@ fn view(mine: &Arc<Leaderboard>, all: &[Arc<Leaderboard>]) -> LeaderboardView {
         counts: Counts::default(),
         gpu_use: Vec::new(),
         in_use: 0,
+        image_note: None,
         pods: 0,
         policy: Policy::InPlace,
         measured: None,
@@ -332,12 +333,13 @@ fn a_leaderboard_that_is_ready_shows_what_its_pods_give_to_strangers() {
         (
             EvalaiStanding::NotRequired,
             "True",
-            "Unbounded: x. Agents can read Secret y. Log group z.",
+            "Images of 2 teams. Unbounded: x. Agents can read Secret y. Log group z.",
         ),
         (EvalaiStanding::NoToken("No token.".into()), "False", "No token."),
     ] {
         let seen = LeaderboardView {
             evalai,
+            image_note: Some("Images of 2 teams.".to_owned()),
             pod_notes: pod_notes.clone(),
             place_notes: vec!["Log group z.".to_owned()],
             ..view(&one, &[])

@@ -6,6 +6,7 @@
 
 pub mod claims;
 pub mod decide;
+mod images;
 pub mod isolation;
 pub mod looks;
 pub mod operator;
@@ -199,6 +200,7 @@ fn observe(
         counts,
         gpu_use: uses.teams.gpu_use(leaderboard),
         in_use,
+        image_note: images::note(leaderboard, &stores.submissions_of(&key.namespace)),
         pods: isolation::pods_left(stores, leaderboard),
         policy,
         measured: isolation::measured(uses.policies.state, leaderboard),

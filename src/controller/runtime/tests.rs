@@ -15,12 +15,11 @@ use crate::kubernetes::Namespaces;
 use crate::observability::shutdown::Stop;
 
 /// All that runs in a leader without Leaderboards, in the order of names.
-const TASKS: [&str; 20] = [
+const TASKS: [&str; 19] = [
     "events of Jobs",
     "events of Pods",
     "foreign runs",
     "gauges",
-    "images",
     "inbox",
     "lease",
     "looks",

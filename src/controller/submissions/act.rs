@@ -140,7 +140,6 @@ impl Actor<'_> {
                 self.delete_submission(uid, resource_version).await?;
             }
             Action::JoinLine(place) => uses.slots.join(submission, place),
-            Action::LookUpImage(question) => workers.images.want(submission, question),
             Action::LookForForeignRun(question) => workers.foreign_runs.want(submission, *question),
             Action::ReadOtherResults(question) => workers.other_results.want(submission, *question),
             Action::TakeOwnership => workers.archive.want_fence(submission, status),

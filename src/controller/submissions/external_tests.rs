@@ -14,8 +14,8 @@ use tokio::sync::mpsc;
 use super::*;
 use crate::controller::fixtures::{Cluster, Surroundings, leaderboard, surroundings, with_job};
 use crate::controller::submissions::view::{
-    ObservedFence, ObservedImage, ObservedJob, ObservedLog, ObservedNode, ObservedReport, ObservedRoutes,
-    ObservedTexts, ObservedTraces, Turn,
+    ObservedFence, ObservedJob, ObservedLog, ObservedNode, ObservedReport, ObservedRoutes, ObservedTexts,
+    ObservedTraces, Turn,
 };
 use leaderboard_api::conditions::{self, Truth};
 use leaderboard_api::{Attempt, State, reasons};
@@ -96,7 +96,6 @@ async fn bench(state: State) -> Bench {
         leaderboard: Some(Arc::new(board)),
         not_allowed: None,
         is_policy_in_place: true,
-        image: ObservedImage::NotAsked,
         traces: ObservedTraces::NotAsked,
         other_routes: ObservedRoutes::NotAsked,
         turn: Turn::Go,

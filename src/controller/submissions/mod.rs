@@ -10,7 +10,6 @@ pub mod decide;
 pub mod external;
 pub mod failure_log;
 pub mod foreign_runs;
-pub mod images;
 pub mod job_spec;
 pub mod memory;
 pub mod observe;

@@ -19,7 +19,7 @@ use crate::observability::tasks::Tasks;
 use leaderboard_api::{Attempt, Storage, Submission, Table};
 
 /// How long an answer is kept that nobody asks for again.
-pub(super) const KEPT: Duration = Duration::from_mins(10);
+const KEPT: Duration = Duration::from_mins(10);
 
 /// What is asked for one attempt of a submission.
 pub trait Question: Clone + PartialEq + Send + 'static {
@@ -244,5 +244,83 @@ where
             }
             () = shared.notify.notified() => {}
         }
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[derive(Clone, Debug, PartialEq)]
+    struct Asked {
+        attempt: Attempt,
+        what: &'static str,
+    }
+
+    impl Question for Asked {
+        type Answer = &'static str;
+        const AT_ONCE: usize = 4;
+        const GOOD_FOR: Duration = Duration::MAX;
+
+        fn attempt(&self) -> Attempt {
+            self.attempt
+        }
+    }
+
+    fn question(attempt: i64, what: &'static str) -> Asked {
+        let attempt = Attempt(attempt);
+        Asked { attempt, what }
+    }
+
+    fn by(name: &str) -> ObjectRef<Submission> {
+        ObjectRef::new(name).within("one")
+    }
+
+    #[tokio::test(start_paused = true)]
+    async fn a_question_is_asked_once_and_its_answer_stays_for_its_attempt() {
+        let shared = Shared::default();
+        let first = question(1, "one");
+        shared.want("u".into(), by("s"), first.clone(), LogSpan::default());
+        assert_eq!(shared.next(), Some(("u".into(), first.clone(), "one".into())));
+        shared.want("u".into(), by("s"), first.clone(), LogSpan::default());
+        assert_eq!(shared.next(), None, "it is under way");
+        tokio::time::advance(Duration::from_secs(3)).await;
+        assert_eq!(shared.observe("u", Attempt(1)), Observed::Asked(Duration::from_secs(3)));
+        assert_eq!(shared.done("u", &first, "none"), Some(by("s")));
+        assert_eq!(shared.observe("u", Attempt(1)), Observed::Answered(Arc::new("none")));
+        assert_eq!(shared.observe("u", Attempt(2)), Observed::NotAsked);
+        shared.want("u".into(), by("s"), question(2, "one"), LogSpan::default());
+        assert_eq!(shared.next().unwrap().1.attempt, Attempt(2));
+    }
+
+    #[tokio::test(start_paused = true)]
+    async fn the_answer_to_an_older_question_is_nobodys() {
+        let shared = Shared::default();
+        let (old, new) = (question(1, "one"), question(1, "other"));
+        shared.want("u".into(), by("s"), old.clone(), LogSpan::default());
+        shared.next();
+        shared.want("u".into(), by("s"), new.clone(), LogSpan::default());
+        assert_eq!(shared.done("u", &old, "none"), None);
+        assert_eq!(shared.observe("u", Attempt(1)), Observed::Asked(Duration::ZERO));
+        assert_eq!(shared.next().unwrap().1, new);
+    }
+
+    #[tokio::test(start_paused = true)]
+    async fn who_asked_first_is_served_first_and_old_answers_go() {
+        let shared = Shared::default();
+        for uid in ["a", "b"] {
+            shared.want(uid.into(), by(uid), question(1, "one"), LogSpan::default());
+            tokio::time::advance(Duration::from_secs(1)).await;
+        }
+        let (uid, question_of_a, _) = shared.next().unwrap();
+        assert_eq!(uid, "a");
+        shared.done(&uid, &question_of_a, "none");
+        tokio::time::advance(KEPT).await;
+        shared.want("c".into(), by("c"), question(1, "one"), LogSpan::default());
+        assert_eq!(shared.observe("a", Attempt(1)), Observed::NotAsked);
+        assert!(
+            matches!(shared.observe("b", Attempt(1)), Observed::Asked(_)),
+            "it still waits"
+        );
     }
 }

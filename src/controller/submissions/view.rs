@@ -7,7 +7,6 @@ use jiff::Timestamp;
 use leaderboard_runner::verdict::Verdict;
 
 pub use super::foreign_runs::ObservedTraces;
-pub use super::images::ObservedImage;
 pub use super::other_results::ObservedRoutes;
 use super::report_digest::{ReportDigest, ReportId};
 pub use crate::controller::slots::turns::Turn;
@@ -25,8 +24,6 @@ pub struct View {
     pub not_allowed: Option<String>,
     /// Whether the NetworkPolicy that the Leaderboard's present spec asks for is in place; only meaningful while it has no Job.
     pub is_policy_in_place: bool,
-    /// What its registry has reported of its image.
-    pub image: ObservedImage,
     /// What another program has left of it.
     pub traces: ObservedTraces,
     /// How many routes another program's run of it has; read only where a Leaderboard observes.
@@ -202,6 +199,8 @@ pub enum ScaleUp {
 #[derive(Clone, Debug, Default, PartialEq)]
 pub struct ContainerView {
     pub name: SharedText,
+    /// What its node calls the image that it runs or ran: `NAME@sha256:…`, if a registry gave it to the node.
+    pub image_id: Option<SharedText>,
     pub restarts: i32,
     pub running: bool,
     /// Its next life is counted among the restarts and does not run yet.

@@ -71,6 +71,8 @@ pub struct Condition {
 #[serde(from = "Seen")]
 pub struct ContainerStatus {
     pub name: Text,
+    /// What the node calls its image; empty before it has the image.
+    pub image_id: Text,
     pub restart_count: i32,
     /// The kubelet has made the container of the next life, and counts it, before that runs. It says that the container waits, as after an end.
     pub begins_anew: bool,
@@ -83,6 +85,8 @@ pub struct ContainerStatus {
 #[serde(rename_all = "camelCase", default)]
 struct Seen {
     name: Text,
+    #[serde(rename = "imageID")]
+    image_id: Text,
     restart_count: i32,
     #[serde(rename = "containerID", deserialize_with = "digest")]
     id: u64,
@@ -177,6 +181,7 @@ impl From<Seen> for ContainerStatus {
         Self {
             begins_anew: state.waiting().is_some() && last_ended.as_deref().is_some_and(is_of_another),
             name: seen.name,
+            image_id: seen.image_id,
             restart_count: seen.restart_count,
             state,
             last_ended,
@@ -250,7 +255,7 @@ impl Pod {
         shared.extend(&mut status.conditions.disruption);
         let all = [&mut status.init_container_statuses, &mut status.container_statuses];
         for container in all.into_iter().flat_map(|containers| containers.iter_mut()) {
-            shared.push(&mut container.name);
+            shared.extend([&mut container.name, &mut container.image_id]);
             shared.extend(match &mut container.state {
                 ContainerState::Waiting(waiting) => waiting.reason.as_mut(),
                 ContainerState::Ended(ended) => ended.reason.as_mut(),

@@ -312,10 +312,10 @@ pub(super) fn has_job(submission: &Submission) -> bool {
     submission.status.as_ref().is_some_and(|s| s.job_name.is_some())
 }
 
-/// Its agents run.
+/// Its agents run, and their image is pinned with the same write.
 pub(super) fn is_running(submission: &Submission) -> bool {
     let status = submission.status.as_ref();
-    status.is_some_and(|s| s.state_of_conditions() == State::Running)
+    status.is_some_and(|s| s.state_of_conditions() == State::Running && s.image.is_some())
 }
 
 pub(super) fn is_read(request: &Request) -> bool {

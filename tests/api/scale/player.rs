@@ -9,7 +9,7 @@ use std::time::Duration;
 use futures::{Stream, StreamExt};
 use jiff::Timestamp;
 use k8s_openapi::api::batch::v1::Job;
-use k8s_openapi::api::core::v1::{Node, Pod};
+use k8s_openapi::api::core::v1::{Container, Node, Pod};
 use kube::api::{Api, Patch, PatchParams, PostParams};
 use kube::runtime::{WatchStreamExt, watcher};
 use kube::{Client, Resource, ResourceExt};
@@ -221,16 +221,21 @@ fn ended_state() -> Value {
 /// A status in which all init containers but the sidecar are done.
 fn pod_status(phase: &str, pod: &Pod, state: &Value) -> Value {
     let spec = pod.spec.as_ref().unwrap();
-    let container = |name: &str, state: &Value| {
+    let container = |container: &Container, state: &Value| {
+        let repository = container
+            .image
+            .as_deref()
+            .and_then(|image| image.split(['@', ':']).next());
         json!({
-            "name": name, "image": "played", "imageID": "played", "restartCount": 0,
+            "name": container.name, "image": container.image, "restartCount": 0,
+            "imageID": format!("{}@sha256:{}", repository.unwrap_or_default(), "a".repeat(64)),
             "ready": state.get("running").is_some(), "started": state.get("running").is_some(), "state": state,
         })
     };
     let init = spec.init_containers.iter().flatten().map(|c| {
         let is_sidecar = c.name == names::CONTAINER_LOGCOPY;
         let ended = ended_state();
-        container(&c.name, if is_sidecar { state } else { &ended })
+        container(c, if is_sidecar { state } else { &ended })
     });
     let now = Timestamp::now().strftime("%Y-%m-%dT%H:%M:%SZ").to_string();
     json!({
@@ -238,7 +243,7 @@ fn pod_status(phase: &str, pod: &Pod, state: &Value) -> Value {
         "startTime": now,
         "conditions": [{"type": "PodScheduled", "status": "True", "lastTransitionTime": now}],
         "initContainerStatuses": init.collect::<Vec<_>>(),
-        "containerStatuses": spec.containers.iter().map(|c| container(&c.name, state)).collect::<Vec<_>>(),
+        "containerStatuses": spec.containers.iter().map(|c| container(c, state)).collect::<Vec<_>>(),
     })
 }
 

@@ -11,8 +11,8 @@ reasons! {
             "Stop the Pipe that the message helps to find. If the queue is shared on purpose, set `queue.foreign` to `Leave`.";
         READY = "Ready",
             "Submissions can run. The message may have a note: metrics of a phase's leaderboard that stay empty, a token that \
-             expires soon, until when nothing is written to EvalAI after a change of operators, or Secrets that \
-             participants can read.",
+             expires soon, until when nothing is written to EvalAI after a change of operators, images of several teams that cannot be pulled \
+             (`ImagePull`), or Secrets that participants can read.",
             "Nothing, or what the note asks for.";
         CHECKING = "Checking",
             "The operator asks bucket, table, queues and the place of EvalAI's token for the first time, and not all have answered yet.",

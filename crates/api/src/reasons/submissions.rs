@@ -40,9 +40,6 @@ reasons! {
             "Wait for the end of the other run; the submission is looked for every 30 s. If nothing runs it any more, set the row's \
              `submission_status` to `FAILED`, or annotate the Submission with `leaderboard.carla.org/adopt=true`: it then continues \
              from what is stored. If the message has an error, do what it asks.";
-        CHECKING_IMAGE = "CheckingImage",
-            "The registry is being asked for the image's digest, size and platform. Shown if that takes 5 s or longer.",
-            "Nothing. Within a minute the submission goes on, or fails for what the registry says.";
         WAITING_FOR_SLOT = "WaitingForSlot",
             "All slots that `concurrency.total` and `concurrency.perTeam` allow are in use. `status.waiting` has the position in the line \
              and an estimate.",
@@ -95,10 +92,6 @@ reasons! {
             "As `Accepted`, but the object had no status although it was run before, as after a restore from a backup: what is stored \
              in the bucket is taken up (condition `Accepted`; the message says where).",
             "Nothing.";
-        IMAGE_NOT_PINNED = "ImageNotPinned",
-            "As `Accepted`, but the image's registry could not be asked (condition `Accepted`; the message says why). Size, platform \
-             and volumes of the image were not checked, and its Pods pull it by its tag.",
-            "Let the operator reach the registry, and give it credentials, as docs/images.md says.";
         RUNNING = "Running",
             "The agents of the first attempt are running.",
             "Nothing.";
@@ -178,19 +171,15 @@ reasons! {
              host's own. No Job is created.",
             "Push the image to the team's own repository, and submit again.";
         IMAGE_NOT_FOUND = "ImageNotFound",
-            "The registry does not have the submitted image. No Job is created; where only the node asks the registry, the submission \
-             fails after `deadlines.startSeconds`.",
+            "The registry does not have the submitted image. The submission fails after `deadlines.startSeconds`.",
             "Push the image under the name that is submitted, and submit again.";
-        IMAGE_TOO_LARGE = "ImageTooLarge",
-            "The layers of the submitted image are larger than `agent.imageSizeLimit`, compressed. No Job is created.",
-            "Make the image smaller, and submit again.";
         IMAGE_PLATFORM = "ImagePlatform",
-            "The registry has the submitted image for other machines only. No Job is created; where only the node asks the registry, \
-             the submission fails after `deadlines.startSeconds`.",
+            "The registry has the submitted image for other machines only. The submission fails after `deadlines.startSeconds`.",
             "Build the image for linux/amd64, and submit again.";
-        IMAGE_VOLUMES = "ImageVolumes",
-            "The submitted image declares volumes, whose content no limit of the cluster counts. No Job is created.",
-            "Remove VOLUME from the image's Dockerfile or use a base image without it, and submit again.";
+        IMAGE_CHANGED = "ImageChanged",
+            "The agents of one Pod run different images, because the tag of the submitted image moved between two pulls. The run is \
+             stopped at once.",
+            "Push the image under a tag that stays, and submit again.";
         DISK_FULL = "DiskFull",
             "The Pod was evicted because its disk was full. A participant failure if the kubelet names an agent's container or a volume that \
              agents alone write to, or if `logcopy` has measured that agents fill the logs. Else it is an infrastructure failure: \
@@ -242,9 +231,6 @@ reasons! {
              not pulled within `deadlines.pullSeconds`.",
             "Fix this, then resume the submission.",
             log: "the log of `contents`, `workspace` or `logcopy`, whichever fails, read from its node before the Job is deleted";
-        IMAGE_DENIED = "ImageDenied",
-            "The registry refuses the image to the operator's credentials. No Job is created, and there is no retry.",
-            "Give the operator's role or pull secret the right to read the repository, then resume the submission.";
         SCHEDULE_DEADLINE = "ScheduleDeadline",
             "No node accepted the Pod within `deadlines.scheduleSeconds`. There is no retry.",
             "Add a node or free one, then resume the submission.";

@@ -72,28 +72,24 @@ fn decide_run(draft: &mut PlanBuilder<'_>, terms: Terms<'_>) -> bool {
     if let Some(missing) = isolation::missing(draft) {
         return wait_for_policy(draft, &missing);
     }
-    let note = match image::decide(draft, terms.leaderboard, &image) {
-        image::Step::Go(note) => note,
-        image::Step::Wait => return false,
-        image::Step::Refuse(found) => return refuse_image(draft, terms, image, found),
-    };
     pin::pin(draft, terms, image);
-    take(draft, note);
+    take(draft);
     true
 }
 
-/// Accepts it, with what there is to show: that its image has no digest (`unpinned`), or that it was restored.
-fn take(draft: &mut PlanBuilder<'_>, unpinned: Option<String>) {
+/// Accepts it, with the note that it was restored.
+fn take(draft: &mut PlanBuilder<'_>) {
     let known = draft.status.condition(conditions::ACCEPTED);
     let known = known
         .filter(|c| c.reason == reasons::RESTORED)
         .map(|c| c.message.to_string());
-    let (reason, note) = match (unpinned, known.or_else(|| stored::note(draft))) {
-        (Some(note), _) => (reasons::IMAGE_NOT_PINNED, note),
-        (None, Some(note)) => (reasons::RESTORED, note),
-        (None, None) => (reasons::ACCEPTED, String::new()),
+    let note = known.or_else(|| stored::note(draft));
+    let reason = if note.is_some() {
+        reasons::RESTORED
+    } else {
+        reasons::ACCEPTED
     };
-    draft.condition(conditions::ACCEPTED, Truth::True, reason, &note);
+    draft.condition(conditions::ACCEPTED, Truth::True, reason, &note.unwrap_or_default());
 }
 
 /// Whether EvalAI's own end is ours, of an object that has lost its status, or that is still being found out.

@@ -6,8 +6,8 @@ use std::time::Duration;
 use super::plan::{Action, EvalaiUpdate, TableUpdate};
 use super::plan_builder::{PlanBuilder, after};
 use super::{
-    accept, clock, crashes, disk, end, failure, interruption, isolation, line, reading, record, reported, restored,
-    start, stop,
+    accept, clock, crashes, disk, end, failure, image, interruption, isolation, line, reading, record, reported,
+    restored, start, stop,
 };
 use crate::controller::submissions::job_spec;
 use crate::controller::submissions::report_digest::ReportDigest;
@@ -289,13 +289,15 @@ fn take_pod(draft: &mut PlanBuilder<'_>, pod: &PodView) {
     draft.status.node_name = pod.node.clone().or(known);
     clock::take_node(draft, pod);
     clock::take_agents(draft, pod);
+    image::pin_digest(draft, pod);
     let now = draft.now();
     crashes::note(&mut draft.status, pod, now);
 }
 
-/// Limits of a run under way: disk, crashes, time.
+/// What ends a run under way: a full disk, agents with different images, crashes, time.
 fn watch_run(draft: &mut PlanBuilder<'_>) {
-    if let Some(found) = disk::full(draft).or_else(|| crashes::too_many(draft)) {
+    let found = disk::full(draft).or_else(|| image::changed(draft));
+    if let Some(found) = found.or_else(|| crashes::too_many(draft)) {
         return draft.fail(found);
     }
     // One that outlives its Leaderboard is charged for no limit that nobody has set; the Pod has a net of its own.

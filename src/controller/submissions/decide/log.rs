@@ -93,6 +93,7 @@ fn places(status: &SubmissionStatus, pod: Option<&PodView>) -> Vec<LogPlace> {
         | reasons::IMAGE_NOT_FOUND
         | reasons::IMAGE_PLATFORM
         | reasons::IMAGE_PULL
+        | reasons::IMAGE_CHANGED
         | reasons::CONTAINER_CONFIG => Vec::new(),
         reasons::DISK_FULL => vec![Some(stored(&agent, agent_log(pair))), on_node(&agent)],
         _ if failure.class == FailureClass::Participant => vec![Some(stored(&agent, agent_log(pair))), on_node(&agent)],

@@ -56,7 +56,6 @@ pub(super) fn of_infrastructure(reason: &str) -> &'static str {
 /// All that a participant reads of a failure of the infrastructure.
 pub(super) fn infrastructure_for_participants(reason: &str) -> String {
     let what = match reason {
-        reasons::IMAGE_DENIED => "The submitted image could not be read in its registry.",
         reasons::IMAGE_PULL => "An image could not be pulled.",
         reasons::NODE_LOST => "The machine that ran the submission was lost.",
         reasons::NODE_INTERRUPTED => "The machine that ran the submission was taken away.",

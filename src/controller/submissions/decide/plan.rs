@@ -4,7 +4,6 @@ use std::time::Duration;
 
 use crate::controller::slots::turns::InLine;
 use crate::controller::submissions::foreign_runs;
-use crate::controller::submissions::images::Question;
 use crate::controller::submissions::other_results;
 use crate::controller::submissions::report_digest::ReportId;
 use crate::controller::submissions::view::{LogPlace, ReportDemand};
@@ -72,8 +71,6 @@ pub enum Action {
     ReleaseFinalizer,
     /// All but the slot is settled: wait for one at this place. Shows nothing new until it is known who is next.
     JoinLine(InLine),
-    /// Ask the image's registry.
-    LookUpImage(Question),
     /// Look whether another program runs the submission.
     LookForForeignRun(Box<foreign_runs::Question>),
     /// Read how many routes another program's run of the submission has.

@@ -61,6 +61,7 @@ fn steady(status: &SubmissionStatus) -> SubmissionStatus {
         score: None,
         message: None,
         waiting: None,
+        image: None,
         ..status.clone()
     };
     for pair in &mut steady.pairs {

@@ -383,13 +383,32 @@ fn the_pod_gets_what_to_measure_and_the_next_one_what_was_found() {
 }
 
 #[test]
+fn all_agents_of_a_pod_get_one_image_unless_the_host_has_nodes_ask_each_time() {
+    let policies = |change: Value| -> Vec<String> {
+        let job = Case::new("V2", change).json();
+        let all = containers(&job).into_iter();
+        let agents = all.filter(|container| container["name"].as_str().unwrap().starts_with("agent-"));
+        agents
+            .map(|agent| agent["imagePullPolicy"].as_str().unwrap().to_owned())
+            .collect()
+    };
+    assert_eq!(policies(json!({})), ["IfNotPresent"; 4]);
+    let always = json!({"podOverrides": {"spec": {"containers": [{"name": "agent", "imagePullPolicy": "Always"}]}}});
+    assert_eq!(policies(always), ["Always"; 4]);
+}
+
+#[test]
 fn our_own_image_has_the_pull_policy_and_region_of_the_operator() {
     let mut case = Case::new("V2", json!({}));
     case.settings.image_pull_policy = Some("Always".into());
     case.settings.region = Some("us-west-2".into());
     let job = case.json();
     for container in containers(&job) {
-        assert_eq!(container.get("imagePullPolicy").is_some(), is_own(container));
+        let is_agent = container["name"].as_str().unwrap().starts_with("agent-");
+        assert_eq!(
+            container.get("imagePullPolicy").is_some(),
+            is_own(container) || is_agent
+        );
         if is_own(container) {
             assert_eq!(container["image"], OPERATOR_IMAGE);
             assert_eq!(value(container, "AWS_REGION"), Some("us-west-2"));

@@ -103,6 +103,8 @@ pub(super) fn agent(input: &JobInput<'_>, pair: Pair) -> Container {
     let resources = effective::resources(own, spec.resources.as_ref());
     Container {
         image: Some(input.plan.image.clone()),
+        // Kubernetes asks for `latest` anew before each container: a pair, or a restart, could get another image.
+        image_pull_policy: Some("IfNotPresent".into()),
         command: Some(behind_runner(member, flags, words)),
         env: Some(merged(agent_env(input, pair), &spec.env)),
         resources: gpu::resources(source(input.spec()), member, resources),

@@ -56,7 +56,6 @@ pub fn observe(uses: Uses<'_>, submission: Arc<Submission>, is_policy_in_place: 
         // Comparing it takes longer than reading the rest.
         is_policy_in_place: may_create(&job) && leaderboard.as_deref().is_some_and(is_policy_in_place),
         not_allowed: leaderboard.as_deref().and_then(|board| uses.external.refusal(board)),
-        image: workers.images.observe(&submission),
         traces: workers.foreign_runs.observe(&submission),
         other_routes: workers.other_results.observe(&submission),
         job_refused: refusal(uses, &submission, &job),

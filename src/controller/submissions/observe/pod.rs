@@ -100,6 +100,7 @@ fn container(status: &ContainerStatus) -> ContainerView {
     let state = &status.state;
     ContainerView {
         name: status.name.clone(),
+        image_id: Some(status.image_id.clone()).filter(|_| state.running().is_some() || status.ended().is_some()),
         restarts: status.restart_count,
         running: state.running().is_some(),
         begins_anew: status.begins_anew,

@@ -6,7 +6,6 @@ use super::lookups::Lookups;
 use crate::controller::objects::Wake;
 use crate::controller::submissions::archive::ArchiveWorkers;
 use crate::controller::submissions::foreign_runs::ForeignRuns;
-use crate::controller::submissions::images::Images;
 use crate::controller::submissions::other_results::OtherResults;
 use crate::observability::tasks::Tasks;
 use crate::services::aws::Aws;
@@ -16,7 +15,6 @@ use leaderboard_api::Submission;
 pub struct Workers {
     pub archive: ArchiveWorkers,
     pub lookups: Lookups,
-    pub images: Images,
     pub foreign_runs: ForeignRuns,
     pub other_results: OtherResults,
 }
@@ -27,7 +25,6 @@ impl Workers {
         Self {
             archive: ArchiveWorkers::new(aws.clone(), client.clone(), tasks.clone(), wake()),
             lookups: Lookups::start(client.clone(), tasks, wake()),
-            images: Images::start(aws, client.clone(), tasks, wake()),
             foreign_runs: ForeignRuns::start(aws, tasks, wake()),
             other_results: OtherResults::start(aws, tasks, wake()),
         }
@@ -36,7 +33,6 @@ impl Workers {
     /// Drops what is known for an object that is gone, or that needs nothing more.
     pub fn forget(&self, uid: &str) {
         self.archive.forget(uid);
-        self.images.forget(uid);
         self.foreign_runs.forget(uid);
         self.other_results.forget(uid);
     }

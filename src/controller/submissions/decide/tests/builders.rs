@@ -12,9 +12,9 @@ use crate::controller::submissions::decide::{Action, EvalaiUpdate, Plan, decide,
 use crate::controller::submissions::foreign_runs::{Looked, Traces, Unread};
 use crate::controller::submissions::report_digest::ReportDigest;
 use crate::controller::submissions::view::{
-    ContainerView, EndView, EvalaiEnd, EvalaiInfo, EvalaiView, JobEnd, JobView, ObservedFence, ObservedImage,
-    ObservedJob, ObservedLog, ObservedNode, ObservedReport, ObservedRoutes, ObservedTexts, ObservedTraces, PodView,
-    RecordView, Stage, Standing, Texts, Turn, View,
+    ContainerView, EndView, EvalaiEnd, EvalaiInfo, EvalaiView, JobEnd, JobView, ObservedFence, ObservedJob,
+    ObservedLog, ObservedNode, ObservedReport, ObservedRoutes, ObservedTexts, ObservedTraces, PodView, RecordView,
+    Stage, Standing, Texts, Turn, View,
 };
 use crate::pod::report::{Report, ReportPair};
 use crate::pod::run::Stop;
@@ -114,7 +114,6 @@ impl World {
                 leaderboard: Some(Arc::new(leaderboard(evalai))),
                 not_allowed: None,
                 is_policy_in_place: true,
-                image: ObservedImage::NotAsked,
                 // Nobody else runs it; the tests of foreign runs set it otherwise.
                 traces: ObservedTraces::Answered(Arc::new(looked(at(0), Ok(Traces::default())))),
                 // The results of another program; the tests of one that observes set it otherwise.

@@ -1,32 +1,15 @@
-//! Which images run: the patterns, what a registry reports, and what participants read of it.
-
-use std::sync::Arc;
-use std::time::Duration;
-
-use serde_json::json;
+//! Which images run: the patterns, the digest that the first agent pins, and what participants read of a pull.
 
 use super::builders::*;
-use crate::controller::submissions::decide::{Action, pinned};
-use crate::controller::submissions::images::Question;
-use crate::controller::submissions::view::ObservedImage;
-use crate::services::registry::{Facts, Fault, Image};
-use leaderboard_api::State::{Failed, Pending};
+use crate::controller::submissions::decide::{Plan, StatusWrite, pinned};
+use leaderboard_api::State::{Failed, Pending, Running};
 use leaderboard_api::conditions::ACCEPTED;
-use leaderboard_api::{Attempt, FailureClass, ImagePattern, PinnedImage, SubmissionStatus, Team, reasons};
+use leaderboard_api::{Attempt, FailureClass, ImagePattern, PinnedImage, Team, reasons};
 
 const ECR: &str = "123456789012.dkr.ecr.us-east-1.amazonaws.com";
-const OURS: &str = "123456789012.dkr.ecr.us-east-1.amazonaws.com/carla-participant-team-42:one";
 
-fn digest() -> String {
-    format!("sha256:{}", "a".repeat(64))
-}
-
-fn facts() -> Facts {
-    Facts {
-        digest: digest(),
-        bytes: 1 << 30,
-        has_volumes: false,
-    }
+fn digest(of: char) -> String {
+    format!("sha256:{}", of.to_string().repeat(64))
 }
 
 /// A submission of EvalAI's team 42 with the default patterns.
@@ -37,21 +20,27 @@ fn evalai(image: &str) -> World {
     world
 }
 
-fn answered(answer: Result<Facts, Fault>) -> World {
-    let mut world = evalai(OURS);
-    world.view.image = ObservedImage::Answered(Arc::new(answer));
-    world
+/// What the node calls an agent's image, from second 10 on.
+fn runs(world: &mut World, agent: &str, image_id: &str) {
+    let containers = &mut world.pod().containers;
+    let found = containers.iter_mut().find(|container| container.name == agent);
+    found.unwrap().image_id = Some(image_id.into());
 }
 
-fn question(world: &mut World) -> Option<Question> {
-    world.pass().actions.into_iter().find_map(|action| match action {
-        Action::LookUpImage(question) => Some(question),
-        _ => None,
-    })
+/// Its agents run, with these images.
+fn running_with(images: [&str; 2]) -> (World, Plan) {
+    let mut world = World::local().with_pod();
+    world.see_agents();
+    for (agent, image) in ["agent-1", "agent-2"].into_iter().zip(images) {
+        runs(&mut world, agent, image);
+    }
+    world.go_to(10);
+    let plan = world.pass();
+    (world, plan)
 }
 
 #[test]
-fn an_image_of_another_team_or_of_the_host_fails_at_once_and_no_registry_is_asked() {
+fn an_image_of_another_team_or_of_the_host_fails_at_once() {
     for image in [
         format!("{ECR}/carla-participant-team-4:one"),
         format!("{ECR}/carla-participant-team-142:one"),
@@ -61,16 +50,15 @@ fn an_image_of_another_team_or_of_the_host_fails_at_once_and_no_registry_is_aske
     ] {
         let mut world = evalai(&image);
         let plan = world.pass_to(Failed, reasons::IMAGE_NOT_ALLOWED);
-        assert!(
-            !creates(&plan) && !has(&plan, |a| matches!(a, Action::LookUpImage(_))),
-            "{image}"
-        );
+        assert!(!creates(&plan), "{image}");
         assert_eq!(condition(&plan, ACCEPTED).0, "False");
         let failure = plan.status.failure.unwrap();
         assert_eq!(failure.class, FailureClass::Participant);
         let shown = failure.participant_message.unwrap_or(failure.message);
         assert!(!shown.contains("amazonaws") && !shown.contains("8080"), "{shown}");
     }
+    let mut own = evalai(&format!("{ECR}/carla-participant-team-42:one"));
+    assert!(creates(&own.pass_to(Pending, reasons::PREPARING)));
 }
 
 #[test]
@@ -91,10 +79,7 @@ fn the_images_of_contents_and_simulator_are_nobodys_agent_whatever_the_patterns_
 fn any_image_of_a_local_submission_runs_unless_patterns_are_set() {
     let mut world = World::local();
     world.leaderboard().agent.images = None;
-    assert!(
-        creates(&world.pass_to(Pending, reasons::PREPARING)),
-        "no registry is asked"
-    );
+    assert!(creates(&world.pass_to(Pending, reasons::PREPARING)));
     let of_team = |id: Option<&str>| {
         let mut world = World::local();
         world.leaderboard().agent.images = Some(vec![ImagePattern("docker.io/team-{team}/*".into())]);
@@ -103,141 +88,108 @@ fn any_image_of_a_local_submission_runs_unless_patterns_are_set() {
         world.submission().spec.team = Some(Team { id, name: None });
         world
     };
-    assert!(question(&mut of_team(Some("7"))).is_some());
+    assert!(creates(&of_team(Some("7")).pass_to(Pending, reasons::PREPARING)));
     for other in [Some("17"), Some("*"), None] {
         of_team(other).pass_to(Failed, reasons::IMAGE_NOT_ALLOWED);
     }
 }
 
 #[test]
-fn the_registry_is_asked_once_and_an_answer_within_five_seconds_costs_no_write() {
-    let mut world = evalai(OURS);
-    world.leaderboard().pod_overrides = Some(json!({"spec": {"imagePullSecrets": [{"name": "registry"}]}}));
-    let image = Image {
-        registry: ECR.into(),
-        path: "carla-participant-team-42".into(),
-        reference: "one".into(),
-        may_be_local: false,
-    };
-    let wanted = Question {
-        attempt: Attempt(1),
-        image,
-        secrets: vec!["registry".into()],
-    };
-    assert_eq!(question(&mut world), Some(wanted));
-    assert_eq!(world.status(), SubmissionStatus::default());
-    world.view.image = ObservedImage::Asked(Duration::from_secs(2));
-    let plan = world.pass();
-    assert_eq!(plan.status, SubmissionStatus::default());
-    assert!(!creates(&plan));
-    world.view.image = ObservedImage::Asked(Duration::from_secs(5));
-    assert!(!creates(&world.pass_to(Pending, reasons::CHECKING_IMAGE)));
-    world.view.image = ObservedImage::Answered(Arc::new(Ok(facts())));
-    let plan = world.pass_to(Pending, reasons::PREPARING);
-    assert!(creates(&plan) && !has(&plan, |a| matches!(a, Action::LookUpImage(_))));
-    assert_eq!(world.status().image, Some(PinnedImage { digest: digest() }));
-    assert_eq!(condition(&plan, ACCEPTED), ("True".into(), reasons::ACCEPTED.into()));
+fn the_digest_comes_with_the_write_that_shows_the_run_and_with_none_of_its_own() {
+    let image = format!("docker.io/team/agent@{}", digest('a'));
+    let mut world = World::local().with_pod();
+    assert_eq!(world.pass_to(Pending, reasons::PREPARING).status.image, None);
+    world.see_agents();
+    runs(&mut world, "agent-1", &image);
+    world.go_to(10);
+    let plan = world.pass_to(Running, reasons::RUNNING);
+    assert_eq!(
+        (plan.write, plan.status.image),
+        (StatusWrite::Now, Some(PinnedImage { digest: digest('a') }))
+    );
+
+    let (mut late, _) = running_with(["sha256:not-from-a-registry", ""]);
+    runs(&mut late, "agent-1", &image);
+    late.view.written_ago = Some(std::time::Duration::from_secs(1));
+    let plan = late.pass();
+    assert_eq!((plan.write, plan.status.image.is_some()), (StatusWrite::NotNow, true));
+}
+
+#[test]
+fn only_a_digest_of_the_submitted_repository_is_pinned() {
+    let of = |name: &str| format!("{name}@{}", digest('a'));
+    for (one, other, wanted) in [
+        (of("docker.io/team/agent"), String::new(), Some('a')),
+        (of("team/agent"), of("team/agent"), Some('a')),
+        // The same content under another name, as a node may show it.
+        (
+            of("docker.io/other/agent"),
+            format!("team/agent@{}", digest('b')),
+            Some('b'),
+        ),
+        (of("docker.io/other/agent"), of("r.example/team/agent"), None),
+        // An image that was loaded onto the node.
+        (digest('a'), String::new(), None),
+        ("team/agent:1".into(), "team/agent@sha256:1".into(), None),
+        (format!("team/agent@sha512:{}", "a".repeat(128)), String::new(), None),
+    ] {
+        let (_, plan) = running_with([&one, &other]);
+        assert_eq!(plan.status.reason.as_deref(), Some(reasons::RUNNING));
+        let found = plan.status.image.map(|image| image.digest);
+        assert_eq!(found, wanted.map(digest), "{one} {other}");
+    }
 }
 
 #[test]
 fn the_digest_stays_through_retries_and_attempts() {
-    let mut world = answered(Ok(facts()));
-    world.pass_to(Pending, reasons::PREPARING);
-    world.view.image = ObservedImage::NotAsked;
-    let mut retried = world.clone();
-    let status = retried.submission().status.as_mut().unwrap();
-    (status.retry, status.job_name) = (1, None);
-    assert_eq!(question(&mut retried), None);
-    assert_eq!(retried.status().image, Some(PinnedImage { digest: digest() }));
+    let image = format!("team/agent@{}", digest('a'));
+    let (mut world, _) = running_with([&image, &image]);
+    let found = Some(PinnedImage { digest: digest('a') });
+    world.gets_another_job();
+    assert_eq!((world.status().retry, world.status().image), (1, found.clone()));
     world.submission().spec.cancel = true;
     world.job_gone();
     world.pass();
     let spec = &mut world.submission().spec;
     (spec.cancel, spec.attempt) = (false, Attempt(2));
     world.pass();
-    assert_eq!(world.status().attempt, Some(Attempt(2)));
-    assert_eq!(question(&mut world), None);
-    assert_eq!(world.status().image, Some(PinnedImage { digest: digest() }));
-}
-
-#[test]
-fn what_a_registry_reports_ends_a_submission_before_a_job_is_made() {
-    use FailureClass::{Infrastructure, Participant};
-    let huge = Facts {
-        bytes: (60 << 30) + 1,
-        ..facts()
-    };
-    let with_volumes = Facts {
-        has_volumes: true,
-        ..facts()
-    };
-    for (answer, reason, class) in [
-        (Err(Fault::NotFound), reasons::IMAGE_NOT_FOUND, Participant),
-        (Ok(huge), reasons::IMAGE_TOO_LARGE, Participant),
-        (Ok(with_volumes), reasons::IMAGE_VOLUMES, Participant),
-        (Err(Fault::OtherPlatform), reasons::IMAGE_PLATFORM, Participant),
-        (Err(Fault::NotAnImage("it is odd")), reasons::IMAGE_INVALID, Participant),
-        (Err(Fault::Denied), reasons::IMAGE_DENIED, Infrastructure),
-    ] {
-        let mut world = answered(answer);
-        let plan = world.pass_to(Failed, reason);
-        assert!(!creates(&plan) && plan.status.image.is_none(), "{reason}");
-        let failure = plan.status.failure.unwrap();
-        assert_eq!(failure.class, class, "{reason}");
-        let shown = failure.participant_message.unwrap_or(failure.message);
-        assert!(!shown.contains(ECR), "{shown}");
-    }
-    let mut largest = answered(Ok(Facts {
-        bytes: 60 << 30,
-        ..facts()
-    }));
-    assert!(creates(&largest.pass()));
-}
-
-#[test]
-fn a_registry_that_cannot_be_asked_holds_nothing_up_and_hosts_alone_read_why() {
-    let why = "no connection (connection refused)\u{1b}[2J";
-    let mut world = answered(Err(Fault::Unreachable(why.into())));
-    let plan = world.pass_to(Pending, reasons::PREPARING);
-    assert!(creates(&plan) && plan.status.image.is_none());
-    let note = |world: &World| {
-        let status = world.status();
-        let found = leaderboard_api::conditions::get(&status.conditions, ACCEPTED)
-            .unwrap()
-            .clone();
-        assert_eq!(
-            (found.status.as_str(), found.reason.as_str()),
-            ("True", reasons::IMAGE_NOT_PINNED)
-        );
-        found.message
-    };
-    let message = note(&world);
-    assert!(
-        message.contains("connection refused") && !message.contains('\u{1b}'),
-        "{message}"
+    assert_eq!(
+        (world.status().attempt, world.status().image),
+        (Some(Attempt(2)), found)
     );
-    // It is not asked again while it waits for its turn, and the note stays.
-    world.view.image = ObservedImage::NotAsked;
-    world.submission().status.as_mut().unwrap().job_name = None;
-    assert_eq!(question(&mut world), None);
-    assert_eq!(note(&world), message);
 }
 
 #[test]
-fn a_new_attempt_asks_again_for_an_image_that_was_missing() {
-    let mut world = answered(Err(Fault::NotFound));
-    world.pass_to(Failed, reasons::IMAGE_NOT_FOUND);
-    world.published();
-    world.submission().spec.attempt = Attempt(2);
-    world.view.image = ObservedImage::NotAsked;
+fn agents_of_one_pod_with_different_images_are_stopped_at_once_and_it_is_the_participants() {
+    let of = |letter: char| format!("team/agent@{}", digest(letter));
+    let (mut world, plan) = running_with([&of('a'), &of('b')]);
+    assert_eq!(plan.status.reason.as_deref(), Some(reasons::STOPPING));
+    world.job_gone();
+    let failure = world.pass_to(Failed, reasons::IMAGE_CHANGED).status.failure.unwrap();
+    assert_eq!(failure.class, FailureClass::Participant);
+    let (_, plan) = running_with([&of('a'), &format!("docker.io/other/agent@{}", digest('b'))]);
+    assert_eq!(plan.status.failure, None, "another name of the content proves nothing");
+}
+
+#[test]
+fn a_new_attempt_pulls_the_tag_again_where_no_agent_has_run() {
+    let mut world = World::local().with_pod();
+    world.see(waiting("agent-1", "ErrImagePull", "manifest unknown"));
     world.pass();
-    assert_eq!(question(&mut world).map(|question| question.attempt), Some(Attempt(2)));
+    world.go_to(1800);
+    world.pass_to(Pending, reasons::STOPPING);
+    world.job_gone();
+    world.pass_to(Failed, reasons::IMAGE_NOT_FOUND);
+    world.submission().spec.attempt = Attempt(2);
+    world.pass();
+    assert!(creates(&world.pass_to(Pending, reasons::PREPARING)));
+    assert_eq!(world.status().image, None);
 }
 
 #[test]
 fn pods_pull_by_digest_whatever_else_the_reference_names() {
-    let found = PinnedImage { digest: digest() };
-    let other = format!("sha256:{}", "b".repeat(64));
+    let found = PinnedImage { digest: digest('a') };
+    let other = digest('b');
     for (image, name) in [
         ("agent".to_owned(), "agent"),
         ("r.example:5000/team/agent:1".to_owned(), "r.example:5000/team/agent"),
@@ -245,7 +197,7 @@ fn pods_pull_by_digest_whatever_else_the_reference_names() {
         (format!("agent:1@{other}"), "agent"),
         (format!("r.example/agent@{other}"), "r.example/agent"),
     ] {
-        assert_eq!(pinned(&image, Some(&found)), format!("{name}@{}", digest()));
+        assert_eq!(pinned(&image, Some(&found)), format!("{name}@{}", digest('a')));
         assert_eq!(pinned(&image, None), image);
     }
 }
