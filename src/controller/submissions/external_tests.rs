@@ -216,7 +216,7 @@ fn an_attempt_that_evalai_has_asked_for_differs_from_one_that_a_person_has_begun
 }
 
 #[test]
-fn an_attempt_that_goes_on_from_a_live_one_is_nobodys_new_wish() {
+fn an_attempt_that_goes_on_from_a_live_one_is_nobodys_new_request() {
     let (mut submission, _) = with_job("sub", &leaderboard("one", "http://s3"));
     submission.spec.attempt = Attempt(2);
     let restart = |reason: &str| {
