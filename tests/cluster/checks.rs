@@ -135,7 +135,7 @@ async fn each_broken_part_is_named() {
         let missing = scene.lab.challenge("simulator:does-not-exist");
         let cases = broken_parts(&missing);
         let runs = cases.into_iter().map(async |(name, mut change, agent, expected)| {
-            change["deadlines"] = json!({"startSeconds": 120});
+            change["deadlines"] = json!({"startSeconds": 60});
             scene.leaderboard(name, change).await;
             // An end waits for the bucket, which a person has to make.
             let seconds = if name == "bucket" { "90" } else { "400" };
