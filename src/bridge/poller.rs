@@ -172,7 +172,7 @@ impl Poller {
         let outcomes = self.outcomes(&reader, &received, &readers).await;
         let count = u32::try_from(received.len()).unwrap_or(1);
         self.each = (self.each * 3 + begun.elapsed() / count) / 4;
-        let (mut deletes, mut held_back) = (Vec::new(), 0_u32);
+        let mut deletes = Vec::new();
         for (message, mut outcome) in received.iter().zip(outcomes) {
             if let MessageOutcome::Dead(reason) = &outcome {
                 outcome = self.dead_letter(&reader, message, reason, &readers).await;
@@ -184,7 +184,6 @@ impl Poller {
                 .total
                 .of([outcome.as_str()])
                 .inc();
-            held_back = held_back.saturating_add(u32::from(outcome.is_held_back()));
             match outcome {
                 MessageOutcome::Delete(_) | MessageOutcome::Dead(_) => deletes.push(message),
                 MessageOutcome::Later { seconds, why } => {
@@ -195,11 +194,6 @@ impl Poller {
             }
         }
         self.delete(&reader, &deletes).await;
-        if held_back > 0 {
-            // The controller does not take what is in flight for another reader's then.
-            let note = format!("{held_back} messages of the queue cannot be used yet and are received again later.");
-            self.publish(&readers, reasons::MESSAGES_HELD_BACK, &note).await;
-        }
         self.reader = Some((reader, since));
     }
 

@@ -176,15 +176,15 @@ async fn an_older_row_never_wins() {
         (row(1, "RUNNING"), Written::Stored),
         (row(1, "FAILED"), Written::Stored),
         (row(1, "FAILED"), Written::Stored),
-        (row(1, "RUNNING"), Written::Stale),
-        (row(1, "FINISHED"), Written::Stale),
+        (row(1, "RUNNING"), Written::Stale { kept: 1 }),
+        (row(1, "FINISHED"), Written::Stale { kept: 1 }),
         (row(2, "RUNNING"), Written::Stored),
-        (row(1, "FAILED"), Written::Stale),
+        (row(1, "FAILED"), Written::Stale { kept: 2 }),
         (row(2, "CANCELLED"), Written::Stored),
-        (row(2, "RUNNING"), Written::Stale),
-        (row(2, "FINISHED"), Written::Stale),
+        (row(2, "RUNNING"), Written::Stale { kept: 2 }),
+        (row(2, "FINISHED"), Written::Stale { kept: 2 }),
         (row(10, "PENDING"), Written::Stored),
-        (row(9, "FINISHED"), Written::Stale),
+        (row(9, "FINISHED"), Written::Stale { kept: 10 }),
     ];
     for (step, (row, want)) in steps.into_iter().enumerate() {
         assert_eq!(table.write(&row).await, Ok(want), "step {step}");
@@ -249,7 +249,7 @@ async fn metrics_of_an_earlier_row_are_removed() {
     }
     assert_eq!(
         table.write(&with(row(1, "FAILED"), Some("10.5"))).await,
-        Ok(Written::Stale),
+        Ok(Written::Stale { kept: 1 }),
         "it is not the same"
     );
 }
@@ -277,14 +277,14 @@ async fn a_cancel_is_written_over_another_end_and_takes_its_metrics_away() {
         }
         assert_eq!(
             table.write(&ended).await,
-            Ok(Written::Stale),
+            Ok(Written::Stale { kept: attempt }),
             "{end} does not come back"
         );
     }
     let older = with(row(1, "CANCELLED"), None);
     assert_eq!(
         table.write(&older).await,
-        Ok(Written::Stale),
+        Ok(Written::Stale { kept: 2 }),
         "it is of an older attempt"
     );
 }
@@ -302,7 +302,7 @@ async fn an_end_is_written_once_more_with_its_rerun() {
     assert_eq!(named().await, None);
     assert_eq!(
         table.write(&rerun("FAILED", "submission-99")).await,
-        Ok(Written::Stale),
+        Ok(Written::Stale { kept: 1 }),
         "another end"
     );
     for _ in 0..2 {
@@ -314,7 +314,7 @@ async fn an_end_is_written_once_more_with_its_rerun() {
     }
     assert_eq!(
         table.write(&rerun("FINISHED", "submission-100")).await,
-        Ok(Written::Stale),
+        Ok(Written::Stale { kept: 1 }),
         "the first one stays"
     );
     assert_eq!(table.write(&row(2, "RUNNING")).await, Ok(Written::Stored));

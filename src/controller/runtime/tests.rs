@@ -15,10 +15,9 @@ use crate::kubernetes::Namespaces;
 use crate::observability::shutdown::Stop;
 
 /// All that runs in a leader without Leaderboards, in the order of names.
-const TASKS: [&str; 20] = [
+const TASKS: [&str; 19] = [
     "events of Jobs",
     "events of Pods",
-    "foreign runs",
     "gauges",
     "images",
     "inbox",
@@ -26,9 +25,9 @@ const TASKS: [&str; 20] = [
     "looks",
     "lookups",
     "nodes",
-    "other results",
     "policies",
     "reconciles",
+    "rows",
     "sweep",
     "watch of jobs",
     "watch of leaderboards",

@@ -12,11 +12,11 @@ use serde_json::{Value, json};
 use tokio::sync::mpsc;
 
 use super::*;
+use crate::ask::Lookup;
 use crate::controller::fixtures::{Cluster, Surroundings, leaderboard, surroundings, with_job};
 use crate::controller::submissions::team_history::TeamHistory;
 use crate::controller::submissions::view::{
-    ObservedFence, ObservedImage, ObservedJob, ObservedLog, ObservedNode, ObservedReport, ObservedRoutes,
-    ObservedTexts, ObservedTraces, Turn,
+    ObservedFence, ObservedImage, ObservedJob, ObservedLog, ObservedNode, ObservedReport, ObservedTexts, Turn,
 };
 use leaderboard_api::conditions::{self, Truth};
 use leaderboard_api::{Attempt, State};
@@ -98,8 +98,7 @@ async fn bench(state: State) -> Bench {
         not_allowed: None,
         is_policy_in_place: true,
         image: ObservedImage::NotAsked,
-        traces: ObservedTraces::NotAsked,
-        other_routes: ObservedRoutes::NotAsked,
+        row: Lookup::default(),
         turn: Turn::Go,
         job: ObservedJob::Absent,
         job_refused: None,

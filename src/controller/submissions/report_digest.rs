@@ -16,14 +16,6 @@ const LONGEST: usize = 500;
 #[derive(Clone, Copy, Debug, Default, PartialEq, Eq)]
 pub struct ReportId([u8; 16]);
 
-/// A report that was found below a run's prefix.
-#[derive(Clone, Debug, PartialEq)]
-pub struct StoredReport {
-    /// UID of the object whose Pods have written it.
-    pub submission_uid: String,
-    pub digest: ReportDigest,
-}
-
 /// What is kept of a report. Its texts are read again when they are published.
 #[derive(Clone, Debug, Default, PartialEq)]
 pub struct ReportDigest {
@@ -58,17 +50,6 @@ impl ReportId {
         let mut id = [0; 16];
         id.copy_from_slice(&Sha256::digest(bytes)[..16]);
         Self(id)
-    }
-}
-
-impl StoredReport {
-    /// Reads a report as hostile text, of whatever object it is.
-    pub(super) fn read(bytes: &[u8]) -> Result<Self, ReportError> {
-        let report = Report::parse(bytes)?;
-        Ok(Self {
-            digest: ReportDigest::of(&report, ReportId::of(bytes)),
-            submission_uid: cut(&report.submission_uid),
-        })
     }
 }
 

@@ -6,11 +6,11 @@ use std::time::Duration;
 use jiff::Timestamp;
 use leaderboard_runner::verdict::Verdict;
 
-pub use super::foreign_runs::ObservedTraces;
 pub use super::images::ObservedImage;
-pub use super::other_results::ObservedRoutes;
 use super::report_digest::{ReportDigest, ReportId};
+use super::rows::Row;
 use super::team_history::TeamHistory;
+use crate::ask::Lookup;
 pub use crate::controller::slots::turns::Turn;
 use crate::pod::run::Stop;
 use crate::services::held_text::HeldText;
@@ -28,10 +28,8 @@ pub struct View {
     pub is_policy_in_place: bool,
     /// What its registry has reported of its image.
     pub image: ObservedImage,
-    /// What another program has left of it.
-    pub traces: ObservedTraces,
-    /// How many routes another program's run of it has; read only where a Leaderboard observes.
-    pub other_routes: ObservedRoutes,
+    /// The row that another program may have written of it.
+    pub row: Lookup<Row>,
     /// Whether it may start now; only meaningful while it has no Job and all else is settled.
     pub turn: Turn,
     pub job: ObservedJob,
@@ -450,8 +448,8 @@ pub enum EvalaiEnd {
 pub struct RecordView {
     /// The end of this attempt is written.
     pub end_written: bool,
-    /// The table keeps a later attempt, or another end, in place of this end.
-    pub is_superseded: bool,
+    /// The attempt of the row that the table keeps in place of this end.
+    pub superseded_by: Option<i64>,
     /// Why the last write failed.
     pub error: Option<String>,
 }

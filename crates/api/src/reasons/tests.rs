@@ -6,14 +6,13 @@ use std::fmt::Write as _;
 use super::*;
 
 const STATES: &str = concat!(env!("CARGO_MANIFEST_DIR"), "/../../docs/states.md");
-const CLASSES: [Class; 13] = [
+const CLASSES: [Class; 12] = [
     Class::Pending,
     Class::Running,
     Class::End,
     Class::Participant,
     Class::Infrastructure,
     Class::System,
-    Class::Comparison,
     Class::Scores,
     Class::CloudWatch,
     Class::Event,

@@ -408,7 +408,7 @@ fn part_of(reason: &str, text: &str) -> Part {
         | reasons::IDLE
         | reasons::TIME_LIMIT
         | reasons::DISK_FULL => Part::Agent,
-        reasons::RESULTS_NOT_STORED | reasons::PREFIX_IN_USE | reasons::NOT_STORED => Part::Bucket,
+        reasons::RESULTS_NOT_STORED | reasons::FOREIGN | reasons::NOT_STORED => Part::Bucket,
         reasons::LEADERBOARD_NOT_FOUND
         | reasons::LEADERBOARD_NOT_READY
         | reasons::TRACK_NOT_FOUND

@@ -179,10 +179,9 @@ fn of_job(draft: &PlanBuilder<'_>, end: &JobEnd) -> Failure {
 
 /// Failures that a second try may fix.
 fn may_retry(draft: &PlanBuilder<'_>, found: &Failure) -> bool {
-    const FINAL: [&str; 6] = [
+    const FINAL: [&str; 5] = [
         reasons::IMPORTED_FAILURE,
         reasons::GRAPHICS_DRIVER_MISSING,
-        reasons::PREFIX_IN_USE,
         reasons::JOB_DELETED,
         reasons::JOB_EXPIRED,
         reasons::SCHEDULE_DEADLINE,

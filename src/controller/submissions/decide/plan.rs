@@ -3,10 +3,9 @@
 use std::time::Duration;
 
 use crate::controller::slots::turns::InLine;
-use crate::controller::submissions::foreign_runs;
 use crate::controller::submissions::images::Question;
-use crate::controller::submissions::other_results;
 use crate::controller::submissions::report_digest::ReportId;
+use crate::controller::submissions::rows::Row;
 use crate::controller::submissions::view::{LogPlace, ReportDemand};
 use crate::pod::run::Stop;
 use leaderboard_api::{JobNumber, SubmissionStatus, names};
@@ -74,10 +73,8 @@ pub enum Action {
     JoinLine(InLine),
     /// Ask the image's registry.
     LookUpImage(Question),
-    /// Look whether another program runs the submission.
-    LookForForeignRun(Box<foreign_runs::Question>),
-    /// Read how many routes another program's run of the submission has.
-    ReadOtherResults(Box<other_results::Question>),
+    /// Read the row of another program that may run the submission.
+    ReadRow(Box<Row>),
     /// Create this Job.
     CreateJob(JobNumber),
     /// Delete a Job and its Pods with this grace period.

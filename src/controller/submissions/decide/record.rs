@@ -10,9 +10,8 @@ use leaderboard_api::text::sentence;
 
 /// What a check finds of the table.
 const TRIED: &str = "The table would take a row; a check writes none.";
-/// Shown of an end that is settled without a row: another try would be refused again.
-const SUPERSEDED: &str = "The table has a later attempt or another end of this run, and its row was left as it was. Correct the row by \
-                          hand if this end is the one that counts.";
+/// How the message begins of an end that is settled without a row: another try would be refused again.
+const SUPERSEDED: &str = "The table keeps another row of this run";
 /// Shown while the row may still turn out otherwise.
 const FOLLOWS_EVALAI: &str = "The table's row is written when EvalAI has answered, since EvalAI may still have cancelled the submission. The \
                               condition Published shows what EvalAI is waited for.";
@@ -29,7 +28,7 @@ pub(super) fn decide(draft: &mut PlanBuilder<'_>, is_shown: bool) -> Delivery {
         return without_leaderboard(draft, conditions::RECORDED);
     }
     if let Some(message) = why_without_row(draft) {
-        draft.condition(conditions::RECORDED, Truth::False, reasons::NOT_REQUIRED, message);
+        draft.condition(conditions::RECORDED, Truth::False, reasons::NOT_REQUIRED, &message);
         return Delivery::Done;
     }
     let view = draft.view.record.clone().unwrap_or_default();
@@ -61,16 +60,16 @@ pub(super) fn decide(draft: &mut PlanBuilder<'_>, is_shown: bool) -> Delivery {
 }
 
 /// Why the end has no row of its own; none if it has one, or will.
-fn why_without_row(draft: &PlanBuilder<'_>) -> Option<&'static str> {
+fn why_without_row(draft: &PlanBuilder<'_>) -> Option<String> {
     let has_team = draft.status.team.as_ref().is_some_and(|team| team.id.is_some());
     if draft.view.record.is_none() {
-        Some("")
+        Some(String::new())
     } else if draft.status.plan.is_none() {
-        Some("The submission was never accepted, so the table has no row for it.")
+        Some("The submission was never accepted, so the table has no row for it.".to_owned())
     } else if !has_team && !draft.spec().check {
-        Some("The row needs a team; give spec.team.id to a submission that is not EvalAI's.")
+        Some("The row needs a team; give spec.team.id to a submission that is not EvalAI's.".to_owned())
     } else {
-        is_superseded(draft).then_some(SUPERSEDED)
+        superseded(draft)
     }
 }
 
@@ -112,9 +111,16 @@ pub(super) fn record_again(draft: &mut PlanBuilder<'_>) -> bool {
     is_recorded
 }
 
-/// Whether the table keeps another row than that of this end: the recorder says so until it has forgotten the end, then the status.
-pub(super) fn is_superseded(draft: &PlanBuilder<'_>) -> bool {
-    let shown = draft.status.condition(conditions::RECORDED);
-    let is_shown = shown.is_some_and(|c| c.reason == reasons::NOT_REQUIRED && c.message == SUPERSEDED);
-    is_shown || draft.view.record.as_ref().is_some_and(|row| row.is_superseded)
+/// Shows that the table keeps another row than that of this end: the recorder knows until it has forgotten the end, then the status.
+pub(super) fn superseded(draft: &PlanBuilder<'_>) -> Option<String> {
+    if let Some(kept) = draft.view.record.as_ref().and_then(|row| row.superseded_by) {
+        let next = kept.saturating_add(1);
+        return Some(format!(
+            "{SUPERSEDED}, of attempt {kept}, and this end was not written there. Raise spec.attempt to {next} if the submission is to \
+             go on. Correct the row by hand if this end is the one that counts."
+        ));
+    }
+    let shown = draft.status.condition(conditions::RECORDED)?;
+    let is_shown = shown.reason == reasons::NOT_REQUIRED && shown.message.starts_with(SUPERSEDED);
+    is_shown.then(|| shown.message.to_string())
 }

@@ -19,6 +19,7 @@ use super::memory::Memory;
 use super::reruns::Reruns;
 use super::team_history::{TeamHistory, Teams};
 use super::view::{NodeView, ObservedJob, PodView, View};
+use crate::controller::objects::uid;
 use crate::controller::slots::SlotAllocator;
 use crate::controller::stores::Stores;
 use crate::kubernetes::objects::Job;
@@ -59,8 +60,7 @@ pub fn observe(uses: Uses<'_>, submission: Arc<Submission>, is_policy_in_place: 
         is_policy_in_place: may_create(&job) && leaderboard.as_deref().is_some_and(is_policy_in_place),
         not_allowed: leaderboard.as_deref().and_then(|board| uses.external.refusal(board)),
         image: workers.images.observe(&submission),
-        traces: workers.foreign_runs.observe(&submission),
-        other_routes: workers.other_results.observe(&submission),
+        row: workers.rows.get(uid(submission.as_ref())),
         job_refused: refusal(uses, &submission, &job),
         turn: uses.slots.turn(&submission, leaderboard.as_deref()),
         node: node.state,

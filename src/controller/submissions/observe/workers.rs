@@ -1,13 +1,14 @@
 //! What is asked of other systems in the background: a reconcile asks, and a later one finds the answer in memory.
 
 use kube::Client;
+use kube::runtime::reflector::ObjectRef;
 
 use super::lookups::Lookups;
+use crate::ask::{self, Asker};
 use crate::controller::objects::Wake;
 use crate::controller::submissions::archive::ArchiveWorkers;
-use crate::controller::submissions::foreign_runs::ForeignRuns;
 use crate::controller::submissions::images::Images;
-use crate::controller::submissions::other_results::OtherResults;
+use crate::controller::submissions::rows::{self, Row};
 use crate::observability::tasks::Tasks;
 use crate::services::aws::Aws;
 use leaderboard_api::Submission;
@@ -17,8 +18,7 @@ pub struct Workers {
     pub archive: ArchiveWorkers,
     pub lookups: Lookups,
     pub images: Images,
-    pub foreign_runs: ForeignRuns,
-    pub other_results: OtherResults,
+    pub rows: Asker<Row>,
 }
 
 impl Workers {
@@ -28,8 +28,7 @@ impl Workers {
             archive: ArchiveWorkers::new(aws.clone(), client.clone(), tasks.clone(), wake()),
             lookups: Lookups::start(client.clone(), tasks, wake()),
             images: Images::start(aws, client.clone(), tasks, wake()),
-            foreign_runs: ForeignRuns::start(aws, tasks, wake()),
-            other_results: OtherResults::start(aws, tasks, wake()),
+            rows: rows::start(aws, tasks, by_key(wake())),
         }
     }
 
@@ -37,7 +36,11 @@ impl Workers {
     pub fn forget(&self, uid: &str) {
         self.archive.forget(uid);
         self.images.forget(uid);
-        self.foreign_runs.forget(uid);
-        self.other_results.forget(uid);
+        self.rows.forget(uid);
     }
+}
+
+/// Wakes a submission by its key.
+fn by_key(wake: Wake<Submission>) -> ask::Wake {
+    Box::new(move |key| wake(ObjectRef::new(&key.name).within(&key.namespace)))
 }

@@ -28,7 +28,6 @@ mod properties;
 mod reading;
 mod record;
 mod requeue;
-mod restored;
 mod resume;
 mod retention;
 mod rules;

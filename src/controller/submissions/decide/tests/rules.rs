@@ -197,11 +197,11 @@ fn status_is_whole(plan: &Plan) {
     let waits = |action: &Action| {
         matches!(
             action,
-            Action::JoinLine(_) | Action::AskEvalai | Action::LookUpImage(_) | Action::LookForForeignRun(_)
+            Action::JoinLine(_) | Action::AskEvalai | Action::LookUpImage(_) | Action::ReadRow(_)
         )
     };
     if *status == SubmissionStatus::default() && plan.actions.iter().any(waits) {
-        // Nothing was written of it yet, and its place, or an answer of EvalAI, table and bucket, the registry or the DNS comes first.
+        // Nothing was written of it yet, and its place, or an answer of EvalAI, the table or the registry comes first.
         return;
     }
     let state = status.state.expect("a state");
