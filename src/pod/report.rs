@@ -7,6 +7,7 @@ use std::collections::BTreeMap;
 
 use leaderboard_api::text::one_line;
 use serde::{Deserialize, Serialize};
+use sha2::{Digest, Sha256};
 
 use super::schema::is_read;
 use leaderboard_api::{Attempt, PairState};
@@ -23,6 +24,18 @@ pub const LONGEST_TEXT: usize = 2000;
 pub const SCHEMA: u32 = 1;
 /// Version of the owner's mark.
 pub const OWNER_SCHEMA: u32 = 1;
+
+/// Tells one report from another by its bytes.
+#[derive(Clone, Copy, Debug, Default, PartialEq, Eq)]
+pub struct ReportId([u8; 16]);
+
+impl ReportId {
+    pub fn of(bytes: &[u8]) -> Self {
+        let mut id = [0; 16];
+        id.copy_from_slice(&Sha256::digest(bytes)[..16]);
+        Self(id)
+    }
+}
 
 /// Whose writes below the prefix count.
 #[derive(Serialize, Deserialize, Clone, Debug, PartialEq, Eq)]

@@ -2,19 +2,15 @@
 
 use leaderboard_results::{Format, metrics};
 use serde_json::{Map, Value};
-use sha2::{Digest, Sha256};
 
-use crate::pod::report::{Logs, Report, ReportError, ReportPair};
+use super::payloads::left_out;
+use crate::pod::report::{Logs, Report, ReportError, ReportId, ReportPair};
 use crate::pod::run::Stop;
 use leaderboard_api::text::one_line;
 use leaderboard_api::{Attempt, Progress, Score};
 
 /// Longest text of a report that is kept, in characters.
 const LONGEST: usize = 500;
-
-/// Tells one report from another by its bytes.
-#[derive(Clone, Copy, Debug, Default, PartialEq, Eq)]
-pub struct ReportId([u8; 16]);
 
 /// A report that was found below a run's prefix.
 #[derive(Clone, Debug, PartialEq)]
@@ -51,14 +47,8 @@ pub struct ReportDigest {
     pub agents_fill_disk: bool,
     /// The metrics of a final report, for the table.
     pub metrics: Option<Box<Map<String, Value>>>,
-}
-
-impl ReportId {
-    pub(super) fn of(bytes: &[u8]) -> Self {
-        let mut id = [0; 16];
-        id.copy_from_slice(&Sha256::digest(bytes)[..16]);
-        Self(id)
-    }
+    /// Why EvalAI is not sent one of its texts.
+    pub left_out: Option<Box<str>>,
 }
 
 impl StoredReport {
@@ -74,10 +64,10 @@ impl StoredReport {
 
 impl ReportDigest {
     /// Reads a report as hostile text. None: it is of another object.
-    pub(super) fn read(bytes: &[u8], uid: &str) -> Result<Option<(Self, Report)>, ReportError> {
+    pub(super) fn read(bytes: &[u8], uid: &str) -> Result<Option<Self>, ReportError> {
         let report = Report::parse(bytes)?;
         let is_of = report.submission_uid == uid;
-        Ok(is_of.then(|| (Self::of(&report, ReportId::of(bytes)), report)))
+        Ok(is_of.then(|| Self::of(&report, ReportId::of(bytes))))
     }
 
     /// Whether all routes are done, and nothing more comes.
@@ -126,6 +116,7 @@ impl ReportDigest {
             }),
             agents_fill_disk: report.agents_fill_disk,
             metrics: report.is_final.then(|| accuracies(&report.results)).flatten(),
+            left_out: left_out(report).map(Into::into),
         }
     }
 }

@@ -91,10 +91,6 @@ pub enum Action {
     AnnotateStop { pod: String, stop: Stop },
     /// Keep the tail of the log that explains the failure, from the first of these places that has it.
     KeepLog { places: Vec<LogPlace> },
-    /// Read the texts of this report, so that they can be published.
-    ReadTexts { of: ReportId },
-    /// Give the memory of the texts that were read back.
-    DropTexts,
     /// Ask the API server for this node.
     LookUpNode(String),
     /// Ask EvalAI for the submission.

@@ -22,7 +22,7 @@ const RECHECK: Duration = Duration::from_secs(1);
 
 /// The order of all requests. What is due and comes first is sent next; all that comes after it waits for the budget.
 #[derive(Clone, Copy, Debug, PartialEq, Eq, PartialOrd, Ord)]
-enum Class {
+pub(super) enum Class {
     /// Not of the API.
     Free,
     /// A write whose read has just been answered: that read is worth nothing a moment later.
@@ -52,7 +52,7 @@ impl Class {
 }
 
 /// Less comes first: whether it has failed twice, its class, when its end came to be, and since when it is due.
-type Rank = (bool, Class, Option<Timestamp>, Duration);
+pub(super) type Rank = (bool, Class, Option<Timestamp>, Duration);
 
 /// A failing list of cancelled submissions keeps its place: it waits by itself, and after an outage runs are to stop before ends are
 /// published.
@@ -69,8 +69,10 @@ fn question(since: Duration, now: &Now) -> Class {
 }
 
 #[derive(Clone, Copy, Debug)]
-enum What<'a> {
+pub(super) enum What<'a> {
     Sub(&'a Key, Step),
+    /// Not a request: what the next write of a submission is sent with.
+    Payload(&'a Key),
     List(i64, Purpose),
     Check(i64),
     /// What others wait for.
@@ -78,7 +80,7 @@ enum What<'a> {
 }
 
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
-enum Step {
+pub(super) enum Step {
     Get,
     /// A read that is worth nothing without the write that follows it.
     GetForWrite,
@@ -88,20 +90,28 @@ enum Step {
 
 /// A request that is due at `ready`.
 #[derive(Clone, Copy, Debug)]
-struct Offer<'a> {
-    rank: Rank,
+pub(super) struct Offer<'a> {
+    pub rank: Rank,
     ready: Duration,
-    what: What<'a>,
+    pub what: What<'a>,
 }
 
 impl Queue {
     /// The next request, and marks it as sent. Without `may_write` every write is kept back.
     pub fn next(&mut self, now: Now, may_write: bool) -> Next {
         self.open_writes(&now);
+        self.tidy_payload();
         let (due, later): (Vec<_>, Vec<_>) = self
             .offers(&now, may_write)
             .into_iter()
             .partition(|offer| offer.ready <= now.at);
+        let (missing, due): (Vec<_>, Vec<_>) = due
+            .into_iter()
+            .partition(|offer| matches!(offer.what, What::Payload(_)));
+        if let Some((key, outline)) = self.payload_to_read(&missing, &due) {
+            self.start_payload(&key, &outline);
+            return Next::Read(key, outline);
+        }
         let best = due.into_iter().min_by_key(|offer| offer.rank);
         let affordable = best.map(|best| self.affordable_at(&now, best.rank));
         let Some(best) = best.filter(|_| affordable <= Some(now.at)) else {
@@ -118,6 +128,8 @@ impl Queue {
             }
             What::List(id, purpose) => self.start_list(id, purpose).map(|list| (list, None)),
             What::Check(id) => self.start_check(id).map(|check| (check, None)),
+            // It was taken out above.
+            What::Payload(_) => None,
             What::Passing => self.passing.start(now.at).map(|(started, other)| {
                 number = Some(started);
                 (other, None)
@@ -202,16 +214,24 @@ impl Queue {
         let idle = Lane::default();
         let lane = self.lanes.get(&sub.pk).unwrap_or(&idle);
         let failures = sub.failures.max(sub.write_failures);
-        let offer = |class, since, ready: Duration, step| Offer {
+        let offer_of = |class, since, ready: Duration, what| Offer {
             rank: rank(class, failures, sub.end_since().filter(|_| class == Class::End), since),
             ready: ready.max(lane.hold_until),
-            what: What::Sub(key, step),
+            what,
         };
+        let offer = |class, since, ready, step| offer_of(class, since, ready, What::Sub(key, step));
         let write = sub.next_write().filter(|_| may_write && now.at >= self.not_before);
+        let (missing, write) = match write {
+            Some((write, since)) if self.lacks_payload(key, sub) => {
+                let class = Class::of(write);
+                (Some(offer_of(class, since, sub.retry_at, What::Payload(key))), None)
+            }
+            write => (None, write),
+        };
         // A list that is on its way may answer it.
         let sweep = self
             .challenges
-            .get(&sub.challenge)
+            .get(&sub.target.challenge)
             .and_then(|c| c.lists.get(&Purpose::SweepSubmitted));
         let asked = sub.asked.filter(|_| !sweep.is_some_and(|sweep| sweep.busy));
         let is_checked = lane.checked.is_some_and(|at| now.at <= at + self.timing.fresh);
@@ -237,7 +257,7 @@ impl Queue {
         let image = sub.wants_image() && sub.asked.is_none();
         let image = image.then(|| offer(Class::Free, now.at, sub.image_at, Step::Image));
         let is_free = lane.busy.is_none();
-        let offers = [next, image].into_iter().flatten();
+        let offers = [next, missing, image].into_iter().flatten();
         offers.filter(move |_| is_free)
     }
 
@@ -250,7 +270,10 @@ impl Queue {
             })
         };
         let list = |purpose| challenge.lists.get(&purpose).copied().unwrap_or_default();
-        let is_live = self.subs.values().any(|sub| sub.challenge == id && sub.live.is_some());
+        let is_live = self
+            .subs
+            .values()
+            .any(|sub| sub.target.challenge == id && sub.live.is_some());
         let cancelled = is_live.then(|| {
             let purpose = Purpose::Cancel;
             offer(list(purpose), Class::Cancelled, What::List(id, purpose))
@@ -285,10 +308,10 @@ impl Queue {
 
     /// A request about a submission, and by when it has to leave.
     fn start_sub(&mut self, key: &Key, step: Step) -> Option<(Request, Option<Duration>)> {
-        let sub = self.subs.get_mut(key)?;
+        let sub = self.subs.get(key)?;
         let subject = SubmissionRef {
             key: key.clone(),
-            challenge: sub.challenge,
+            challenge: sub.target.challenge,
             pk: sub.pk,
             attempt: sub.run.attempt,
             log: sub.run.log.clone(),
@@ -301,8 +324,11 @@ impl Queue {
                 let named = sub.view.row.as_ref().is_some_and(|row| row.names(&sub.run.job));
                 Request::Progress(subject, progress, (!named).then(|| sub.run.job.clone()))
             }
-            Step::Write(Write::Partial) => Request::Partial(subject, sub.partial.as_ref()?.what.clone()),
-            Step::Write(Write::End) => Request::Final(subject, sub.outcome()?, sub.end.as_ref()?.what.1.clone()),
+            Step::Write(Write::Partial) => Request::Partial(subject, self.payload(key, &sub.partial.as_ref()?.what)?),
+            Step::Write(Write::End) => {
+                let payload = self.payload(key, &sub.end.as_ref()?.what.1)?;
+                Request::Final(subject, sub.outcome()?, payload)
+            }
         };
         let lane = self.lanes.entry(sub.pk).or_default();
         let checked = lane.checked.take().filter(|_| request.is_write());

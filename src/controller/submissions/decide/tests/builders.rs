@@ -13,8 +13,8 @@ use crate::controller::submissions::foreign_runs::{Looked, Traces, Unread};
 use crate::controller::submissions::report_digest::ReportDigest;
 use crate::controller::submissions::view::{
     ContainerView, EndView, EvalaiEnd, EvalaiInfo, EvalaiView, JobEnd, JobView, ObservedFence, ObservedJob,
-    ObservedLog, ObservedNode, ObservedReport, ObservedRoutes, ObservedTexts, ObservedTraces, PodView, RecordView,
-    Stage, Standing, Texts, Turn, View,
+    ObservedLog, ObservedNode, ObservedReport, ObservedRoutes, ObservedTraces, PodView, RecordView, Stage, Standing,
+    Turn, View,
 };
 use crate::pod::report::{Report, ReportPair};
 use crate::pod::run::Stop;
@@ -129,7 +129,6 @@ impl World {
                 // Whatever is asked for is there already; the tests of waiting set it otherwise.
                 report_stage: Some(Stage::JobEnded),
                 report_waited: std::time::Duration::ZERO,
-                texts: ObservedTexts::NotRead,
                 fence: ObservedFence::Held,
                 log: ObservedLog::Kept,
                 evalai: evalai.then_some(known),
@@ -137,7 +136,6 @@ impl World {
                 evalai_waited: std::time::Duration::from_secs(5),
                 written_ago: None,
                 record: Some(RecordView::default()),
-                partial_sent: None,
                 rerun_as: None,
                 evalai_writes_from: None,
             },
@@ -243,13 +241,7 @@ impl World {
 
     /// Its report shows this.
     pub fn report(&mut self, report: Report) {
-        let digest = ReportDigest::from(&report);
-        self.view.texts = ObservedTexts::Read(Arc::new(Texts {
-            of: digest.id,
-            result: report.results,
-            ..Texts::default()
-        }));
-        self.view.report = ObservedReport::Ours(Arc::new(digest));
+        self.view.report = ObservedReport::Ours(Arc::new(ReportDigest::from(&report)));
     }
 
     pub fn status(&self) -> SubmissionStatus {
@@ -321,9 +313,6 @@ impl World {
         let plan = decide(&self.view);
         rules::check(&self.view, &plan);
         self.submission().status = Some(plan.status.clone());
-        if plan.actions.contains(&Action::Forget) {
-            self.view.texts = ObservedTexts::NotRead;
-        }
         plan
     }
 

@@ -11,7 +11,7 @@ use super::builders::*;
 use crate::controller::submissions::decide::job_name;
 use crate::controller::submissions::view::{
     EvalaiEnd, EvalaiView, JobEnd, JobView, ObservedFence, ObservedJob, ObservedLog, ObservedNode, ObservedReport,
-    ObservedTexts, PodView, Stage, Standing, Turn,
+    PodView, Stage, Standing, Turn,
 };
 use crate::pod::report::Report;
 use crate::pod::run::Stop;
@@ -29,7 +29,6 @@ enum Change {
         waited: Duration,
         fence: ObservedFence,
         log: ObservedLog,
-        texts: ObservedTexts,
     },
     Evalai(Box<EvalaiView>),
     Recorded(bool),
@@ -238,17 +237,11 @@ fn answers() -> impl Strategy<Value = Change> {
             ObservedLog::GivenUp,
         ])
     });
-    let texts = select(vec![
-        ObservedTexts::NotRead,
-        ObservedTexts::Unread("away".into()),
-        ObservedTexts::Read(Arc::default()),
-    ]);
-    (stage, waited(), fence, log, texts).prop_map(|(stage, waited, fence, log, texts)| Change::Answers {
+    (stage, waited(), fence, log).prop_map(|(stage, waited, fence, log)| Change::Answers {
         stage,
         waited,
         fence,
         log,
-        texts,
     })
 }
 
@@ -272,14 +265,8 @@ fn evalai_view() -> impl Strategy<Value = EvalaiView> {
         Some(EvalaiEnd::Ended {
             status: "cancelled".into(),
         }),
-        Some(EvalaiEnd::Refused {
-            message: "no".into(),
-            is_due: false,
-        }),
-        Some(EvalaiEnd::Refused {
-            message: "no".into(),
-            is_due: true,
-        }),
+        Some(EvalaiEnd::Refused { message: "no".into() }),
+        Some(EvalaiEnd::Refused { message: "no".into() }),
     ];
     let error = select(vec![None, Some("away".to_owned())]);
     let cancels = select(
@@ -374,13 +361,11 @@ fn apply(world: &mut World, change: Change) {
             waited,
             fence,
             log,
-            texts,
         } => {
             world.view.report_stage = stage;
             world.view.report_waited = waited;
             world.view.fence = fence;
             world.view.log = log;
-            world.view.texts = texts;
         }
         Change::Evalai(view) => world.view.evalai = is_evalais.then_some(*view),
         Change::Recorded(end) => world.view.record.get_or_insert_default().end_written = end,
