@@ -15,7 +15,7 @@ use crate::kubernetes::Namespaces;
 use crate::observability::shutdown::Stop;
 
 /// All that runs in a leader without Leaderboards, in the order of names.
-const TASKS: [&str; 19] = [
+const TASKS: [&str; 20] = [
     "events of Jobs",
     "events of Pods",
     "foreign runs",
@@ -28,6 +28,7 @@ const TASKS: [&str; 19] = [
     "other results",
     "policies",
     "reconciles",
+    "slots",
     "sweep",
     "watch of jobs",
     "watch of leaderboards",

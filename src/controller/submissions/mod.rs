@@ -22,5 +22,4 @@ pub mod report_digest;
 pub mod reruns;
 mod result_texts;
 pub mod spans;
-pub mod team_use;
 pub mod view;
