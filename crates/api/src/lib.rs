@@ -22,7 +22,6 @@ pub mod leaderboard;
 pub mod leaderboard_network;
 pub mod leaderboard_parts;
 pub mod leaderboard_services;
-pub mod log_collectors;
 pub mod names;
 mod pair_status;
 mod progress;
