@@ -65,6 +65,11 @@ pub fn agent_container(pair: usize) -> String {
     format!("agent-{pair}")
 }
 
+/// True for the name of an agent's container.
+pub fn is_agent_container(name: &str) -> bool {
+    name.starts_with("agent-")
+}
+
 /// Name of a simulator's container; pairs count from 1.
 pub fn simulator_container(pair: usize) -> String {
     format!("simulator-{pair}")

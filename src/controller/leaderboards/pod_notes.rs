@@ -7,6 +7,8 @@ use std::net::IpAddr;
 
 use serde_json::Value;
 
+use leaderboard_api::names;
+
 /// Pods of one track.
 pub(super) struct TrackPods {
     pub(super) track: String,
@@ -142,7 +144,7 @@ fn agents(pod: &Value) -> impl Iterator<Item = &Value> {
     let lists = ["initContainers", "containers"].map(|field| list(pod, field));
     lists.into_iter().flatten().filter(|container| {
         let name = container["name"].as_str();
-        name.is_some_and(|name| name.starts_with("agent-"))
+        name.is_some_and(names::is_agent_container)
     })
 }
 

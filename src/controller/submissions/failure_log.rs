@@ -16,7 +16,7 @@ use super::view::{LogAt, LogPlace};
 use crate::services::archive::Archive;
 use leaderboard_api::client_errors;
 use leaderboard_api::names::FAILURE_LOG_KEY;
-use leaderboard_api::{Attempt, JobNumber};
+use leaderboard_api::{Attempt, JobNumber, names};
 
 /// Characters that are kept, as EvalAI's own worker does.
 const TAIL_CHARS: usize = 10_000;
@@ -52,7 +52,7 @@ pub struct Tail {
 impl Tail {
     /// Whether the participant's own program wrote it.
     pub fn is_agents(&self) -> bool {
-        self.container.starts_with("agent-")
+        names::is_agent_container(&self.container)
     }
 
     /// With a first line that shows whose log it is, and where all of it is.

@@ -10,7 +10,7 @@ use super::failure::{charged, infrastructure};
 use super::plan_builder::PlanBuilder;
 use crate::controller::submissions::pod_layout::{LOGS_VOLUME, SHM_VOLUME};
 use leaderboard_api::text::sentence;
-use leaderboard_api::{Failure, LeaderboardSpec, reasons};
+use leaderboard_api::{Failure, LeaderboardSpec, names, reasons};
 
 /// The failure of a Pod that was evicted because of its own disk. Another one on the same node would run into it again.
 pub(super) fn full(draft: &PlanBuilder<'_>) -> Option<Failure> {
@@ -64,7 +64,7 @@ impl<'a> Account<'a> {
 
 /// A container of an agent, or the name that stands for those of all agents in an overlay.
 fn is_agent(name: &str) -> bool {
-    name == "agent" || name.starts_with("agent-")
+    name == "agent" || names::is_agent_container(name)
 }
 
 /// True if agents write to a volume of the hosts' own, and no other container does.

@@ -5,7 +5,7 @@ use super::plan_builder::PlanBuilder;
 use crate::controller::submissions::view::{ContainerView, PodView};
 use leaderboard_api::{
     Failure, ImagePattern, ImageReference, LeaderboardSpec, PinnedImage, Repository, SubmissionStatus, image_pattern,
-    reasons,
+    names, reasons,
 };
 
 /// Why the Leaderboard does not allow the image.
@@ -82,7 +82,7 @@ fn digests<'a>(status: &SubmissionStatus, pod: &'a PodView) -> Vec<&'a str> {
     let agents = pod
         .containers
         .iter()
-        .filter(|container| container.name.starts_with("agent-"));
+        .filter(|container| names::is_agent_container(&container.name));
     agents.filter_map(digest).collect()
 }
 

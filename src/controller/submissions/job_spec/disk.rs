@@ -28,9 +28,7 @@ pub(super) fn fill(pod: &mut Value, logs: u64) {
     let is_unlimited = |container: &Value| names_disk(container, "requests") && !names_disk(container, "limits");
     let unlimited = pairs.iter().any(is_unlimited);
     for container in pairs.iter_mut().filter(|container| !is_settled(container)) {
-        let is_agent = container["name"]
-            .as_str()
-            .is_some_and(|name| name.starts_with("agent-"));
+        let is_agent = container["name"].as_str().is_some_and(names::is_agent_container);
         let [request, limit] = if is_agent { AGENT } else { SIMULATOR };
         set(container, "requests", request);
         if !unlimited {

@@ -60,7 +60,7 @@ fn agent_started(status: &PodStatus) -> Option<jiff::Timestamp> {
     let agents = status
         .container_statuses
         .iter()
-        .filter(|c| c.name.starts_with("agent-"));
+        .filter(|c| names::is_agent_container(&c.name));
     agents.flat_map(started_times).min()
 }
 
