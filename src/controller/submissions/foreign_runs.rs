@@ -7,7 +7,8 @@ use std::time::Duration;
 
 use jiff::Timestamp;
 
-use super::questions::{self, Observed, Questions, Service};
+use super::questions::{self, Observed, Questions};
+use crate::ask::Service;
 use crate::controller::objects::Wake;
 use crate::controller::submissions::report_digest::StoredReport;
 use crate::lock::lock;
@@ -93,8 +94,8 @@ impl questions::Question for Question {
 
     fn shares_a_service(&self, other: &Self) -> bool {
         let tables = self.table.as_ref().zip(other.table.as_ref());
-        Service::of_bucket(&self.storage) == Service::of_bucket(&other.storage)
-            || tables.is_some_and(|(one, other)| Service::of_table(one) == Service::of_table(other))
+        Service::bucket(&self.storage) == Service::bucket(&other.storage)
+            || tables.is_some_and(|(one, other)| Service::table(one) == Service::table(other))
     }
 }
 

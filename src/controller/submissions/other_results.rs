@@ -5,7 +5,8 @@ use std::time::Duration;
 
 use serde::Deserialize;
 
-use super::questions::{self, Observed, Questions, Service};
+use super::questions::{self, Observed, Questions};
+use crate::ask::Service;
 use crate::controller::objects::Wake;
 use crate::observability::tasks::Tasks;
 use crate::services::archive::Archive;
@@ -49,7 +50,7 @@ impl questions::Question for Question {
     }
 
     fn shares_a_service(&self, other: &Self) -> bool {
-        Service::of_bucket(&self.storage) == Service::of_bucket(&other.storage)
+        Service::bucket(&self.storage) == Service::bucket(&other.storage)
     }
 }
 

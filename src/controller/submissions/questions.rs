@@ -16,7 +16,7 @@ use crate::controller::objects::{Wake, log_span_of, uid, uid_of};
 use crate::lock::lock;
 use crate::observability::about::LogSpan;
 use crate::observability::tasks::Tasks;
-use leaderboard_api::{Attempt, Storage, Submission, Table};
+use leaderboard_api::{Attempt, Submission};
 
 /// How long an answer is kept that nobody asks for again.
 const KEPT: Duration = Duration::from_mins(10);
@@ -36,29 +36,6 @@ pub trait Question: Clone + PartialEq + Send + 'static {
     /// Whether one service is asked both, so that it holds up both if it hangs.
     fn shares_a_service(&self, _other: &Self) -> bool {
         true
-    }
-}
-
-/// A bucket or a table as something that may hang: an endpoint of one's own hangs with all that it has, of AWS each alone.
-#[derive(PartialEq, Eq)]
-pub(super) enum Service<'a> {
-    Endpoint(&'a str),
-    OfAws { region: Option<&'a str>, name: &'a str },
-}
-
-impl<'a> Service<'a> {
-    /// Of a bucket.
-    pub(super) fn of_bucket(storage: &'a Storage) -> Self {
-        Self::of(storage.endpoint.as_deref(), storage.region.as_deref(), &storage.bucket)
-    }
-
-    /// Of a table.
-    pub(super) fn of_table(table: &'a Table) -> Self {
-        Self::of(table.endpoint.as_deref(), table.region.as_deref(), &table.name)
-    }
-
-    fn of(endpoint: Option<&'a str>, region: Option<&'a str>, name: &'a str) -> Self {
-        endpoint.map_or(Self::OfAws { region, name }, Self::Endpoint)
     }
 }
 
