@@ -133,10 +133,7 @@ pub fn dry_run(verb: &str, chosen: &[&Submission], frame: Frame) -> Vec<String> 
 fn row(one: &Submission, now: Timestamp) -> Vec<String> {
     let status = one.status.as_ref();
     let failure = status.and_then(|status| status.failure.as_ref());
-    let class = failure.map_or("", |failure| match failure.class {
-        FailureClass::Participant => "Participant",
-        FailureClass::Infrastructure => "Infrastructure",
-    });
+    let class = failure.map_or("", |failure| failure.class.as_str());
     let plan = status.and_then(|status| status.plan.as_ref());
     // The registry is the same for all, and the tag is what differs.
     let simulator = plan.and_then(|plan| plan.simulator_image.rsplit('/').next());
