@@ -2,6 +2,7 @@
 //! documents laid over it.
 #![cfg(test)]
 
+use std::collections::BTreeMap;
 use std::os::unix::fs::PermissionsExt as _;
 use std::path::Path;
 use std::process::{Command, Output};
@@ -16,31 +17,14 @@ const TOKEN: &str = "local-host-token";
 const FILE: &str = "entries.json";
 
 /// The four entries, as the original has them.
-fn entries() -> [(&'static str, Value); 4] {
-    let board = |number: u32| {
-        let image = |name: &str| format!("123456789012.dkr.ecr.us-west-2.amazonaws.com/{name}-{number}:latest");
-        let name = format!("leaderboard-{number}");
-        json!({
-            "name": name, "endpoint": "https://0123.gr7.us-west-2.eks.amazonaws.com", "certificate_authority": "LS0tLS1=",
-            "simulator_image": image("simulator"), "leaderboard_image": image("leaderboard"), "logcopy_image": image("logcopy"),
-            "s3_bucket": name, "dynamodb_submissions_table": name, "cloudwatch_log_group": name,
-        })
-    };
-    let tracks = json!({
-        "4170": "leaderboard-10-sensors", "4171": "leaderboard-10-map",
-        "4172": "leaderboard-20-sensors", "4173": "leaderboard-20-map",
-    });
-    [
-        ("evalai", json!({"auth_token": TOKEN, "api_server": "https://eval.ai"})),
-        ("evalai-tracks", tracks),
-        ("leaderboard-10", board(10)),
-        ("leaderboard-20", board(20)),
-    ]
+fn entries() -> BTreeMap<&'static str, Value> {
+    let file = include_str!("../../crates/kubectl-leaderboard/src/import/entries.json");
+    serde_json::from_str(file).unwrap()
 }
 
 /// What `aws secretsmanager get-secret-value --output json` prints of them.
-fn answers(entries: &[(&str, Value)]) -> String {
-    let answer = |(name, entry): &(&str, Value)| {
+fn answers(entries: &BTreeMap<&str, Value>) -> String {
+    let answer = |(name, entry): (&&str, &Value)| {
         let arn = format!("arn:aws:secretsmanager:us-west-2:123456789012:secret:{name}-Ab12Cd");
         format!(
             "{:#}\n",
@@ -125,7 +109,7 @@ async fn the_api_server_accepts_the_manifests_with_the_decisions_of_the_document
     let namespace = server().await.namespace("decisions").await;
     let mut given = entries();
     // The page's reader leaves the token out.
-    given[0].1 = json!({"api_server": "https://eval.ai"});
+    given.insert("evalai", json!({"api_server": "https://eval.ai"}));
     for page in ["import.md", "migrate.md"] {
         let folder = folder(&answers(&given), 0o644);
         let (manifests, notes) = texts(&import(folder.path(), &["--namespace", &namespace]));

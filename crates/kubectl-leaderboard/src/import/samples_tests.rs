@@ -13,27 +13,12 @@ pub(super) type Texts = BTreeMap<&'static str, Value>;
 
 /// The entry of one Leaderboard.
 pub(super) fn board(number: &str) -> Value {
-    let image = |name: &str| format!("123456789012.dkr.ecr.us-west-2.amazonaws.com/{name}-{number}:latest");
-    let name = format!("leaderboard-{number}");
-    json!({
-        "name": name, "endpoint": "https://0123.gr7.us-west-2.eks.amazonaws.com", "certificate_authority": "LS0tLS1CRUdJTg==",
-        "simulator_image": image("simulator"), "leaderboard_image": image("leaderboard"), "logcopy_image": image("logcopy"),
-        "s3_bucket": name, "dynamodb_submissions_table": name, "cloudwatch_log_group": name,
-    })
+    texts()[format!("leaderboard-{number}").as_str()].clone()
 }
 
-/// All four.
+/// All four, as the original has them. A test of the API server reads the same file.
 pub(super) fn texts() -> Texts {
-    let tracks = json!({
-        "4170": "leaderboard-10-sensors", "4171": "leaderboard-10-map",
-        "4172": "leaderboard-20-sensors", "4173": "leaderboard-20-map",
-    });
-    Texts::from([
-        ("evalai", json!({"auth_token": TOKEN, "api_server": "https://eval.ai"})),
-        ("evalai-tracks", tracks),
-        ("leaderboard-10", board("10")),
-        ("leaderboard-20", board("20")),
-    ])
+    serde_json::from_str(include_str!("entries.json")).unwrap()
 }
 
 /// What `aws secretsmanager get-secret-value --output json` prints of an entry.
