@@ -36,6 +36,29 @@ async fn put(world: &World, table: &str, columns: &[(&str, &str)]) {
     request.send().await.unwrap();
 }
 
+/// Rows of another program's run, of a failed one and of one that is written by a stranger.
+async fn put_others(world: &World, [rows, local_rows]: &[String; 2]) {
+    for (id, status, more) in [("7001", "RUNNING", &[][..]), ("7002", "FAILED", &[("attempt", "1")])] {
+        let row = [
+            ("team_id", "1"),
+            ("submission_id", id),
+            ("submission_status", status),
+            ("track_id", "1"),
+        ];
+        put(world, rows, &[&row[..], more].concat()).await;
+    }
+    let hostile = [
+        ("team_id", "9"),
+        ("team_name", HOSTILE),
+        ("submission_id", "local-hostile"),
+        ("submission_status", "PENDING"),
+        ("track_name", "SENSORS"),
+        ("submitted_image_uri", "r/agent:1"),
+        ("attempt", "1"),
+    ];
+    put(world, local_rows, &hostile).await;
+}
+
 /// The commands of the page for one Leaderboard, whose table `aws` prints from a file.
 fn commands(world: &World, board: &str, file: &str) -> String {
     let page = std::path::Path::new(env!("CARGO_MANIFEST_DIR")).join("docs/backup.md");
@@ -72,26 +95,7 @@ async fn runs_that_are_newer_than_the_backup_go_on_from_their_rows() {
     begin(&world, LOCAL_RUNNING, LOCAL_RUNNING).await;
     drop(controller);
     until_released(&world).await;
-    for (id, status, more) in [("7001", "RUNNING", &[][..]), ("7002", "FAILED", &[("attempt", "1")])] {
-        let row = [
-            ("team_id", "1"),
-            ("submission_id", id),
-            ("submission_status", status),
-            ("track_id", "1"),
-        ];
-        put(&world, &tables[0], &[&row[..], more].concat()).await;
-    }
-    let hostile = [
-        ("team_id", "9"),
-        ("team_name", HOSTILE),
-        ("submission_id", "local-hostile"),
-        ("submission_status", "PENDING"),
-        ("track_name", "SENSORS"),
-        ("submitted_image_uri", "r/agent:1"),
-        ("attempt", "1"),
-    ];
-    put(&world, &tables[1], &hostile).await;
-
+    put_others(&world, &tables).await;
     lose::<Submission>(&world).await;
     lose::<Job>(&world).await;
     lose::<Pod>(&world).await;
