@@ -245,10 +245,7 @@ fn open(status: &SubmissionStatus) -> Vec<&'static str> {
         (conditions::PUBLISHED, "EvalAI"),
         (conditions::RECORDED, "DynamoDB"),
     ];
-    let is_open = |type_: &str| {
-        let condition = status.condition(type_);
-        condition.is_some_and(|condition| condition.status != "True" && condition.reason != reasons::NOT_REQUIRED)
-    };
+    let is_open = |type_: &str| status.condition(type_).is_some() && !status.is_delivered(type_);
     let open = systems.into_iter().filter(|(type_, _)| is_open(type_));
     open.map(|(_, system)| system).collect()
 }

@@ -42,11 +42,6 @@ const CONDITION: &str = "attribute_not_exists(#attempt) OR #attempt < :attempt \
 const CANCELLED: &str = ENDS[2];
 /// A cancel that EvalAI shows after it has refused a result is written over the end that the row had. Nothing leads back from it.
 const OR_CANCELLED: &str = " OR (#attempt = :attempt AND #status IN (:end0, :end1))";
-/// Column with the Submission of a re-run, which comes after the end.
-const RERUN: &str = "rerun_as";
-/// A row that names a re-run is also written over the end that it had before.
-const OR_RERUN: &str = " OR (#attempt = :attempt AND #status = :status AND attribute_not_exists(#rerun))";
-
 /// One row, all columns as text. An empty text is unknown: its column stays as it is.
 #[derive(Clone, Debug, Default, PartialEq, Eq)]
 pub struct Row {
@@ -78,8 +73,6 @@ pub struct Row {
     pub progress: String,
     /// GPUs times seconds that it has used.
     pub gpu_seconds: String,
-    /// Name of the Submission that a host made of it by a re-run in EvalAI.
-    pub rerun_as: String,
     /// Metric columns and their values; none removes the column: only a finished submission has metrics.
     pub metrics: Vec<(String, Option<String>)>,
 }
@@ -99,7 +92,6 @@ impl Row {
             ("results", &self.results),
             ("progress", &self.progress),
             ("gpu_seconds", &self.gpu_seconds),
-            (RERUN, &self.rerun_as),
         ];
         let metrics = self
             .metrics
@@ -115,10 +107,9 @@ impl Row {
 
 /// What must hold of the row that is there.
 fn condition(row: &Row) -> String {
-    let or_rerun = if row.rerun_as.is_empty() { "" } else { OR_RERUN };
     let is_cancelled = row.submission_status == CANCELLED;
     let or_cancelled = if is_cancelled { OR_CANCELLED } else { "" };
-    format!("{CONDITION}{or_rerun}{or_cancelled}")
+    format!("{CONDITION}{or_cancelled}")
 }
 
 /// Columns and their values; those without one are removed.
@@ -226,7 +217,7 @@ impl Table {
     /// Writes a row, unless the table holds a later one. Safe twice.
     pub async fn write(&self, row: &Row) -> Result<Written, TableError> {
         let columns = self.columns(row);
-        let request = set_columns(self.request(row)?, row, &columns).send();
+        let request = set_columns(self.request(row)?, &columns).send();
         match self.meter.aws("dynamodb", "UpdateItem", request).await {
             Ok(_) => Ok(Written::Stored),
             Err(error) => match error.as_service_error() {
@@ -273,13 +264,12 @@ impl Table {
 }
 
 /// Sets the columns that have a value, and removes the others.
-fn set_columns(mut request: UpdateItemFluentBuilder, row: &Row, columns: &Columns<'_>) -> UpdateItemFluentBuilder {
+fn set_columns(mut request: UpdateItemFluentBuilder, columns: &Columns<'_>) -> UpdateItemFluentBuilder {
     let (mut set, mut remove) = (vec!["#attempt = :attempt".to_owned()], Vec::new());
     for (index, (column, value)) in columns.iter().enumerate() {
         // A name may have one placeholder only, and the status has one already.
         let name = match *column {
             STATUS => "#status".to_owned(),
-            RERUN => "#rerun".to_owned(),
             _ => format!("#c{index}"),
         };
         request = request.expression_attribute_names(&name, *column);
@@ -289,10 +279,6 @@ fn set_columns(mut request: UpdateItemFluentBuilder, row: &Row, columns: &Column
         } else {
             remove.push(name);
         }
-    }
-    if !row.rerun_as.is_empty() {
-        let status = AttributeValue::S(row.submission_status.clone());
-        request = request.expression_attribute_values(":status", status);
     }
     let mut update = format!("SET {}", set.join(", "));
     if !remove.is_empty() {

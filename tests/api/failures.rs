@@ -5,6 +5,8 @@
 //! logcopy.
 #![cfg(test)]
 
+use std::time::Duration;
+
 use evalai_stand_in::model::Status;
 use k8s_openapi::api::batch::v1::Job;
 use k8s_openapi::api::coordination::v1::Lease;
@@ -13,7 +15,9 @@ use kube::api::{DeleteParams, Patch, PatchParams, PostParams};
 use kube::runtime::wait::await_condition;
 use kube::{Api, ResourceExt};
 use leaderboard_api::names::FAILURE_LOG_KEY;
-use leaderboard_api::{Attempt, JobNumber, Leaderboard, State, Submission, SubmissionStatus, conditions, names};
+use leaderboard_api::{
+    Attempt, JobNumber, Leaderboard, State, Submission, SubmissionStatus, conditions, names, reasons,
+};
 use leaderboard_operator::controller::runtime::leader;
 use leaderboard_operator::pod::report::{OWNER_KEY, Owner};
 use leaderboard_operator::services::archive::Archive;
@@ -21,6 +25,7 @@ use serde_json::json;
 use tokio::time::timeout;
 
 use super::bridge::{LIMIT, StandIn};
+use super::scale::player::{Player, Props, ROUTES};
 use super::world::{HOST, NODE, PARTICIPANT, ROUTE, World, ago, running};
 
 #[tokio::test(flavor = "multi_thread", worker_threads = 2)]
@@ -70,57 +75,41 @@ async fn routes_that_an_agent_prints_are_for_hosts_unless_they_want_it_otherwise
 }
 
 #[tokio::test(flavor = "multi_thread", worker_threads = 2)]
-async fn a_rerun_in_evalai_is_named_by_the_submission_whose_result_it_cancels() {
+async fn a_result_that_a_hosts_rerun_cancels_in_evalai_is_shown_so() {
     let world = World::new().await;
-    world.leaderboard("lb", 1, "Hosts").await;
+    world
+        .leaderboard_with("lb", 1, "Hosts", &json!({"routes": ROUTES}))
+        .await;
     let _controller = world.controller();
-    let (old, name) = failed(&world).await;
-    is_named_by_its_rerun(&world, old, &name).await;
+    let (pk, name) = finishes(&world).await;
+    let (new, _) = world.rerun("lb", 1, pk).await;
+    let statuses = [pk, new].map(|pk| world.evalai.with_state(|state| state.submissions[&pk].status));
+    assert_eq!(statuses, [Status::Cancelled, Status::Submitted]);
+    let published = |s: &SubmissionStatus| conditions::get(&s.conditions, conditions::PUBLISHED).cloned();
+    let is_shown = |s: &SubmissionStatus| published(s).is_some_and(|c| c.reason == reasons::CANCELLED_IN_EVALAI);
+    world.until(&name, "its result counts no more", is_shown).await;
+    let status = world.api::<Submission>().get(&name).await.unwrap().status.unwrap();
+    assert_eq!(status.state, Some(State::Finished), "its result stays");
 }
 
-#[tokio::test(flavor = "multi_thread", worker_threads = 2)]
-async fn a_rerun_is_named_although_its_original_ended_before_evalai_knew_its_job() {
-    let world = World::new().await;
-    world.leaderboard("lb", 1, "Hosts").await;
-    let _controller = world.controller();
-    let (old, name) = failed(&world).await;
-    world.evalai.with_state(|state| {
-        let mut row = state.submissions[&old].clone();
-        row.job_name.clear();
-        state.save(row);
-    });
-    is_named_by_its_rerun(&world, old, &name).await;
-}
-
-/// A submission whose failure EvalAI has.
-async fn failed(world: &World) -> (u64, String) {
+/// A submission whose result EvalAI has.
+async fn finishes(world: &World) -> (u64, String) {
     let (pk, name) = world.submit("lb", 1).await;
-    world.run_that_crashes(pk, &name).await;
+    let seed = &evalai_stand_in::Config::in_memory().unwrap().0.seed;
+    let player = Player::start(Props {
+        client: world.client.clone(),
+        namespace: world.namespace.clone(),
+        s3: world.aws.aws.s3(None, Some(&world.aws.endpoint)),
+        bucket: world.bucket.clone(),
+        period: Duration::from_millis(500),
+        labels: seed.challenges[0].phases[0].splits[0].schema.labels.clone(),
+    });
+    let runs = |status: &SubmissionStatus| status.progress.as_ref().is_some_and(|progress| progress.done > 0);
+    world.until(&name, "a route is done", runs).await;
+    player.fall_the_curtain();
     let is_published = |s: &SubmissionStatus| s.times.published.is_some();
     world.until(&name, "EvalAI has the end", is_published).await;
     (pk, name)
-}
-
-/// A host re-runs an ended submission, and both objects show it.
-async fn is_named_by_its_rerun(world: &World, old: u64, name: &str) {
-    let (new, rerun) = world.rerun("lb", 1, old).await;
-    let statuses = [old, new].map(|pk| world.evalai.with_state(|state| state.submissions[&pk].status));
-    assert_eq!(statuses, [Status::Cancelled, Status::Submitted]);
-    let of = |s: &SubmissionStatus| s.rerun_of.as_ref().is_some_and(|of| of.submission_name == name);
-    world.until(&rerun, "it names what it re-runs", of).await;
-    let again = |s: &SubmissionStatus| s.rerun_as.as_ref().is_some_and(|again| again.submission_name == rerun);
-    world.until(name, "it names its re-run", again).await;
-    let status = world.api::<Submission>().get(name).await.unwrap().status.unwrap();
-    assert_eq!(status.state, Some(State::Failed), "its result stays");
-    let message = status.message.unwrap();
-    let told = format!(
-        "A host re-ran this submission in EvalAI as {rerun}; EvalAI cancelled this one's result. Its state and score stay, in the table too."
-    );
-    assert!(
-        message.starts_with("Agent 1 crashed") && message.ends_with(&told),
-        "{message}"
-    );
-    assert!(world.shown(name).await.contains("re-ran this submission in EvalAI as"));
 }
 
 #[tokio::test(flavor = "multi_thread", worker_threads = 2)]

@@ -286,37 +286,6 @@ async fn a_cancel_is_written_over_another_end_and_takes_its_metrics_away() {
 }
 
 #[tokio::test]
-async fn an_end_is_written_once_more_with_its_rerun() {
-    let stand_in = StandIn::start().await;
-    let (spec, table) = usual(&stand_in).await;
-    let rerun = |status: &str, name: &str| Row {
-        rerun_as: name.into(),
-        ..row(1, status)
-    };
-    let named = async || rows(&stand_in, &spec.name).await.remove(0).remove("rerun_as");
-    assert_eq!(table.write(&row(1, "FINISHED")).await, Ok(Written::Stored));
-    assert_eq!(named().await, None);
-    assert_eq!(
-        table.write(&rerun("FAILED", "submission-99")).await,
-        Ok(Written::Stale),
-        "another end"
-    );
-    for _ in 0..2 {
-        assert_eq!(
-            table.write(&rerun("FINISHED", "submission-99")).await,
-            Ok(Written::Stored)
-        );
-        assert_eq!(named().await.as_deref(), Some("submission-99"));
-    }
-    assert_eq!(
-        table.write(&rerun("FINISHED", "submission-100")).await,
-        Ok(Written::Stale),
-        "the first one stays"
-    );
-    assert_eq!(table.write(&row(2, "RUNNING")).await, Ok(Written::Stored));
-}
-
-#[tokio::test]
 async fn of_many_writers_at_once_the_end_of_the_last_attempt_wins() {
     let stand_in = StandIn::start().await;
     let (spec, table) = usual(&stand_in).await;

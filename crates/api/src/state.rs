@@ -20,7 +20,8 @@ impl SubmissionStatus {
     /// Whether another system has the end, or is to have none, by this condition.
     pub fn is_delivered(&self, type_: &str) -> bool {
         let found = self.condition(type_);
-        found.is_some_and(|c| c.status == "True" || c.reason == reasons::NOT_REQUIRED)
+        let settled = [reasons::NOT_REQUIRED, reasons::CANCELLED_IN_EVALAI];
+        found.is_some_and(|c| c.status == "True" || settled.contains(&c.reason.as_str()))
     }
 
     /// The condition of the end that the present attempt has come to.

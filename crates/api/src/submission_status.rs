@@ -142,12 +142,6 @@ pub struct SubmissionStatus {
     #[x_kube(merge_strategy = ListMerge::Map(vec!["nodeName".into()]))]
     #[schemars(length(max = MAX_FAILED_NODES))]
     pub failed_nodes: Vec<FailedNode>,
-    /// The submission that this one re-runs: EvalAI made a new row for it.
-    #[serde(default, skip_serializing_if = "Option::is_none")]
-    pub rerun_of: Option<Box<Rerun>>,
-    /// The submission that re-runs this one: EvalAI has cancelled this one's result. State, score and the table's row stay.
-    #[serde(default, skip_serializing_if = "Option::is_none")]
-    pub rerun_as: Option<Box<Rerun>>,
     /// Where the results are, `s3://bucket/prefix/id`.
     #[serde(rename = "resultsURL", default, skip_serializing_if = "Option::is_none")]
     #[schemars(length(max = 2048))]
@@ -276,18 +270,6 @@ pub struct BlockedSince {
     pub reason: String,
     /// Since when it has been the same reason.
     pub time: Time,
-}
-
-/// The other submission of a re-run.
-#[derive(Serialize, Deserialize, JsonSchema, Clone, Debug, PartialEq, Eq)]
-#[serde(rename_all = "camelCase")]
-pub struct Rerun {
-    /// Its name, in the same namespace.
-    #[schemars(length(max = 253))]
-    pub submission_name: String,
-    /// When EvalAI made the new row.
-    #[serde(default, skip_serializing_if = "Option::is_none")]
-    pub time: Option<Time>,
 }
 
 /// When what happened; from the timestamps of messages, Pods and Jobs.

@@ -225,7 +225,7 @@ fn other_systems(status: &SubmissionStatus, now: Timestamp) -> Option<String> {
     let late = |c: &&Condition| {
         let age = now.duration_since(c.last_transition_time.0).as_secs();
         match c.reason.as_str() {
-            reasons::NOT_REQUIRED => false,
+            reasons::NOT_REQUIRED | reasons::CANCELLED_IN_EVALAI => false,
             reasons::WAITING_FOR_PREVIOUS_CONTROLLER => age > PATIENCE_SECONDS,
             reasons::WAITING => !c.message.is_empty() || age > PATIENCE_SECONDS,
             _ => true,

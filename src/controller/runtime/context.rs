@@ -18,7 +18,6 @@ use crate::controller::submissions::external::ExternalSystems;
 use crate::controller::submissions::memory::Memory;
 use crate::controller::submissions::observe::causes::Causes;
 use crate::controller::submissions::observe::workers::Workers;
-use crate::controller::submissions::reruns::Reruns;
 use crate::controller::submissions::team_use::Teams;
 use crate::controller::submissions::{act, observe};
 use crate::kubernetes::objects::Pod;
@@ -37,7 +36,6 @@ pub struct Context {
     pub workers: Workers,
     pub causes: Causes,
     pub teams: Teams,
-    pub reruns: Reruns,
     pub slots: Arc<SlotAllocator>,
     pub leaderboards: LeaderboardState,
     pub looks: UnboundedSender<Look>,
@@ -57,7 +55,6 @@ impl Context {
             workers: &self.workers,
             slots: &self.slots,
             causes: &self.causes,
-            reruns: &self.reruns,
             external: &self.external,
         }
     }

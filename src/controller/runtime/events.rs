@@ -99,7 +99,7 @@ pub(super) fn of_leaderboards(watches: &Watches, shared: &Arc<Shared>) -> Events
 
 fn of_submission(
     shared: Arc<Shared>,
-) -> impl FnMut(WatchEvent<Submission>) -> Vec<(ObjectRef<Submission>, Class)> + Send {
+) -> impl FnMut(WatchEvent<Submission>) -> Option<(ObjectRef<Submission>, Class)> + Send {
     let mut marks = Marks::default();
     move |event| {
         let (object, queues) = (event.object.as_ref(), &shared.queues);
@@ -108,18 +108,15 @@ fn of_submission(
             let board = ObjectRef::<Leaderboard>::new(&object.spec.leaderboard_name).within(&namespace);
             queues.leaderboards.add(&board, Class::Refresh);
         }
-        let original = shared.context.reruns.moved(object, event.is_gone);
         if event.is_gone {
             marks.forget(object);
             queues.submissions.forget(&Key::from(&ObjectRef::from_obj(object)));
             shared.forget(&key_of(object));
-            return Vec::new();
+            return None;
         }
         shared.context.memory.is_shown(object);
         let is_news = marks.moved(object, &own_fields(object, names::FINALIZER_SUBMISSION));
-        let own = is_news.then(|| (ObjectRef::from_obj(object), urgency::of_submission(object)));
-        let original = original.into_iter().map(|original| (original, Class::Refresh));
-        own.into_iter().chain(original).collect()
+        is_news.then(|| (ObjectRef::from_obj(object), urgency::of_submission(object)))
     }
 }
 

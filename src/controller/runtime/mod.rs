@@ -35,7 +35,6 @@ use crate::controller::submissions::observe::causes::{Causes, OF_JOBS, OF_PODS, 
 use crate::controller::submissions::observe::node;
 use crate::controller::submissions::observe::workers::Workers;
 use crate::controller::submissions::phases::Phase;
-use crate::controller::submissions::reruns::Reruns;
 use crate::kubernetes::objects::Event;
 use crate::kubernetes::preflight::{self, await_kinds};
 use crate::kubernetes::spawn_uncached;
@@ -238,7 +237,6 @@ impl Parts {
             workers: Workers::start(aws, client, tasks, answered),
             causes: self.causes(queues),
             teams: self.watches.teams.clone(),
-            reruns: Reruns::default(),
             slots: Arc::default(),
             leaderboards: LeaderboardState::default(),
             looks,

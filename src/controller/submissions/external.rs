@@ -9,7 +9,6 @@ use kube::ResourceExt;
 use super::archive::ArchiveWorkers;
 use super::decide::{EvalaiUpdate, TableUpdate};
 use super::memory::Memory;
-use super::reruns;
 use super::result_texts;
 use super::view::{EvalaiEnd, EvalaiInfo, EvalaiView, RecordView, Standing, View};
 use crate::allowed::Allowed;
@@ -20,7 +19,7 @@ use crate::services::evalai::{
     self, DesiredUpdate, Ended, Hub, ImageAnswer, Outcome, Publisher, Run, Status, Subject, SubmissionState, Target,
 };
 use crate::services::table::Recorder;
-use leaderboard_api::{Ingested, JobNumber, Leaderboard, Rerun, Submission, SubmissionStatus, names};
+use leaderboard_api::{Ingested, JobNumber, Leaderboard, Submission, SubmissionStatus, names};
 
 /// Doors to both services, and what each Leaderboard needs to go through them.
 pub struct ExternalSystems {
@@ -65,31 +64,22 @@ impl ExternalSystems {
     }
 
     /// What EvalAI is known to show of a submission.
-    /// `others` are the Submissions among which the original of a re-run is looked for, until it is noted.
-    pub fn evalai_view(
-        &self,
-        leaderboard: Option<&Leaderboard>,
-        submission: &Submission,
-        others: impl FnOnce() -> Vec<Arc<Submission>>,
-    ) -> Option<EvalaiView> {
-        submission.spec.evalai?;
+    pub fn evalai_view(&self, leaderboard: Option<&Leaderboard>, submission: &Submission) -> Option<EvalaiView> {
+        let evalai = submission.spec.evalai?;
         let Some(seen) = self.hub.view(&key_of(submission)) else {
             let ready = leaderboard.is_some_and(|l| self.target(l).is_some());
             let error = (!ready).then(|| "the Leaderboard's token is not known yet; see its status".to_owned());
             return Some(EvalaiView {
                 error,
+                cancelled_as_of: leaderboard
+                    .and_then(|board| self.hub.cancelled_as_of(&key_of(board), evalai.submission)),
                 ..EvalaiView::default()
             });
         };
-        let status = submission.status.as_ref();
-        let may_note = status.is_none_or(|s| s.rerun_of.is_none() && s.job_name.is_none());
-        let row = seen.row.as_ref().filter(|_| may_note);
-        let rerun_of = row.and_then(|row| reruns::original(row, submission, others));
         let observes = leaderboard.is_some_and(|board| board.spec.observes());
-        let phase = submission.spec.evalai.map_or(0, |evalai| evalai.phase);
         Some(EvalaiView {
-            shows_partial: leaderboard.is_some_and(|board| self.hub.shows_partial(&key_of(board), phase)),
-            ..map_view(&as_observed(seen, observes), submission, rerun_of)
+            shows_partial: leaderboard.is_some_and(|board| self.hub.shows_partial(&key_of(board), evalai.phase)),
+            ..map_view(&as_observed(seen, observes), submission)
         })
     }
 
@@ -238,7 +228,7 @@ fn as_observed(seen: SubmissionState, observes: bool) -> SubmissionState {
     }
 }
 
-fn map_view(seen: &SubmissionState, submission: &Submission, rerun_of: Option<Rerun>) -> EvalaiView {
+fn map_view(seen: &SubmissionState, submission: &Submission) -> EvalaiView {
     let attempt = submission.present_attempt();
     // An image that was asked for is waited for; why there is none is an answer too.
     let image_known = !wants_image(submission) || seen.image.is_some();
@@ -267,13 +257,13 @@ fn map_view(seen: &SubmissionState, submission: &Submission, rerun_of: Option<Re
                 team_name: row.team_name.clone(),
                 submitted_at: row.submitted_at,
                 resumed_at: row.resumed_at,
-                rerun_of,
-                last_attempt: reruns::last_attempt(row),
+                last_attempt: row.last_attempt(),
                 image,
                 image_problem,
             }),
         read_at: seen.read_at,
         cancelled: ended.is_some(),
+        cancelled_as_of: None,
         overtaken: ended.is_some() && seen.overtaken,
         end: seen
             .end

@@ -116,7 +116,6 @@ async fn bench(state: State) -> Bench {
         evalai: None,
         record: Some(RecordView::default()),
         partial_sent: None,
-        rerun_as: None,
         evalai_writes_from: None,
     };
     Bench {
@@ -255,7 +254,7 @@ fn an_attempt_that_is_asked_for_early_is_not_the_one_that_runs() {
         ended: Some(Status::Cancelled),
         ..SubmissionState::default()
     };
-    assert!(map_view(&ended_in_evalai, &submission, None).cancelled);
+    assert!(map_view(&ended_in_evalai, &submission).cancelled);
     submission.status = None;
     assert_eq!(run_of(&submission).attempt, Attempt(2));
 }
@@ -274,7 +273,7 @@ fn an_end_that_evalai_showed_already_is_published_at_one_moment_whatever_is_read
             read_at: Timestamp::from_second(seconds).ok(),
             ..SubmissionState::default()
         };
-        map_view(&seen, &submission, None).end
+        map_view(&seen, &submission).end
     };
     for seconds in [0, 10] {
         assert_eq!(end_after(seconds), Some(EvalaiEnd::Published { at }));

@@ -19,7 +19,6 @@ mod pod_layout;
 pub mod pod_overlay;
 pub mod questions;
 pub mod report_digest;
-pub mod reruns;
 mod result_texts;
 pub mod spans;
 pub mod team_use;

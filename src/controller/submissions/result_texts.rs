@@ -105,11 +105,6 @@ pub(super) fn row(report: Option<&ReportDigest>, status: &SubmissionStatus) -> O
         results: status.results_url.clone().unwrap_or_default(),
         progress: status.progress.as_ref().map(|p| p.text.clone()).unwrap_or_default(),
         gpu_seconds: gpu_seconds(status),
-        rerun_as: status
-            .rerun_as
-            .as_ref()
-            .map(|r| r.submission_name.clone())
-            .unwrap_or_default(),
         metrics: columns(report.filter(|_| is_finished(status)), plan.leaderboard_version),
     })
 }

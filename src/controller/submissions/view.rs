@@ -12,7 +12,7 @@ use super::report_digest::{ReportDigest, ReportId};
 pub use crate::controller::slots::turns::Turn;
 use crate::pod::run::Stop;
 use crate::services::held_text::HeldText;
-use leaderboard_api::{Attempt, JobNumber, Leaderboard, Rerun, SharedText, Submission, names};
+use leaderboard_api::{Attempt, JobNumber, Leaderboard, SharedText, Submission, names};
 
 /// Everything a decision may depend on.
 #[derive(Clone, Debug)]
@@ -57,8 +57,6 @@ pub struct View {
     pub record: Option<RecordView>,
     /// Routes in the last partial result that was sent to EvalAI, in this attempt.
     pub partial_sent: Option<u32>,
-    /// The submission that re-runs this one, as its status shows.
-    pub rerun_as: Option<Rerun>,
     /// Until when nothing is written to EvalAI, because the controller before may still have requests under way.
     pub evalai_writes_from: Option<Timestamp>,
 }
@@ -386,6 +384,8 @@ pub struct EvalaiView {
     pub read_at: Option<Timestamp>,
     /// It was cancelled there, after this attempt was announced.
     pub cancelled: bool,
+    /// When the list was asked for that shows it as cancelled, of one that has its end and is not followed any more.
+    pub cancelled_as_of: Option<Timestamp>,
     /// A write of ours may have undone that cancel in EvalAI.
     pub overtaken: bool,
     /// What became of the final result of this attempt.
@@ -410,8 +410,6 @@ pub struct EvalaiInfo {
     pub submitted_at: Option<Timestamp>,
     /// When it was last re-run or resumed there.
     pub resumed_at: Option<Timestamp>,
-    /// The submission that this one re-runs.
-    pub rerun_of: Option<Rerun>,
     /// The highest attempt whose Job its row names.
     pub last_attempt: Option<Attempt>,
     pub image: Option<String>,

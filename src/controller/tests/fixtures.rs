@@ -30,7 +30,6 @@ use crate::controller::submissions::external::ExternalSystems;
 use crate::controller::submissions::memory::Memory;
 use crate::controller::submissions::observe::causes::Causes;
 use crate::controller::submissions::observe::workers::Workers;
-use crate::controller::submissions::reruns::Reruns;
 use crate::controller::submissions::team_use::Teams;
 use crate::kubernetes::Namespaces;
 use crate::kubernetes::objects::{Job, Owner, Pod};
@@ -121,7 +120,6 @@ pub async fn surroundings(cluster: Cluster, endpoint: &str) -> Surroundings {
         workers: Workers::start(&aws, &client, &tasks, || noting(&answering)),
         causes: Causes::default(),
         teams,
-        reruns: Reruns::default(),
         slots: Arc::default(),
         leaderboards: LeaderboardState::default(),
         looks,

@@ -269,6 +269,11 @@ impl Hub {
             .is_some_and(|shared| shared.queue().shows_partial(leaderboard, phase))
     }
 
+    /// When the list was asked for that shows a submission as cancelled which has its end here; none if the last one does not.
+    pub fn cancelled_as_of(&self, leaderboard: &Key, pk: i64) -> Option<Timestamp> {
+        self.place(leaderboard)?.queue().cancelled_as_of(leaderboard, pk)
+    }
+
     /// How the requests of a Leaderboard's token are used.
     pub fn usage(&self, leaderboard: &Key) -> Option<Usage> {
         let shared = self.place(leaderboard)?;

@@ -9,8 +9,8 @@ use serde_json::Value;
 
 use super::job_names::JobNames;
 use super::status::Status;
-use leaderboard_api::ImageReference;
 use leaderboard_api::text::{LONGEST_NAME, one_line};
+use leaderboard_api::{Attempt, ImageReference, names};
 
 /// A submission as EvalAI shows it to a host.
 #[derive(Clone, Debug, PartialEq)]
@@ -63,6 +63,17 @@ impl Row {
     pub fn names(&self, job: &str) -> bool {
         let job = job.to_lowercase();
         self.jobs.contains(&job)
+    }
+
+    /// The highest attempt whose first Job it names as its own. A participant can edit the row, so a number that no Submission can have
+    /// counts for nothing.
+    pub fn last_attempt(&self) -> Option<Attempt> {
+        let own = format!("{}-", names::submission(self.id));
+        let numbers = self.jobs.iter().filter_map(|job| job.strip_prefix(&own)?.parse().ok());
+        let attempts = numbers.map(Attempt);
+        attempts
+            .filter(|attempt| (Attempt::FIRST..Attempt::HIGHEST).contains(attempt))
+            .max()
     }
 }
 

@@ -283,6 +283,10 @@ reasons! {
             "There is nothing to publish: no EvalAI, no table, no team, or EvalAI ended the submission itself; or the table keeps a later \
              attempt or another end of the run, as the message then says.",
             "Nothing, unless the message asks for it.";
+        CANCELLED_IN_EVALAI = "CancelledInEvalAI",
+            "EvalAI has cancelled the result since it took it, as a host's re-run does: it counts there no more (condition `Published`). State, \
+             score and the table's row stay.",
+            "Nothing. A re-run is a new submission.";
         CONCURRENT_UPDATE = "ConcurrentUpdate",
             "An update of EvalAI and one of the operator happened at the same time, or the submission was deleted before its end: \
              EvalAI may show the wrong end. The operator reads EvalAI again and writes `cancelled` if needed.",
@@ -347,11 +351,6 @@ reasons! {
             "EvalAI showed the submission under another team when its result was published; the run counts for the team it was \
              accepted for.",
             "Set the team back in EvalAI, or correct the table.";
-        RERUN_IN_EVALAI = "RerunInEvalAI",
-            "A host re-ran the submission in EvalAI, which cancelled its result there and created a new submission; the message and \
-             `status.rerunAs` name it. State, score and the table's row keep the result; the row names the re-run in its column \
-             `rerun_as`.",
-            "Nothing.";
         RELEASED_UNPUBLISHED = "ReleasedUnpublished",
             "A deleted Submission was released after `deadlines.finalizeSeconds` before all systems had its result.",
             "Correct EvalAI or the table by hand.";

@@ -100,17 +100,6 @@ fn the_crashes_of_the_failed_pair_are_counted_once() {
 }
 
 #[test]
-fn both_submissions_of_a_rerun_name_each_other() {
-    let other = |name: &str| json!({"submissionName": name, "time": "2026-11-01T11:57:00Z"});
-    let old = explained(&with(finished(), &json!({"rerunAs": other("submission-99")})));
-    let line = "Re-run:      as submission-99, 2026-11-01 11:57:00 UTC (3 min ago); EvalAI cancelled this one.\n";
-    assert!(old.contains(line), "{old}");
-    let new = explained(&with(waiting(), &json!({"rerunOf": other("submission-7")})));
-    let line = "Re-run:      of submission-7, 2026-11-01 11:57:00 UTC (3 min ago).\n";
-    assert!(new.contains(line), "{new}");
-}
-
-#[test]
 fn an_infrastructure_failure_does_not_count_and_is_resumed() {
     let text = explained(&node_lost());
     for expected in [

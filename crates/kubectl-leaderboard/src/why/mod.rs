@@ -17,7 +17,7 @@ use super::text::{Frame, Page, join, span, when};
 use leaderboard_api::conditions::{self, Condition};
 use leaderboard_api::names::FAILURE_LOG_KEY;
 use leaderboard_api::text::sentence;
-use leaderboard_api::{EndReason, FailureClass, LastEnd, PairStatus, Rerun, Submission, SubmissionStatus, reasons};
+use leaderboard_api::{EndReason, FailureClass, LastEnd, PairStatus, Submission, SubmissionStatus, reasons};
 
 /// What is known, and the lines about it so far.
 struct Explanation<'a> {
@@ -61,7 +61,6 @@ pub fn explain(submission: &Submission, leaderboard: Observed<'_>, frame: Frame)
     explanation.page.gap();
     explanation.belongs_to();
     explanation.reason();
-    explanation.rerun();
     explanation.failure();
     explanation.line();
     explanation.attempt();
@@ -103,24 +102,6 @@ impl Explanation<'_> {
             let since = when(other.last_transition_time.0, self.now);
             let text = format!("{} since {since}: {}", other.reason, sentence(&other.message));
             self.page.row("Stalled", &text);
-        }
-    }
-
-    /// The other submission of a re-run in EvalAI.
-    fn rerun(&mut self) {
-        let ago = |rerun: &Rerun| {
-            let time = rerun.time.as_ref().map(|time| when(time.0, self.now));
-            time.map(|time| format!(", {time}")).unwrap_or_default()
-        };
-        let of = self.status.rerun_of.as_ref();
-        let of = of.map(|rerun| format!("of {}{}.", rerun.submission_name, ago(rerun)));
-        let again = self.status.rerun_as.as_ref();
-        let again = again.map(|rerun| {
-            let name = &rerun.submission_name;
-            format!("as {name}{}; EvalAI cancelled this one.", ago(rerun))
-        });
-        for text in [of, again].into_iter().flatten() {
-            self.page.row("Re-run", &text);
         }
     }
 

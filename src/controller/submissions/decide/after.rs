@@ -8,7 +8,7 @@ use k8s_openapi::apimachinery::pkg::apis::meta::v1::Time;
 use super::plan::{Action, EvalaiUpdate};
 use super::plan_builder::{PlanBuilder, after, seconds};
 use super::reading::{self, Reading};
-use super::record::{self, is_superseded, record_again, record_end, row_of_end};
+use super::record::{self, is_superseded, record_end};
 use super::{accept, log, observe, retention, stop};
 use crate::controller::submissions::view::{EvalaiEnd, ObservedJob, ObservedTexts};
 use leaderboard_api::conditions::{self, Truth};
@@ -21,10 +21,6 @@ const AGAIN: Duration = Duration::from_secs(30);
 const FAREWELL_SECONDS: i64 = 120;
 /// How long EvalAI's answer waits for the table's, to be shown with it.
 const TOGETHER_SECONDS: i64 = 10;
-/// How long after the time of a re-run a row may have been read that does not show it: the clocks differ.
-const RERUN_SECONDS: i64 = 60;
-/// What EvalAI calls a row that was cancelled.
-const CANCELLED: &str = "cancelled";
 /// EvalAI's word for a row with a result.
 const FINISHED: &str = "finished";
 /// Why an attempt does not begin.
@@ -60,7 +56,7 @@ pub(super) fn decide(draft: &mut PlanBuilder<'_>) {
     }
     let is_published = matches!(published, Delivery::Done | Delivery::Answered(_));
     let complete = is_published && recorded && log_left.is_none();
-    if complete && !follow_rerun(draft) && !observe::awaits_end(draft) {
+    if complete && !observe::awaits_end(draft) {
         draft.act(Action::Forget);
         retention::decide(draft);
     } else {
@@ -168,55 +164,6 @@ pub(super) fn without_leaderboard(draft: &mut PlanBuilder<'_>, type_: &str) -> D
     }
 }
 
-/// Notes that EvalAI has cancelled a result because it was re-run, of which nobody is notified. Returns whether EvalAI has to be
-/// asked for that: the re-run's row can be edited by its participant, so it alone is no proof.
-fn follow_rerun(draft: &mut PlanBuilder<'_>) -> bool {
-    let rerun = draft.view.rerun_as.clone().filter(|_| draft.status.rerun_as.is_none());
-    let Some(rerun) = rerun.filter(|_| !draft.is_deleting() && draft.leaderboard().is_some()) else {
-        return false;
-    };
-    let evalai = draft.view.evalai.as_ref();
-    let Some(info) = draft.evalai_info() else {
-        draft.act(Action::AskEvalai);
-        return true;
-    };
-    if info.status != CANCELLED {
-        let read_at = evalai.and_then(|evalai| evalai.read_at);
-        let is_old = may_be_older(read_at, rerun.time.as_ref(), draft.now());
-        if is_old {
-            // What is known is forgotten, so that the next reconcile asks anew.
-            draft.act(Action::ForgetEvalai);
-        }
-        return is_old;
-    }
-    let is_recorded = draft.status.is_true(conditions::RECORDED);
-    if is_recorded && matches!(row_of_end(draft), Reading::Waits(_)) {
-        return true;
-    }
-    let message = format!(
-        "A host re-ran this submission in EvalAI as {}; EvalAI cancelled this one's result. Its state and score stay, in the table too.",
-        rerun.submission_name
-    );
-    let ended = draft.status.message.take().unwrap_or_default();
-    draft.status.message = Some(format!("{ended} {message}").trim_start().into());
-    if let Some(published) = draft.status.condition(conditions::PUBLISHED).cloned() {
-        let truth = Truth::from(published.status == "True");
-        draft.condition(conditions::PUBLISHED, truth, &published.reason, &message);
-    }
-    draft.event(false, reasons::RERUN_IN_EVALAI, message);
-    draft.status.rerun_as = Some(Box::new(rerun));
-    record_again(draft)
-}
-
-/// Whether what was read may be from before a re-run that EvalAI dates so. A time that is still to come was not written by EvalAI.
-fn may_be_older(read_at: Option<Timestamp>, rerun: Option<&Time>, now: Timestamp) -> bool {
-    let Some((read_at, rerun)) = read_at.zip(rerun) else {
-        return false;
-    };
-    let latest = after(now, RERUN_SECONDS);
-    rerun.0 <= latest && read_at <= after(rerun.0, RERUN_SECONDS)
-}
-
 fn publish(draft: &mut PlanBuilder<'_>, log_left: Option<Duration>) -> Delivery {
     let end = draft.status.condition(conditions::FINISHED);
     let is_evalais = end.is_some_and(|c| c.reason == reasons::ENDED_IN_EVALAI);
@@ -228,6 +175,7 @@ fn publish(draft: &mut PlanBuilder<'_>, log_left: Option<Duration>) -> Delivery 
         return Delivery::Done;
     }
     if draft.status.is_delivered(conditions::PUBLISHED) {
+        note_late_cancel(draft);
         return Delivery::Done;
     }
     if draft.leaderboard().is_none() {
@@ -249,6 +197,19 @@ fn publish(draft: &mut PlanBuilder<'_>, log_left: Option<Duration>) -> Delivery 
             send_end(draft, view.error, is_overtaken, log_left);
             Delivery::Waiting
         }
+    }
+}
+
+/// Shows that EvalAI has cancelled a result that it had, as a host's re-run does. State, score and row stay.
+fn note_late_cancel(draft: &mut PlanBuilder<'_>) {
+    let listed = draft.view.evalai.as_ref().and_then(|evalai| evalai.cancelled_as_of);
+    let published = draft.status.times.published.as_ref();
+    // The status has whole seconds. An older list shows what the result has replaced.
+    let is_later = listed
+        .zip(published)
+        .is_some_and(|(listed, published)| listed > after(published.0, 1));
+    if is_later && draft.is_successful() && draft.status.is_true(conditions::PUBLISHED) {
+        draft.condition(conditions::PUBLISHED, Truth::False, reasons::CANCELLED_IN_EVALAI, "");
     }
 }
 

@@ -95,7 +95,6 @@ fn in_line(draft: &mut PlanBuilder<'_>) {
     if !accept::decide(draft) {
         return draft.requeue_in(BACKSTOP);
     }
-    note_original(draft);
     if waits_for_next_try(draft) {
         return;
     }
@@ -105,13 +104,6 @@ fn in_line(draft: &mut PlanBuilder<'_>) {
         line::Step::Wait => update_evalai(draft),
     }
     draft.requeue_in(BACKSTOP);
-}
-
-/// Remembers which submission this one re-runs, so that the other learns of it.
-fn note_original(draft: &mut PlanBuilder<'_>) {
-    if draft.status.rerun_of.is_none() {
-        draft.status.rerun_of = draft.evalai_info().and_then(|info| info.rerun_of.clone()).map(Box::new);
-    }
 }
 
 fn waits_for_next_try(draft: &mut PlanBuilder<'_>) -> bool {

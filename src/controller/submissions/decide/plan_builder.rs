@@ -243,7 +243,6 @@ impl<'a> PlanBuilder<'a> {
             progress: old.progress,
             score: old.score.map(Score::so_far),
             results_url: old.results_url,
-            rerun_of: old.rerun_of,
             usage: old.usage,
             times: leaderboard_api::Times {
                 submitted: old.times.submitted,

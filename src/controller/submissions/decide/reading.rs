@@ -174,8 +174,7 @@ pub(super) fn drop_texts(draft: &mut PlanBuilder<'_>) {
 /// Whether an end is still to be sent to EvalAI, with the texts that were read.
 pub fn awaits_publication(status: &SubmissionStatus) -> bool {
     let published = status.condition(conditions::PUBLISHED);
-    let is_open =
-        |c: &Condition| c.status == "False" && ![reasons::NOT_REQUIRED, reasons::REFUSED].contains(&c.reason.as_str());
+    let is_open = |c: &Condition| c.reason != reasons::REFUSED && !status.is_delivered(conditions::PUBLISHED);
     status.has_ended() && published.is_some_and(is_open)
 }
 

@@ -81,7 +81,7 @@ pub(super) fn record_end(draft: &mut PlanBuilder<'_>) {
 }
 
 /// Whether all that the row shows is there: only that of a finished submission has metrics.
-pub(super) fn row_of_end(draft: &mut PlanBuilder<'_>) -> Reading {
+fn row_of_end(draft: &mut PlanBuilder<'_>) -> Reading {
     if draft.is_successful() {
         reading::report_of_end(draft)
     } else {
@@ -96,16 +96,6 @@ pub(super) fn follow_evalai(draft: &mut PlanBuilder<'_>) {
     if is_waiting && draft.leaderboard().is_some() && why_without_row(draft).is_none() {
         draft.condition(conditions::RECORDED, Truth::False, reasons::WAITING, FOLLOWS_EVALAI);
     }
-}
-
-/// The row has its end and is written once more, with the re-run. Returns whether that is still to come.
-pub(super) fn record_again(draft: &mut PlanBuilder<'_>) -> bool {
-    let is_recorded = draft.status.is_true(conditions::RECORDED);
-    if is_recorded {
-        record_end(draft);
-        draft.condition(conditions::RECORDED, Truth::False, reasons::WAITING, "");
-    }
-    is_recorded
 }
 
 /// Whether the table keeps another row than that of this end: the recorder says so until it has forgotten the end, then the status.

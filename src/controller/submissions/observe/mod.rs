@@ -16,7 +16,6 @@ use kube::runtime::reflector::ObjectRef;
 use super::decide::job_name;
 use super::external::ExternalSystems;
 use super::memory::Memory;
-use super::reruns::Reruns;
 use super::view::{NodeView, ObservedJob, PodView, View};
 use crate::controller::slots::SlotAllocator;
 use crate::controller::stores::Stores;
@@ -33,7 +32,6 @@ pub struct Uses<'a> {
     pub workers: &'a Workers,
     pub slots: &'a SlotAllocator,
     pub causes: &'a Causes,
-    pub reruns: &'a Reruns,
     pub external: &'a ExternalSystems,
 }
 
@@ -42,7 +40,6 @@ pub fn observe(uses: Uses<'_>, submission: Arc<Submission>, is_policy_in_place: 
     let workers = uses.workers;
     let submission = uses.memory.with_own_status(submission);
     let now = Timestamp::now();
-    let namespace = submission.namespace().unwrap_or_default();
     let leaderboard = uses.stores.leaderboard_for(&submission);
     let (job, pod) = children(uses, &submission);
     let status = submission.status.as_ref();
@@ -50,7 +47,6 @@ pub fn observe(uses: Uses<'_>, submission: Arc<Submission>, is_policy_in_place: 
     let pod_uid = pod.as_ref().map(|pod| pod.uid.as_str());
     let node = node(uses, pod.as_ref());
     let archive = workers.archive.observe(&submission, pod_uid, is_over);
-    let others = || uses.stores.submissions_of(&namespace);
     View {
         now,
         // Comparing it takes longer than reading the rest.
@@ -69,14 +65,13 @@ pub fn observe(uses: Uses<'_>, submission: Arc<Submission>, is_policy_in_place: 
         texts: archive.texts,
         fence: archive.fence,
         log: archive.log,
-        evalai: uses.external.evalai_view(leaderboard.as_deref(), &submission, others),
+        evalai: uses.external.evalai_view(leaderboard.as_deref(), &submission),
         record: leaderboard
             .as_deref()
             .and_then(|board| uses.external.record_view(board, &submission)),
         evalai_waited: uses.memory.evalai_waited(&submission),
         written_ago: uses.memory.since_write(&submission),
         partial_sent: uses.memory.partial_sent(&submission),
-        rerun_as: uses.reruns.of(&submission),
         evalai_writes_from: uses.external.hub.writes_from(),
         submission,
         leaderboard,

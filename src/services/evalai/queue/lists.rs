@@ -2,6 +2,7 @@
 //!
 //! Owned by `queue`. Pure.
 
+use std::collections::BTreeSet;
 use std::sync::Arc;
 use std::time::Duration;
 
@@ -14,7 +15,7 @@ use crate::services::evalai::answer::{About, Answer};
 use crate::services::evalai::request::{Purpose, Reply, Request};
 use crate::services::evalai::row::{Row, Split};
 use crate::services::evalai::status::Status;
-use crate::services::evalai::types::{Changed, SweepRow, Swept};
+use crate::services::evalai::types::{Changed, Key, SweepRow, Swept};
 use leaderboard_api::names;
 
 /// What the sweep has found is not handed out again for so long.
@@ -130,6 +131,9 @@ impl Queue {
             }
         };
         challenge.poll(purpose).done(requested, now.at, every);
+        if purpose == Purpose::Cancel {
+            self.note_cancelled(id, &rows, requested, now);
+        }
         for row in rows {
             if matches!(purpose, Purpose::SweepSubmitted | Purpose::SweepResuming) {
                 self.sweep_row(id, &row, now);
@@ -137,6 +141,36 @@ impl Queue {
             self.spread(&Arc::new(row), requested, now, |_| {});
         }
         self.listed(id, purpose, requested);
+    }
+
+    /// Wakes the submissions that have their end and were cancelled since the last list. A re-run that is live lets the list reach back to its
+    /// original: EvalAI copies the time of the submission.
+    fn note_cancelled(&mut self, id: i64, rows: &[Row], requested: Duration, now: &Now) {
+        let namespace = self.served.keys().next().map(|board| board.namespace.clone());
+        let (Some(namespace), Some(challenge)) = (namespace, self.challenges.get_mut(&id)) else {
+            return;
+        };
+        let ended = rows
+            .iter()
+            .filter(|row| row.status == Status::Cancelled && !self.pks.contains_key(&row.id));
+        let listed: BTreeSet<i64> = ended.map(|row| row.id).collect();
+        // Nothing is known of them here but the name.
+        let named = |id: &i64| Key {
+            namespace: namespace.clone(),
+            name: names::submission(*id),
+            uid: String::new(),
+        };
+        let new = listed.difference(&challenge.cancelled.1).map(named);
+        self.changes.extend(new.map(Changed::Submission));
+        let took = SignedDuration::try_from(now.at.saturating_sub(requested)).unwrap_or_default();
+        challenge.cancelled = (back(now.wall, took), listed);
+    }
+
+    /// When the list was asked for that shows an ended submission as cancelled; none if the last one does not.
+    pub fn cancelled_as_of(&self, leaderboard: &Key, pk: i64) -> Option<Timestamp> {
+        let target = self.served.get(leaderboard)?;
+        let (at, listed) = &self.challenges.get(&target.challenge)?.cancelled;
+        listed.contains(&pk).then_some(*at)
     }
 
     /// A submission that still waits after a list of new ones is asked for alone.

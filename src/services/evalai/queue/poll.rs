@@ -2,7 +2,7 @@
 //!
 //! Owned by `queue`. Pure.
 
-use std::collections::BTreeMap;
+use std::collections::{BTreeMap, BTreeSet};
 use std::time::Duration;
 
 use jiff::Timestamp;
@@ -72,6 +72,8 @@ pub(super) struct Challenge {
     pub check: ChallengeCheck,
     /// What the sweep has handed out, so that it is handed out once: when it asked to be run, and when it was handed out.
     pub swept: BTreeMap<i64, (Timestamp, Duration)>,
+    /// Ids that the last list of cancelled submissions had and that have their end here, and when it was asked for.
+    pub cancelled: (Timestamp, BTreeSet<i64>),
 }
 
 impl Challenge {
@@ -82,6 +84,7 @@ impl Challenge {
             lists: BTreeMap::new(),
             check: ChallengeCheck::default(),
             swept: BTreeMap::new(),
+            cancelled: (Timestamp::MIN, BTreeSet::new()),
         }
     }
 

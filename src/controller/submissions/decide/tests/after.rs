@@ -3,15 +3,14 @@
 use std::time::Duration;
 
 use jiff::SignedDuration;
-use k8s_openapi::apimachinery::pkg::apis::meta::v1::Time;
 
 use super::builders::*;
 use super::record::{finished, refused};
 use crate::controller::submissions::decide::{Action, EvalaiUpdate, Plan, TableUpdate};
-use crate::controller::submissions::view::{EvalaiEnd, EvalaiInfo, ObservedReport, Standing};
+use crate::controller::submissions::view::{EvalaiEnd, ObservedReport};
 use leaderboard_api::State::{Cancelled, Failed, Finished};
 use leaderboard_api::conditions::{self, PUBLISHED, RECORDED};
-use leaderboard_api::{Rerun, reasons};
+use leaderboard_api::reasons;
 
 fn failed() -> World {
     let mut world = World::evalai().running();
@@ -314,113 +313,60 @@ fn a_leaderboard_that_is_gone_wants_what_it_wanted() {
         == Action::ReleaseFinalizer));
 }
 
-/// What EvalAI shows of a row, as it was just read.
-fn says(world: &mut World, status: &str) {
-    world.in_evalai().info = Some(EvalaiInfo {
-        standing: Standing::Ended,
-        status: status.into(),
-        ..info()
-    });
-}
-
 #[test]
-fn a_result_that_evalai_cancelled_for_a_rerun_names_it_and_stays() {
-    for (mut world, state) in [(finished(), Finished), (failed(), Failed)] {
-        world.published();
-        world.recorded();
-        world.pass();
-        let before = world.pass().status;
-        world.view.evalai = None;
-        let rerun = Rerun {
-            submission_name: "submission-99".into(),
-            time: Some(Time(at(500))),
-        };
-        world.view.rerun_as = Some(rerun.clone());
-        let plan = world.pass();
-        assert_eq!(plan.actions, [Action::AskEvalai], "the row of a re-run is no proof");
-        assert!(plan.requeue.is_some() && plan.status.rerun_as.is_none());
-
-        says(&mut world, "finished");
-        let plan = world.pass();
-        assert_eq!((plan.actions, plan.status.rerun_as), (vec![Action::Forget], None));
-
-        says(&mut world, "cancelled");
-        let plan = world.pass();
-        let text = "A host re-ran this submission in EvalAI as submission-99; EvalAI cancelled this one's result. Its state and score stay, in the table too.";
-        assert_eq!(plan.status.rerun_as.as_deref(), Some(&rerun));
-        assert_eq!(
-            (plan.status.state, plan.status.score.clone(), plan.status.reason.clone()),
-            (Some(state), before.score, before.reason)
-        );
-        let message = format!("{} {text}", before.message.unwrap());
-        assert_eq!(plan.status.message.as_deref(), Some(message.as_str()));
-        let published = conditions::get(&plan.status.conditions, PUBLISHED).unwrap();
-        assert_eq!((published.status.as_str(), published.message.as_str()), ("True", text));
-        assert_eq!(events(&plan), [reasons::RERUN_IN_EVALAI]);
-        assert_eq!(plan.actions, [Action::Record(TableUpdate::End)], "the row names it too");
-        assert_eq!(condition(&plan, RECORDED), ("False".into(), reasons::WAITING.into()));
-
-        world.view.record.as_mut().unwrap().end_written = false;
-        let waits = world.pass();
-        assert_eq!(waits.actions, [Action::Record(TableUpdate::End)], "until it is written");
-        world.recorded();
-        world.view.evalai = None;
-        let again = world.pass();
-        assert_eq!(
-            (again.actions.as_slice(), again.events.len()),
-            ([Action::Forget].as_slice(), 0)
-        );
-        assert_eq!(condition(&again, RECORDED).0, "True");
-        assert_eq!(again.status.message, plan.status.message, "it is said once");
-    }
-}
-
-#[test]
-fn a_row_that_was_read_before_the_rerun_is_asked_for_anew() {
+fn a_result_that_evalai_cancels_later_is_shown_as_cancelled_there_and_stays() {
     let mut world = finished();
     world.published();
     world.recorded();
     world.pass();
-    world.view.rerun_as = Some(Rerun {
-        submission_name: "submission-99".into(),
-        time: Some(Time(at(500))),
-    });
-    says(&mut world, "finished");
-    world.in_evalai().read_at = Some(at(490));
-    world.go_to(501);
-    let plan = world.pass();
-    assert_eq!(plan.actions, [Action::ForgetEvalai]);
-    assert!(plan.requeue.is_some(), "nobody else looks again");
-
-    let mut unproven = world.clone();
     world.view.evalai = None;
-    assert_eq!(world.pass().actions, [Action::AskEvalai]);
-    says(&mut world, "cancelled");
-    world.in_evalai().read_at = Some(at(532));
-    assert!(world.pass().status.rerun_as.is_some());
+    let before = world.pass().status;
+    let listed = world.view.now;
+    world.in_evalai().cancelled_as_of = Some(listed);
+    let plan = world.pass();
+    assert_eq!(
+        condition(&plan, PUBLISHED).0,
+        "True",
+        "the list may be older than the result"
+    );
+    world.in_evalai().cancelled_as_of = listed.checked_add(SignedDuration::from_secs(2)).ok();
+    let plan = world.pass();
+    assert_eq!(
+        condition(&plan, PUBLISHED),
+        ("False".into(), reasons::CANCELLED_IN_EVALAI.into())
+    );
+    assert_eq!(condition(&plan, RECORDED).0, "True");
+    assert_eq!(
+        (plan.actions, plan.events.len(), plan.requeue),
+        (vec![Action::Forget], 0, None)
+    );
+    assert_eq!(
+        (
+            plan.status.state,
+            plan.status.reason,
+            plan.status.message,
+            plan.status.score
+        ),
+        (before.state, before.reason, before.message, before.score)
+    );
 
-    // The row of the re-run was edited: EvalAI still shows finished after it.
-    unproven.go_to(600);
-    unproven.in_evalai().read_at = Some(at(590));
-    let plan = unproven.pass();
-    assert_eq!((plan.actions, plan.requeue), (vec![Action::Forget], None));
-    // A time to come would be asked about until then.
-    unproven.view.rerun_as.as_mut().unwrap().time = Some(Time(at(90_000)));
-    assert_eq!(unproven.pass().requeue, None);
+    // The list of later shows it no more, or the controller has begun anew.
+    world.view.evalai = None;
+    let plan = world.pass();
+    assert_eq!(condition(&plan, PUBLISHED).1, reasons::CANCELLED_IN_EVALAI);
+    assert_eq!(plan.actions, [Action::Forget], "nothing is sent again");
 }
 
 #[test]
-fn a_submission_remembers_which_one_it_reruns() {
-    let mut world = World::evalai();
-    let of = Rerun {
-        submission_name: "submission-7".into(),
-        time: None,
-    };
-    let known = world.in_evalai().info.as_mut().unwrap();
-    known.rerun_of = Some(of.clone());
-    assert_eq!(world.pass().status.rerun_of.as_deref(), Some(&of));
-    world.in_evalai().info.as_mut().unwrap().rerun_of = None;
-    assert_eq!(world.pass().status.rerun_of.as_deref(), Some(&of));
+fn a_failure_that_evalai_cancels_later_stays_published() {
+    let mut world = failed();
+    world.published();
+    world.recorded();
+    world.pass();
+    world.view.evalai = None;
+    let later = world.view.now.checked_add(SignedDuration::from_secs(2)).ok();
+    world.in_evalai().cancelled_as_of = later;
+    assert_eq!(condition(&world.pass(), PUBLISHED).0, "True");
 }
 
 #[test]

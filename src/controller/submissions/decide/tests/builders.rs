@@ -83,7 +83,6 @@ pub fn info() -> EvalaiInfo {
         team_name: Some("Team".into()),
         submitted_at: Some(at(-60)),
         resumed_at: None,
-        rerun_of: None,
         last_attempt: None,
         image: Some("ecr/agent:9".into()),
         image_problem: None,
@@ -138,7 +137,6 @@ impl World {
                 written_ago: None,
                 record: Some(RecordView::default()),
                 partial_sent: None,
-                rerun_as: None,
                 evalai_writes_from: None,
             },
         }

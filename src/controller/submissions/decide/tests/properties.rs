@@ -294,6 +294,7 @@ fn evalai_view() -> impl Strategy<Value = EvalaiView> {
         info,
         read_at: None,
         cancelled,
+        cancelled_as_of: cancelled.then(|| at(900)),
         overtaken,
         end,
         error,

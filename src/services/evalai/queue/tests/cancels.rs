@@ -36,6 +36,44 @@ fn a_cancellation_is_found_by_the_next_list() {
 }
 
 #[test]
+fn a_submission_with_its_end_is_woken_once_when_a_list_shows_it_as_cancelled() {
+    let mut bench = Bench::new();
+    bench.serve();
+    bench.live(8, 1);
+    bench.answer_all(Status::Running);
+    let board = key(100);
+    let lists = |bench: &mut Bench, rows: Vec<Row>| {
+        bench.wait(10.0);
+        bench.queue.take_changes();
+        while let Some((name, ticket)) = bench.next() {
+            let rows = if name == "list of cancelled" {
+                rows.clone()
+            } else {
+                vec![]
+            };
+            bench.answer(&ticket, Reply::Rows(Answer::Done(rows)));
+        }
+        let woken = |change| matches!(change, Changed::Submission(key) if key.name == "submission-7");
+        bench.queue.take_changes().into_iter().any(woken)
+    };
+    assert!(!lists(&mut bench, vec![]));
+    assert_eq!(bench.queue.cancelled_as_of(&board, 7), None);
+    let shown = || vec![row(7, Status::Cancelled), row(8, Status::Running)];
+    assert!(lists(&mut bench, shown()));
+    let first = bench.queue.cancelled_as_of(&board, 7);
+    assert!(first.is_some_and(|at| at < bench.now().wall));
+    assert_eq!(
+        bench.queue.cancelled_as_of(&board, 8),
+        None,
+        "one that runs is followed otherwise"
+    );
+    assert!(!lists(&mut bench, shown()), "once");
+    assert!(bench.queue.cancelled_as_of(&board, 7) > first);
+    assert!(!lists(&mut bench, vec![]));
+    assert_eq!(bench.queue.cancelled_as_of(&board, 7), None);
+}
+
+#[test]
 fn a_cancellation_that_a_write_under_way_may_undo_is_sent_again() {
     let (mut bench, write) = partial_under_way();
     let list = next_list(&mut bench);
