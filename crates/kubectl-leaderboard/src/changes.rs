@@ -4,7 +4,6 @@ use std::pin::pin;
 use std::process::ExitCode;
 
 use futures::StreamExt;
-use jiff::Timestamp;
 use kube::ResourceExt;
 
 use crate::change::{self, Request};
@@ -12,9 +11,8 @@ use crate::cluster::{Cluster, Fetched, Scope};
 use crate::commands::{frame, note_interruption, nothing};
 use crate::error::{self, Error};
 use crate::output::{self, note, print};
-use crate::transitions::Waiting;
-use crate::{Cancel, resume, submit};
-use leaderboard_api::{Attempt, State, Submission};
+use crate::{Cancel, facts, resume, submit};
+use leaderboard_api::{Attempt, State, Submission, SubmissionStatus};
 
 /// How often a change is tried again after a conflict with somebody else's.
 const TRIES: usize = 4;
@@ -166,16 +164,20 @@ fn refusal(request: Request, submission: &Submission, error: kube::Error) -> Err
 
 /// Waits for the end of an attempt, and prints each state until then.
 async fn wait(cluster: &Cluster, name: &str, attempt: Attempt) -> Result<State, Error> {
-    let mut waiting = Waiting::new(attempt).within(output::width());
     let mut changes = pin!(cluster.changes(name));
-    let mut printed = String::new();
+    let (mut printed, mut last) = (String::new(), String::new());
     while let Some(change) = changes.next().await {
         match change {
             Ok(Some(submission)) => {
-                let update = waiting.observe(&submission, Timestamp::now());
-                print(&update.lines);
-                if let Some(end) = update.end {
-                    return Ok(end);
+                let Some((state, lines)) = facts::transition(&submission, attempt, frame()) else {
+                    continue;
+                };
+                if state != last {
+                    print(&lines);
+                    last = state;
+                }
+                if let Some(status) = submission.status.filter(SubmissionStatus::has_ended) {
+                    return Ok(status.state_of_conditions());
                 }
             }
             Ok(None) => return Err(Error::Gone(name.to_owned())),

@@ -6,8 +6,8 @@ use jiff::Timestamp;
 use k8s_openapi::apimachinery::pkg::apis::meta::v1::Time;
 use kube::ResourceExt;
 
-use super::text::when;
-use leaderboard_api::{FailureClass, State, Submission, SubmissionStatus, TeamStatus, conditions};
+use super::text::{Frame, when};
+use leaderboard_api::{Attempt, FailureClass, State, Submission, SubmissionStatus, TeamStatus, conditions};
 
 /// The state of a submission; none before the operator has processed it.
 pub(super) fn state(status: &SubmissionStatus) -> Option<State> {
@@ -58,6 +58,25 @@ pub(super) fn headline(submission: &Submission, now: Timestamp) -> String {
     }
 }
 
+/// The state of this attempt, or of a later one, with its reason; and with the message, as a person who waits for it reads it. None before
+/// the attempt has begun.
+pub(super) fn transition(submission: &Submission, attempt: Attempt, frame: Frame) -> Option<(String, Vec<String>)> {
+    let status = submission.status.as_ref().filter(|s| s.attempt >= Some(attempt))?;
+    let reason = status.reason.as_deref().unwrap_or_default();
+    let state = format!(
+        "{} is {} ({reason})",
+        submission.name_any(),
+        status.state_of_conditions().as_str()
+    );
+    let text = format!("{state}: {}", status.message.as_deref().unwrap_or_default());
+    let mut page = frame.page();
+    page.row(
+        &frame.now.strftime("%H:%M:%SZ").to_string(),
+        text.trim_end_matches(": "),
+    );
+    Some((state, page.into_lines()))
+}
+
 /// Name of the team, else its id.
 pub(super) fn team(submission: &Submission) -> Option<String> {
     let given = submission.spec.team.clone().map(TeamStatus::from);
@@ -89,8 +108,7 @@ pub(super) fn track(submission: &Submission) -> String {
 /// Whether the attempt has ended and no higher one is requested.
 pub(super) fn has_ended(submission: &Submission) -> bool {
     let status = submission.status.as_ref();
-    status.is_some_and(|s| conditions::is_true(&s.conditions, conditions::FINISHED))
-        && !is_attempt_requested(submission)
+    status.is_some_and(SubmissionStatus::has_ended) && !is_attempt_requested(submission)
 }
 
 /// Whether it has a Job and has not ended.

@@ -1,6 +1,6 @@
 //! `kubectl leaderboard`: explains why a submission waits, runs or failed, and cancels or resumes it.
 //!
-//! `why`, `status`, `overview`, `top`, `change`, `resume` and `transitions` are pure and hold what is printed and decided; `cluster` talks to
+//! `why`, `status`, `overview`, `top`, `change`, `resume` and `facts` are pure and hold what is printed and decided; `cluster` talks to
 //! the API server; `commands` and `changes` bring both together. `import` makes text of text. The plugin shows what the status holds, and
 //! contacts neither EvalAI nor AWS; where that helps, it starts the person's own `aws` program.
 
@@ -31,7 +31,6 @@ mod submit;
 mod table;
 mod text;
 mod top;
-mod transitions;
 mod why;
 
 #[cfg(test)]
@@ -108,7 +107,7 @@ enum Command {
                       or did not finish, or an error."
     )]
     Resume(resume::Resume),
-    /// Write what a person who helps needs into one archive, without secrets, routes and names of teams.
+    /// Write what a person who helps needs into one file, without secrets, routes and names of teams.
     Report(report::Report),
     /// Print manifests for a pipeline of Step Functions that this operator takes over. It asks neither AWS nor a cluster.
     #[command(

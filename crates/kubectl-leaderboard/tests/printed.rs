@@ -264,7 +264,7 @@ fn without_a_cluster_its_address_is_named() {
         ],
     );
     assert!(
-        !Path::new("leaderboard-report-carla.zip").exists(),
+        !Path::new("leaderboard-report-carla.json").exists(),
         "no empty report is written"
     );
 }
@@ -318,7 +318,7 @@ fn logs_have_the_label_of_their_container_and_come_in_its_order() {
 #[test]
 fn a_report_counts_what_it_has_and_names_what_it_has_not() {
     let stub = Stub::start(cluster);
-    let file = std::env::temp_dir().join(format!("leaderboard-report-{}.zip", std::process::id()));
+    let file = std::env::temp_dir().join(format!("leaderboard-report-{}.json", std::process::id()));
     let output = plugin(&stub, &["report", "--file", file.to_str().unwrap()]);
     let text = String::from_utf8(output.stdout).unwrap();
     assert!(output.status.success() && file.exists(), "{text}");
@@ -326,7 +326,7 @@ fn a_report_counts_what_it_has_and_names_what_it_has_not() {
     let words = text.split_whitespace().collect::<Vec<_>>().join(" ");
     for part in [
         "of namespace carla: 1 Leaderboard, 5 submissions, 1 Pod.",
-        "Without events.json: missing right: events.events.k8s.io is forbidden",
+        "Without events: missing right: events.events.k8s.io is forbidden",
     ] {
         assert!(words.contains(part), "{part}\n\n{text}");
     }

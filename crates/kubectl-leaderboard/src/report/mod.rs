@@ -1,79 +1,76 @@
-//! `report`: what a person who helps needs of a namespace, in one zip archive, without secrets, routes and names of teams.
+//! `report`: what a person who helps needs of a namespace, in one file, without secrets, routes and names of teams.
 //!
-//! `redact` takes out what is nobody's business, `zip` writes the archive; both are pure.
+//! `redact`, which is pure, takes out what is nobody's business.
 
 mod redact;
-mod zip;
 
 use std::path::PathBuf;
 
 use clap::Args;
 use jiff::Timestamp;
 use leaderboard_api::text::sentence;
-use serde_json::Value;
+use serde_json::{Value, json};
 
 use crate::cluster::{Cluster, Scope};
 use crate::commands::frame;
 use crate::error::Error;
-use crate::output::print;
+use crate::output::{self, Format, print};
 use crate::text::Frame;
 
-/// Where the archive goes.
+/// Where the report goes.
 #[derive(Args, Debug)]
 pub struct Report {
-    /// File to write [default: leaderboard-report-NAMESPACE.zip].
+    /// File to write [default: leaderboard-report-NAMESPACE.json].
     #[arg(long, value_name = "FILE")]
     file: Option<PathBuf>,
 }
 
-/// The file whose objects name teams.
-const SUBMISSIONS: &str = "submissions.json";
+/// The part whose objects name teams.
+const SUBMISSIONS: &str = "submissions";
 
-/// One file of the archive, and what it counts.
+/// One part of the report, and what it counts.
 struct Part {
-    file: &'static str,
+    name: &'static str,
     one: &'static str,
     many: &'static str,
     objects: Result<Vec<Value>, Error>,
 }
 
-/// Writes the archive.
+/// Writes the report.
 pub async fn report(cluster: &Cluster, wanted: &Report) -> Result<(), Error> {
     let now = Timestamp::now();
     let parts = ask(cluster).await;
-    let submissions = parts.iter().find(|part| part.file == SUBMISSIONS);
+    let submissions = parts.iter().find(|part| part.name == SUBMISSIONS);
     let names = submissions
         .and_then(|part| part.objects.as_deref().ok())
         .map(redact::names)
         .unwrap_or_default();
-    let (mut files, mut missing, mut counts) = (Vec::new(), Vec::new(), Vec::new());
+    let about = format!(
+        "kubectl leaderboard {} of namespace {} at {now:.0}",
+        env!("CARGO_PKG_VERSION"),
+        cluster.namespace
+    );
+    let mut document = json!({ "about": about });
+    let (mut missing, mut counts) = (Vec::new(), Vec::new());
     for part in parts {
         match part.objects {
             Ok(objects) => {
                 counts.push(counted(objects.len(), part.one, part.many));
-                files.push((
-                    part.file.to_owned(),
-                    format!("{:#}\n", redact::objects(part.file, objects, &names)),
-                ));
+                document[part.name] = redact::objects(part.name, objects, &names);
             }
-            // An archive of nothing helps nobody.
+            // A report of nothing helps nobody.
             Err(error @ (Error::Credentials(_) | Error::Unreachable { .. })) => return Err(error),
             // Without a right to one kind, the others help all the same.
-            Err(error) => missing.push(format!("{}: {error}", part.file)),
+            Err(error) => missing.push(format!("{}: {error}", part.name)),
         }
     }
-    let about = format!(
-        "kubectl leaderboard {} of namespace {} at {now:.0}\n{}\n",
-        env!("CARGO_PKG_VERSION"),
-        cluster.namespace,
-        missing.join("\n")
-    );
-    files.push(("about.txt".to_owned(), about));
-    let default = || PathBuf::from(format!("leaderboard-report-{}.zip", cluster.namespace));
+    document["missing"] = json!(missing);
+    let default = || PathBuf::from(format!("leaderboard-report-{}.json", cluster.namespace));
     let file = wanted.file.clone().unwrap_or_else(default);
-    let archive = zip::archive(&files, now);
+    // Who reads it on a terminal is not commanded by a stranger's text.
+    let text = output::document(Format::Json, &document).unwrap_or_default().concat();
     let path = file.display().to_string();
-    std::fs::write(&file, archive).map_err(|error| Error::File(path.clone(), error))?;
+    std::fs::write(&file, text + "\n").map_err(|error| Error::File(path.clone(), error))?;
     print(&lines(&path, &cluster.namespace, &counts, &missing, frame()));
     Ok(())
 }
@@ -82,8 +79,8 @@ async fn ask(cluster: &Cluster) -> [Part; 4] {
     let scope = Scope::default();
     let leaderboards = cluster.leaderboards(&scope).await;
     let unread = || Error::Forbidden("Leaderboards cannot be listed".to_owned());
-    let part = |file, one, many, objects| Part {
-        file,
+    let part = |name, one, many, objects| Part {
+        name,
         one,
         many,
         objects,
@@ -92,10 +89,10 @@ async fn ask(cluster: &Cluster) -> [Part; 4] {
     let submissions = documents(cluster.submissions(&scope).await);
     let (pods, events) = (documents(cluster.pods().await), documents(cluster.events().await));
     [
-        part("leaderboards.json", "Leaderboard", "Leaderboards", leaderboards),
+        part("leaderboards", "Leaderboard", "Leaderboards", leaderboards),
         part(SUBMISSIONS, "submission", "submissions", submissions),
-        part("pods.json", "Pod", "Pods", pods),
-        part("events.json", "event", "events", events),
+        part("pods", "Pod", "Pods", pods),
+        part("events", "event", "events", events),
     ]
 }
 

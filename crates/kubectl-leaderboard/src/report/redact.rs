@@ -30,9 +30,9 @@ pub(super) fn names(submissions: &[Value]) -> BTreeSet<String> {
         .collect()
 }
 
-/// The objects of one file, without these names of teams.
-pub(super) fn objects(file: &str, objects: Vec<Value>, names: &BTreeSet<String>) -> Value {
-    let is_of_pods = file.starts_with("pods");
+/// The objects of one part, without these names of teams.
+pub(super) fn objects(part: &str, objects: Vec<Value>, names: &BTreeSet<String>) -> Value {
+    let is_of_pods = part == "pods";
     let all = objects
         .into_iter()
         .map(|object| if is_of_pods { pod(&object) } else { object });
@@ -131,7 +131,7 @@ mod tests {
         });
         let board =
             json!({"spec": {"agent": {"env": [{"name": "TOKEN", "value": secret}]}, "podOverrides": {"x": secret}}});
-        let text = objects("submissions.json", vec![submission, board], &BTreeSet::new()).to_string();
+        let text = objects("submissions", vec![submission, board], &BTreeSet::new()).to_string();
         assert!(!text.contains(secret), "{text}");
         for kept in ["stays", "TOKEN", "\"id\":\"7\"", "InvalidResults"] {
             assert!(text.contains(kept), "{kept}: {text}");
@@ -156,7 +156,7 @@ mod tests {
             json!({"reason": "NodeLost", "note": ended}),
         ];
         let names = names(&all);
-        let text = objects("submissions.json", all, &names).to_string();
+        let text = objects("submissions", all, &names).to_string();
         assert!(!text.contains("Seven"), "{text}");
         for kept in ["\"team\":\"8\"", "attempts of team <removed> ended", "gpu-3"] {
             assert!(text.contains(kept), "{kept}: {text}");
@@ -168,7 +168,7 @@ mod tests {
         let event = |reason: &str, note: &str| json!({"reason": reason, "note": note, "regarding": {"name": "a"}});
         let mut events: Vec<Value> = OF_RESULTS.iter().map(|reason| event(reason, "s3cr3t")).collect();
         events.push(event("Replacing", "stays"));
-        let text = objects("events.json", events, &BTreeSet::new()).to_string();
+        let text = objects("events", events, &BTreeSet::new()).to_string();
         assert!(!text.contains("s3cr3t"), "{text}");
         assert!(text.contains("InvalidResults") && text.contains("stays"), "{text}");
     }
@@ -181,7 +181,7 @@ mod tests {
             "spec": {"nodeName": "gpu-3", "containers": [{"env": [{"name": "LEADERBOARD_RUN", "value": "s3cr3t"}]}]},
             "status": {"phase": "Failed", "containerStatuses": [{"name": "agent-1", "image": "a:1", "state": ended}]},
         });
-        let text = objects("pods.json", vec![pod], &BTreeSet::new()).to_string();
+        let text = objects("pods", vec![pod], &BTreeSet::new()).to_string();
         assert!(!text.contains("s3cr3t") && !text.contains("LEADERBOARD_RUN"), "{text}");
         assert!(text.contains("\"exitCode\":1") && text.contains("gpu-3"), "{text}");
     }

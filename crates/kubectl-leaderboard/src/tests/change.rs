@@ -3,12 +3,12 @@
 use serde_json::{Value, json};
 
 use super::{
-    assert_width, cancelled, crashed, finished, frame, leaderboard, node_lost, now, running, submission, waiting, with,
+    assert_width, cancelled, crashed, finished, frame, leaderboard, node_lost, running, submission, waiting, with,
 };
 use crate::board::Observed;
 use crate::change::{Change, Request, after_refusal, plan};
-use crate::transitions::Waiting;
-use leaderboard_api::{Attempt, State, Submission};
+use crate::facts::transition;
+use leaderboard_api::{Attempt, Submission};
 
 fn planned(request: Request, submission: &Submission) -> Result<Change, String> {
     let plan = plan(request, submission, Observed::Found(&leaderboard()), frame());
@@ -182,31 +182,22 @@ fn a_refusal_names_the_other_way() {
 }
 
 #[test]
-fn a_wait_prints_each_transition_once_and_the_end() {
-    let mut wait = Waiting::new(Attempt(2));
-    let attempt = |status: Value| submission(&with(status, &json!({"attempt": 2})));
-    let mut observe = |object: &Submission| wait.observe(object, now());
+fn a_wait_prints_the_states_of_its_own_attempt() {
+    let of = |status: Value| transition(&submission(&status), Attempt(2), frame());
+    let again = |status: Value| of(with(status, &json!({"attempt": 2}))).unwrap();
+    assert_eq!(of(crashed()), None, "that was the attempt before");
+    let (state, lines) = again(waiting());
+    assert_eq!(state, "submission-42 is Pending (WaitingForSlot)");
     assert_eq!(
-        observe(&submission(&crashed())).end,
-        None,
-        "that was the attempt before"
+        lines[0],
+        "12:00:00Z:   submission-42 is Pending (WaitingForSlot): All slots of the Leaderboard are in use;"
     );
-    let update = observe(&attempt(waiting()));
+    assert_width(&lines);
+    let (before, lines) = again(running());
     assert_eq!(
-        update.lines[0],
-        "12:00:00Z  submission-42 is Pending (WaitingForSlot): All slots of the Leaderboard are in use;"
+        lines,
+        ["12:00:00Z:   submission-42 is Resumed (Running): 12/20 routes done."]
     );
-    assert_width(&update.lines);
-    assert!(observe(&attempt(waiting())).lines.is_empty());
-    assert_eq!(
-        observe(&attempt(running())).lines,
-        ["12:00:00Z  submission-42 is Resumed (Running): 12/20 routes done."]
-    );
-    let more = with(running(), &json!({"attempt": 2, "message": "13/20 routes done."}));
-    assert!(
-        observe(&submission(&more)).lines.is_empty(),
-        "progress is no transition"
-    );
-    let update = observe(&attempt(finished()));
-    assert_eq!((update.end, update.lines.len()), (Some(State::Finished), 1));
+    let (more, _) = again(with(running(), &json!({"message": "13/20 routes done."})));
+    assert_eq!(more, before, "progress is no transition");
 }

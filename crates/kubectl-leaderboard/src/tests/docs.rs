@@ -10,7 +10,8 @@ use super::{
 use crate::board::Observed;
 use crate::change::{Request, plan};
 use crate::error::Error;
-use crate::transitions::Waiting;
+use crate::facts::transition;
+use crate::text::{Frame, WIDTH};
 use crate::{overview, resume, why};
 use leaderboard_api::{Attempt, Submission};
 
@@ -79,7 +80,6 @@ fn cancel_and_resume_are_documented_as_they_are_printed() {
 #[test]
 fn the_states_on_the_way_are_documented_as_they_are_printed() {
     let stopping = json!({"reason": "Stopping", "message": "Stopping as requested; completed routes are kept."});
-    let mut wait = Waiting::new(Attempt::FIRST);
     let mut lines = Vec::new();
     for (time, status) in [
         ("2026-11-01T12:00:00Z", running()),
@@ -87,7 +87,8 @@ fn the_states_on_the_way_are_documented_as_they_are_printed() {
         ("2026-11-01T12:00:07Z", cancelled()),
     ] {
         let now: Timestamp = time.parse().unwrap();
-        lines.extend(wait.observe(&submission(&status), now).lines);
+        let frame = Frame { now, width: WIDTH };
+        lines.extend(transition(&submission(&status), Attempt::FIRST, frame).unwrap().1);
     }
     assert_documented(&lines);
 }

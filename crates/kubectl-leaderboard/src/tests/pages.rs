@@ -89,12 +89,12 @@ fn a_log_that_is_not_there_is_explained() {
 
 #[test]
 fn a_report_is_printed_as_its_files_show() {
-    let file = "leaderboard-report-carla.zip";
+    let file = "leaderboard-report-carla.json";
     let texts = |texts: &[&str]| texts.iter().map(|text| (*text).to_owned()).collect::<Vec<_>>();
     let all = texts(&["1 Leaderboard", "12 submissions", "3 Pods", "40 events"]);
     assert_shown("report", |frame| report::lines(file, "carla", &all, &[], frame));
     let missing = texts(&[
-        "events.json: missing right: events.events.k8s.io is forbidden: User \"host\" cannot list \
+        "events: missing right: events.events.k8s.io is forbidden: User \"host\" cannot list \
                           resource \"events\" in API group \"events.k8s.io\" in the namespace \"carla\". Check namespace and context, or \
                           ask for the right: docs/plugin.md has a Role with all that the plugin needs",
     ]);

@@ -10,8 +10,8 @@ use super::{
 };
 use crate::board::Observed;
 use crate::change::{Request, plan};
+use crate::facts::transition;
 use crate::resume::{self, Resume};
-use crate::transitions::Waiting;
 use crate::{overview, status, top, why};
 use leaderboard_api::{Attempt, Submission};
 
@@ -164,12 +164,8 @@ fn changes_are_printed_as_their_files_show() {
         .lines
     });
     assert_shown("wait", |frame| {
-        let mut wait = Waiting::new(Attempt::FIRST).within(frame.width);
-        let states = [running(), crashed()];
-        let lines = states
-            .iter()
-            .flat_map(|status| wait.observe(&submission(status), frame.now).lines);
-        lines.collect()
+        let lines = |status| transition(&submission(status), Attempt::FIRST, frame).unwrap().1;
+        [running(), crashed()].iter().flat_map(lines).collect()
     });
 }
 
