@@ -3,12 +3,12 @@
 use std::borrow::Cow;
 
 use kube::api::{Patch, PatchParams};
-use kube::{Client, Resource, ResourceExt};
+use kube::{Resource, ResourceExt};
 use serde::Serialize;
 use serde_json::json;
 
 use super::objects::uid;
-use crate::kubernetes::{CallError, Watchable, Writes, call};
+use crate::kubernetes::{CallError, Watchable, Writer, Writes, call};
 use leaderboard_api::names;
 
 /// Of a patch that is no apply.
@@ -19,8 +19,13 @@ pub fn patch_by(manager: &str) -> PatchParams {
     }
 }
 
-/// Puts our finalizer on an object, or takes it off.
-pub async fn set_finalizer<K>(client: &Client, object: &K, finalizer: &str, wanted: bool) -> Result<(), CallError>
+/// Puts our finalizer on an object, or takes it off. Returns the version of the object then, if it is still there.
+pub async fn set_finalizer<K>(
+    writer: &Writer,
+    object: &K,
+    finalizer: &str,
+    wanted: bool,
+) -> Result<Option<String>, CallError>
 where
     K: Watchable + Resource<DynamicType = ()>,
 {
@@ -31,10 +36,10 @@ where
     let version = &object.meta().resource_version;
     let patch = Patch::Merge(json!({ "metadata": { "resourceVersion": version, "finalizers": finalizers } }));
     let params = patch_by(names::MANAGER_FINALIZER);
-    let (api, name) = (api(client, object), object.name_any());
+    let (api, name) = (api(writer, object), object.name_any());
     match call("the finalizer", &described(object), api.patch(&name, &params, &patch)).await {
-        Err(error) if !wanted && error.is_gone() => Ok(()),
-        other => other.map(|_| ()),
+        Err(error) if !wanted && error.is_gone() => Ok(None),
+        other => other.map(|written| Some(written.metadata.resource_version.into())),
     }
 }
 
@@ -49,23 +54,31 @@ struct Applied<'a, S> {
 }
 
 #[derive(Serialize)]
+#[serde(rename_all = "camelCase")]
 struct Identity<'a> {
     name: &'a str,
     uid: &'a str,
+    resource_version: Option<&'a str>,
 }
 
-/// Applies a status. Returns the version of the object that has it.
-pub async fn apply_status<K>(client: &Client, object: &K, status: &impl Serialize) -> Result<Box<str>, CallError>
+/// Applies a status that was decided on this version of the object; another one is a conflict. Returns the version that has it.
+pub async fn apply_status<K>(
+    writer: &Writer,
+    object: &K,
+    version: Option<&str>,
+    status: &impl Serialize,
+) -> Result<Box<str>, CallError>
 where
     K: Watchable + Resource<DynamicType = ()>,
 {
-    let (api, name) = (api(client, object), object.name_any());
+    let (api, name) = (api(writer, object), object.name_any());
     let patch = Patch::Apply(Applied {
         api_version: <K as Resource>::api_version(&()),
         kind: <K as Resource>::kind(&()),
         metadata: Identity {
             name: &name,
             uid: uid(object),
+            resource_version: version,
         },
         status,
     });
@@ -79,9 +92,9 @@ fn described<K: Resource<DynamicType = ()>>(object: &K) -> String {
     format!("{} {}", K::kind(&()), object.name_any())
 }
 
-fn api<K>(client: &Client, object: &K) -> Writes<K>
+fn api<K>(writer: &Writer, object: &K) -> Writes<K>
 where
     K: Watchable + Resource<DynamicType = ()>,
 {
-    Writes::new(client.clone(), &ResourceExt::namespace(object).unwrap_or_default())
+    Writes::new(writer, &ResourceExt::namespace(object).unwrap_or_default())
 }

@@ -29,7 +29,7 @@ pub use namespaces::Namespaces;
 pub use store::{Index, Store, Tally};
 pub use uncached::spawn_uncached;
 pub use watch::{Shape, Synced, Unreadable, Watch, spawn_watch};
-pub use write::{Writes, Written};
+pub use write::{Writer, Writes, Written};
 
 /// Longer than a watch may be silent: the server ends each after 290 s.
 const READ_TIMEOUT: Duration = Duration::from_mins(5);

@@ -1,6 +1,7 @@
 //! Writes that are answered with metadata alone: who writes an object knows it, and the API server need not encode all of it.
 
 use std::marker::PhantomData;
+use std::sync::Arc;
 
 use kube::api::{DeleteParams, Patch, PatchParams, PostParams};
 use kube::core::{Request, request};
@@ -12,9 +13,26 @@ use super::objects::Meta;
 
 const METADATA_ONLY: &str = "application/json;as=PartialObjectMetadata;g=meta.k8s.io;v=v1";
 
+/// A client that writes as long as this process may.
+#[derive(Clone)]
+pub struct Writer {
+    client: Client,
+    may_write: Arc<dyn Fn() -> bool + Send + Sync>,
+}
+
+impl Writer {
+    /// `may_write` is asked right before each request.
+    pub fn new(client: Client, may_write: impl Fn() -> bool + Send + Sync + 'static) -> Self {
+        Self {
+            client,
+            may_write: Arc::new(may_write),
+        }
+    }
+}
+
 /// Writes objects of one kind in one namespace.
 pub struct Writes<K> {
-    client: Client,
+    writer: Writer,
     request: Request,
     kind: PhantomData<fn() -> K>,
 }
@@ -27,9 +45,9 @@ pub struct Written {
 }
 
 impl<K: Watchable> Writes<K> {
-    pub fn new(client: Client, namespace: &str) -> Self {
+    pub fn new(writer: &Writer, namespace: &str) -> Self {
         Self {
-            client,
+            writer: writer.clone(),
             request: Request::new(Item::<K>::url_path(&(), Some(namespace))),
             kind: PhantomData,
         }
@@ -68,6 +86,11 @@ impl<K: Watchable> Writes<K> {
         if let Ok(accept) = METADATA_ONLY.parse() {
             request.headers_mut().insert("accept", accept);
         }
-        self.client.request(request).await
+        if !(self.writer.may_write)() {
+            return Err(Error::Service(
+                "this process no longer leads, so it writes nothing".into(),
+            ));
+        }
+        self.writer.client.request(request).await
     }
 }

@@ -18,7 +18,6 @@ use leaderboard_api::names::FAILURE_LOG_KEY;
 use leaderboard_api::{
     Attempt, JobNumber, Leaderboard, State, Submission, SubmissionStatus, conditions, names, reasons,
 };
-use leaderboard_operator::controller::runtime::leader;
 use leaderboard_operator::pod::report::{OWNER_KEY, Owner};
 use leaderboard_operator::services::archive::Archive;
 use serde_json::json;
@@ -116,10 +115,10 @@ async fn finishes(world: &World) -> (u64, String) {
 async fn after_a_controller_that_did_not_confirm_its_requests_everybody_reads_until_when_nothing_is_written() {
     let world = World::new().await;
     world.leaderboard("lb", 1, "Hosts").await;
-    // Handed over in order, but without an answer to the last requests.
+    // It was killed: its Lease has a holder, and ends by itself.
     let lease = json!({
-        "metadata": {"name": "operator", "annotations": {leader::ANNOTATION_RELEASED: "1"}},
-        "spec": {"leaseTransitions": 1},
+        "metadata": {"name": "operator"},
+        "spec": {"holderIdentity": "gone", "leaseTransitions": 1},
     });
     let lease: Lease = serde_json::from_value(lease).unwrap();
     world.api().create(&PostParams::default(), &lease).await.unwrap();

@@ -3,12 +3,13 @@
 use std::time::Duration;
 
 use k8s_openapi::api::coordination::v1::Lease;
-use kube::api::{Patch, PatchParams};
+use kube::api::{Patch, PatchParams, PostParams};
 use kube::runtime::wait::await_condition;
-use kube::{Api, Client};
-use leaderboard_operator::controller::runtime::leader::{
-    ANNOTATION_DRAINED, Identity, Leader, Leadership, Settings, Timing, start,
-};
+use kube::{Api, Client, ResourceExt};
+use leaderboard_api::Submission;
+use leaderboard_operator::controller::runtime::leader::{Identity, Leader, Leadership, Settings, Timing, start};
+use leaderboard_operator::controller::writes::apply_status;
+use leaderboard_operator::kubernetes::Writer;
 use leaderboard_operator::observability::Observability;
 use leaderboard_operator::observability::shutdown::Stop;
 use serde_json::json;
@@ -59,9 +60,10 @@ impl Candidate {
             .expect("the election goes on")
             .clone()
         {
-            Leadership::Leader {
-                term, drained_before, ..
-            } => (term, drained_before),
+            Leadership::Leader { term } => {
+                let not_before = self.leader.fence().evalai_not_before().expect("it leads");
+                (term, not_before <= Instant::now())
+            }
             other => panic!("{other:?}"),
         }
     }
@@ -89,12 +91,9 @@ async fn leaders_follow_one_another_in_order_and_after_a_crash() {
     let second = Candidate::start(&client, &namespace);
     let fence = first.leader.fence();
     assert!(fence.may_write());
-    first.leader.drained();
+    first.leader.release().await;
     assert!(!fence.may_write());
-    first.leader.release().await.unwrap();
     assert_eq!(second.leads().await, (2, true));
-    let annotations = leases.get(LEASE).await.unwrap().metadata.annotations.unwrap();
-    assert_eq!(annotations[ANNOTATION_DRAINED], "1");
 
     drop(second);
     let third = Candidate::start(&client, &namespace);
@@ -142,4 +141,31 @@ async fn a_leader_stays_one_while_others_edit_its_lease() {
     }
     assert!(candidate.leader.fence().may_write());
     assert_eq!(candidate.leader.leadership().borrow().term(), Some(1));
+}
+
+#[tokio::test]
+async fn a_leader_that_slept_writes_no_older_status() {
+    let (client, namespace) = (server().await.client(), server().await.namespace("leader").await);
+    let api = Api::<Submission>::namespaced(client.clone(), &namespace);
+    let spec = json!({"leaderboardName": "lb", "track": "sensors", "image": "agent:1"});
+    let object = Submission::new("one", serde_json::from_value(spec).unwrap());
+    let made = api.create(&PostParams::default(), &object).await.unwrap();
+    let says = |message: &str| json!({"attempt": 1, "message": message});
+    let seen = made.resource_version();
+    let leads = Writer::new(client.clone(), || true);
+    let newer = apply_status(&leads, &made, seen.as_deref(), &says("newer"))
+        .await
+        .unwrap();
+    let older = apply_status(&leads, &made, seen.as_deref(), &says("older")).await;
+    assert!(older.unwrap_err().is_conflict());
+    apply_status(&leads, &made, Some(&newer), &says("newest"))
+        .await
+        .unwrap();
+    let lost = Writer::new(client, || false);
+    let refused = apply_status(&lost, &made, None, &says("of a former leader"))
+        .await
+        .unwrap_err();
+    assert!(refused.to_string().contains("no longer leads"), "{refused}");
+    let status = api.get("one").await.unwrap().status.unwrap();
+    assert_eq!(status.message.as_deref(), Some("newest"));
 }

@@ -26,7 +26,6 @@ use std::sync::Arc;
 use std::time::Duration;
 
 use jiff::Timestamp;
-use kube::Client;
 use kube::runtime::events::Recorder;
 use tokio::sync::mpsc::UnboundedSender;
 use tokio::time::Instant;
@@ -37,7 +36,7 @@ use super::slots::SlotAllocator;
 use super::writes::{apply_status, set_finalizer};
 use crate::controller::submissions::external::ExternalSystems;
 use crate::controller::submissions::team_use::Teams;
-use crate::kubernetes::CallError;
+use crate::kubernetes::{CallError, Writer};
 use crate::observability::metrics::leader::{self, Gauge, Samples};
 use decide::{LeaderboardPlan, LeaderboardView, decide};
 use isolation::Policies;
@@ -53,6 +52,7 @@ const FIRST_LOOK: Duration = Duration::from_secs(2);
 #[derive(Clone, Copy)]
 pub struct Uses<'a> {
     pub policies: Policies<'a>,
+    pub writer: &'a Writer,
     pub recorder: &'a Recorder,
     pub settings: &'a Settings,
     pub slots: &'a SlotAllocator,
@@ -92,9 +92,7 @@ pub async fn reconcile(leaderboard: Arc<Leaderboard>, uses: Uses<'_>) -> Result<
 /// One reconcile of a Leaderboard that this installation drives.
 async fn drive(leaderboard: Arc<Leaderboard>, uses: Uses<'_>) -> Result<Duration, CallError> {
     let (uid, now) = (uid_of(leaderboard.as_ref()), Timestamp::now());
-    let Policies {
-        client, stores, state, ..
-    } = uses.policies;
+    let (writer, Policies { stores, state, .. }) = (uses.writer, uses.policies);
     // One that is being deleted keeps it too: its submissions may still run.
     let policy = isolation::keep(uses.policies, &leaderboard, now).await;
     let refusal = refusal::of(&uses.settings.allowed, &leaderboard);
@@ -113,8 +111,9 @@ async fn drive(leaderboard: Arc<Leaderboard>, uses: Uses<'_>) -> Result<Duration
     }
     serve(uses, &view, &plan, &known);
     let since = since.or_else(|| look(uses, &view, &known));
+    let mut version = leaderboard.metadata.resource_version.clone();
     if let Some(wanted) = plan.finalizer {
-        set_finalizer(client, leaderboard.as_ref(), names::FINALIZER_LEADERBOARD, wanted).await?;
+        version = set_finalizer(writer, leaderboard.as_ref(), names::FINALIZER_LEADERBOARD, wanted).await?;
     }
     if plan.finalizer == Some(false) {
         return Ok(RESYNC);
@@ -123,7 +122,7 @@ async fn drive(leaderboard: Arc<Leaderboard>, uses: Uses<'_>) -> Result<Duration
     let left = left.map(|since| FIRST_LOOK.saturating_sub(since.elapsed()));
     let again = match left.filter(|left| !left.is_zero()) {
         Some(left) => left,
-        None => write_status(client, state, &leaderboard, &plan, now).await?,
+        None => write_status(writer, state, &leaderboard, version.as_deref(), &plan, now).await?,
     };
     // The end of a look wakes it.
     let due = known.next(&leaderboard, is_refused(uses, &leaderboard), now);
@@ -228,9 +227,10 @@ fn rows_waiting(uses: Uses<'_>, leaderboard: &Leaderboard) -> Option<usize> {
 /// Writes the status if it shows something new; returns when to look again. On top of a status that the cache does not show yet
 /// nothing is written: conditions would get the time of the second write.
 async fn write_status(
-    client: &Client,
+    writer: &Writer,
     state: &LeaderboardState,
     leaderboard: &Leaderboard,
+    version_now: Option<&str>,
     plan: &LeaderboardPlan,
     now: Timestamp,
 ) -> Result<Duration, CallError> {
@@ -256,7 +256,7 @@ async fn write_status(
     if only_numbers && old.counts == plan.status.counts && !state.is_older(&uid, now, RESYNC) {
         return Ok(RESYNC);
     }
-    let made = apply_status(client, leaderboard, &plan.status).await?;
+    let made = apply_status(writer, leaderboard, version_now, &plan.status).await?;
     state.change(&uid, |entry| entry.written = Some((now, version_number(&made))));
     Ok(RESYNC)
 }

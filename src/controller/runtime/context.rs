@@ -20,6 +20,7 @@ use crate::controller::submissions::observe::causes::Causes;
 use crate::controller::submissions::observe::workers::Workers;
 use crate::controller::submissions::team_use::Teams;
 use crate::controller::submissions::{act, observe};
+use crate::kubernetes::Writer;
 use crate::kubernetes::objects::Pod;
 use crate::observability::metrics::Metrics;
 use crate::observability::traces::Traces;
@@ -30,6 +31,7 @@ use leaderboard_api::Leaderboard;
 /// Shared by all reconciles.
 pub struct Context {
     pub client: Client,
+    pub writer: Writer,
     pub settings: Settings,
     pub stores: Stores,
     pub memory: Memory,
@@ -61,7 +63,7 @@ impl Context {
 
     pub fn for_act(&self) -> act::Uses<'_> {
         act::Uses {
-            client: &self.client,
+            writer: &self.writer,
             recorder: &self.recorder,
             settings: &self.settings,
             stores: &self.stores,
@@ -77,6 +79,7 @@ impl Context {
     pub fn for_leaderboards(&self) -> leaderboards::Uses<'_> {
         leaderboards::Uses {
             policies: self.policies(),
+            writer: &self.writer,
             recorder: &self.recorder,
             settings: &self.settings,
             slots: &self.slots,

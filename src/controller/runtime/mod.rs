@@ -37,7 +37,7 @@ use crate::controller::submissions::observe::workers::Workers;
 use crate::controller::submissions::phases::Phase;
 use crate::kubernetes::objects::Event;
 use crate::kubernetes::preflight::{self, await_kinds};
-use crate::kubernetes::spawn_uncached;
+use crate::kubernetes::{Writer, spawn_uncached};
 use crate::observability::Observability;
 use crate::observability::tasks::TaskFailed;
 use crate::page::Page;
@@ -113,13 +113,14 @@ pub async fn run(
             watches,
             telemetry,
         };
-        let result = parts.lead(&leader).await;
-        if result.is_ok()
-            && let Err(error) = leader.release().await
-        {
-            tracing::warn!("{error}");
+        if parts.lead(&leader).await? {
+            leader.release().await;
+        } else {
+            tracing::warn!(
+                "EvalAI has not answered all requests: the Lease is left to expire, and the next leader waits for that"
+            );
         }
-        result
+        Ok(())
     });
     tokio::select! {
         biased;
@@ -146,11 +147,12 @@ struct Parts {
 }
 
 impl Parts {
-    async fn lead(self, leader: &Leader) -> Result<(), RunError> {
+    /// Until the stop. Returns whether EvalAI has answered all that was written to it.
+    async fn lead(self, leader: &Leader) -> Result<bool, RunError> {
         if !await_lead(leader, &self.telemetry).await? {
-            return Ok(());
+            return Ok(true);
         }
-        tokio::select! { () = self.watches.synced() => {}, () = self.telemetry.stop.wait() => return Ok(()) }
+        tokio::select! { () = self.watches.synced() => {}, () = self.telemetry.stop.wait() => return Ok(true) }
         // Prometheus sees no increase in a sample that begins with 1.
         for phase in Phase::ALL {
             self.telemetry.metrics.submissions.phases.of([phase.as_str()]);
@@ -162,7 +164,7 @@ impl Parts {
         let hub = external.hub.clone();
         let (looks, wanted) = mpsc::unbounded_channel();
         let shared = Arc::new(Shared {
-            context: Arc::new(self.context(external, looks, &queues)),
+            context: Arc::new(self.context(&leader.fence(), external, looks, &queues)),
             queues,
             backoff: BackoffMap::default(),
             telemetry: self.telemetry.clone(),
@@ -181,21 +183,10 @@ impl Parts {
         };
         let of_submissions = events::of_submissions(&self.watches, reports, &shared);
         let of_leaderboards = events::of_leaderboards(&self.watches, &shared);
-        let mut leadership = leader.leadership();
         let reconciles = reconciles::run(of_submissions, of_leaderboards, shared);
         let reconciles = self.telemetry.tasks.stay("reconciles", reconciles);
-        tokio::select! {
-            () = self.telemetry.stop.wait() => {}
-            why = lost(&mut leadership) => {
-                reconciles.abort();
-                return Err(RunError::LostLease(why));
-            }
-        }
-        finish(reconciles).await;
-        if hub.drain().await {
-            leader.drained();
-        }
-        Ok(())
+        let (stop, lost) = (self.telemetry.stop.wait(), lost(leader.leadership()));
+        end(reconciles, stop, hub.drain(), lost).await
     }
 
     /// The services, and what counts them.
@@ -225,12 +216,20 @@ impl Parts {
     }
 
     /// What all reconciles share.
-    fn context(&self, external: ExternalSystems, looks: mpsc::UnboundedSender<Look>, queues: &Queues) -> Context {
+    fn context(
+        &self,
+        fence: &leader::Fence,
+        external: ExternalSystems,
+        looks: mpsc::UnboundedSender<Look>,
+        queues: &Queues,
+    ) -> Context {
+        let fence = fence.clone();
         let (aws, client, tasks) = (&self.aws, &self.client, &self.telemetry.tasks);
         let answered = || events::waking(&queues.submissions, &self.watches.submissions.store);
         let boards = Arc::clone(&queues.leaderboards);
         let context = Context {
             client: client.clone(),
+            writer: Writer::new(client.clone(), move || fence.may_write()),
             settings: self.settings.clone(),
             stores: self.watches.stores(),
             memory: Memory::default(),
@@ -292,11 +291,26 @@ impl Parts {
     }
 }
 
-/// Reconciles end by the stop; what they have begun is finished, and given up when that takes too long.
-async fn finish<T>(mut reconciles: JoinHandle<T>) {
-    if tokio::time::timeout(DRAIN, &mut reconciles).await.is_err() {
-        reconciles.abort();
-    }
+/// After the stop, what reconciles have begun is finished, and given up when that takes too long; then `drain` is waited for and
+/// answered. A leader that has lost its Lease drops all of it, at any moment.
+async fn end<T>(
+    mut reconciles: JoinHandle<T>,
+    stop: impl Future<Output = ()>,
+    drain: impl Future<Output = bool>,
+    lost: impl Future<Output = String>,
+) -> Result<bool, RunError> {
+    let finished = async {
+        stop.await;
+        let _ = tokio::time::timeout(DRAIN, &mut reconciles).await;
+        drain.await
+    };
+    let result = tokio::select! {
+        biased;
+        why = lost => Err(RunError::LostLease(why)),
+        is_answered = finished => Ok(is_answered),
+    };
+    reconciles.abort();
+    result
 }
 
 fn events(client: &Client) -> EventRecorder {
@@ -324,7 +338,7 @@ async fn await_lead(leader: &Leader, telemetry: &Observability) -> Result<bool, 
     }
 }
 
-async fn lost(leadership: &mut tokio::sync::watch::Receiver<Leadership>) -> String {
+async fn lost(mut leadership: tokio::sync::watch::Receiver<Leadership>) -> String {
     let why = {
         let ended = leadership.wait_for(|l| !matches!(l, Leadership::Leader { .. })).await;
         ended.map(|leadership| match &*leadership {

@@ -1,5 +1,7 @@
 //! The whole controller on a mock of the API server: what becomes of the process when one of its tasks ends.
 
+use std::future::{pending, ready};
+
 use http::{Request, Response};
 use kube::client::Body;
 use serde_json::{Value, json};
@@ -130,16 +132,43 @@ async fn a_stop_is_no_failure_of_the_tasks_that_it_ends() {
 #[tokio::test(start_paused = true)]
 async fn reconciles_are_waited_for_until_they_have_ended_and_no_longer_than_the_limit() {
     let began = Instant::now();
-    finish(tokio::spawn(async {})).await;
+    let stopped = async |reconciles| end(reconciles, ready(()), ready(true), pending()).await.unwrap();
+    assert!(stopped(tokio::spawn(async {})).await);
     assert_eq!(began.elapsed(), Duration::ZERO);
-    finish(tokio::spawn(tokio::time::sleep(Duration::from_secs(3)))).await;
+    assert!(stopped(tokio::spawn(tokio::time::sleep(Duration::from_secs(3)))).await);
     assert_eq!(began.elapsed(), Duration::from_secs(3));
-    let (alive, hangs) = tokio::sync::oneshot::channel::<()>();
-    let hanging = tokio::spawn(async move {
-        let _alive = alive;
-        std::future::pending::<()>().await;
-    });
-    finish(hanging).await;
+    let (reconciles, dropped) = hanging();
+    assert!(stopped(reconciles).await);
     assert_eq!(began.elapsed(), Duration::from_secs(3) + DRAIN);
-    assert!(hangs.await.is_err(), "one that hangs is given up");
+    assert!(dropped.await.is_err(), "one that hangs is given up");
+    let unanswered = end(tokio::spawn(async {}), ready(()), ready(false), pending()).await;
+    assert!(!unanswered.unwrap());
+}
+
+#[tokio::test(start_paused = true)]
+async fn a_lost_lease_drops_reconciles_also_after_a_stop() {
+    let lost = async || {
+        tokio::time::sleep(Duration::from_secs(2)).await;
+        "other holds the Lease".to_owned()
+    };
+    let began = Instant::now();
+    let (reconciles, dropped) = hanging();
+    let result = end(reconciles, pending(), ready(true), lost()).await;
+    assert!(matches!(result, Err(RunError::LostLease(_))));
+    assert!(dropped.await.is_err());
+    let (reconciles, dropped) = hanging();
+    let result = end(reconciles, ready(()), ready(true), lost()).await;
+    assert!(matches!(result, Err(RunError::LostLease(_))), "a stop comes first");
+    assert!(dropped.await.is_err());
+    assert_eq!(began.elapsed(), Duration::from_secs(4));
+}
+
+/// Reconciles that never end, and what shows that they were dropped.
+fn hanging() -> (JoinHandle<()>, tokio::sync::oneshot::Receiver<()>) {
+    let (alive, dropped) = tokio::sync::oneshot::channel::<()>();
+    let reconciles = tokio::spawn(async move {
+        let _alive = alive;
+        pending::<()>().await;
+    });
+    (reconciles, dropped)
 }

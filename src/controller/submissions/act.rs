@@ -7,7 +7,7 @@ use std::time::Duration;
 use kube::api::{DeleteParams, Patch, PostParams, Preconditions};
 use kube::runtime::events::{Event as KubeEvent, EventType, Recorder};
 use kube::runtime::reflector::ObjectRef;
-use kube::{Client, Resource, ResourceExt};
+use kube::{Resource, ResourceExt};
 use serde_json::json;
 use tokio::time::Instant;
 
@@ -26,7 +26,7 @@ use crate::controller::slots::SlotAllocator;
 use crate::controller::stores::Stores;
 use crate::controller::writes::{apply_status, patch_by, set_finalizer};
 use crate::kubernetes::objects::{Job, Meta, Pod};
-use crate::kubernetes::{CallError, Watchable, Writes, call, call_within};
+use crate::kubernetes::{CallError, Watchable, Writer, Writes, call, call_within};
 use crate::observability::metrics::Metrics;
 use crate::observability::traces::Traces;
 use crate::pod::run::Stop;
@@ -39,7 +39,7 @@ const LONGEST_NOTE: usize = 900;
 /// What carrying a plan out uses.
 #[derive(Clone, Copy)]
 pub struct Uses<'a> {
-    pub client: &'a Client,
+    pub writer: &'a Writer,
     pub recorder: &'a Recorder,
     pub settings: &'a Settings,
     pub stores: &'a Stores,
@@ -82,10 +82,11 @@ pub async fn act(uses: Uses<'_>, view: &View, plan: Plan) -> Result<Option<Durat
         view,
         namespace: view.submission.namespace().unwrap_or_default(),
     };
+    let mut version = view.submission.resource_version();
     if plan.actions.contains(&Action::AddFinalizer) {
-        actor.set_finalizer(true).await?;
+        version = actor.set_finalizer(true).await?;
     }
-    let turn_in = actor.write_status(&plan.status, plan.write).await?;
+    let turn_in = actor.write_status(&plan.status, plan.write, version.as_deref()).await?;
     for event in &plan.events {
         actor.publish(event).await;
     }
@@ -118,7 +119,7 @@ impl Actor<'_> {
     }
 
     fn writes<K: Watchable>(&self) -> Writes<K> {
-        Writes::new(self.uses.client.clone(), &self.namespace)
+        Writes::new(self.uses.writer, &self.namespace)
     }
 
     /// Carries one action out. What others do is only handed on: to the slots, the workers of S3, EvalAI and the table.
@@ -127,7 +128,9 @@ impl Actor<'_> {
         match action {
             // It went before the status.
             Action::AddFinalizer => {}
-            Action::ReleaseFinalizer => self.set_finalizer(false).await?,
+            Action::ReleaseFinalizer => {
+                self.set_finalizer(false).await?;
+            }
             Action::CreateJob(number) => self.create_job(status, number).await?,
             Action::DeleteJob {
                 name,
@@ -166,13 +169,18 @@ impl Actor<'_> {
         Ok(())
     }
 
-    async fn set_finalizer(&self, wanted: bool) -> Result<(), ActError> {
-        let set = set_finalizer(self.uses.client, self.submission(), names::FINALIZER_SUBMISSION, wanted);
+    async fn set_finalizer(&self, wanted: bool) -> Result<Option<String>, ActError> {
+        let set = set_finalizer(self.uses.writer, self.submission(), names::FINALIZER_SUBMISSION, wanted);
         Ok(set.await?)
     }
 
-    /// Returns how long it waits for its turn.
-    async fn write_status(&self, status: &SubmissionStatus, write: StatusWrite) -> Result<Option<Duration>, ActError> {
+    /// Writes the status, if the object still has this version. Returns how long it waits for its turn.
+    async fn write_status(
+        &self,
+        status: &SubmissionStatus,
+        write: StatusWrite,
+        version: Option<&str>,
+    ) -> Result<Option<Duration>, ActError> {
         let waits = match write {
             StatusWrite::NotNow => return Ok(None),
             StatusWrite::InTurn => self.uses.memory.place_waits(self.submission(), Instant::now()),
@@ -183,7 +191,7 @@ impl Actor<'_> {
         }
         let nothing = SubmissionStatus::default();
         let old = self.submission().status.as_ref().unwrap_or(&nothing);
-        let version = apply_status(self.uses.client, self.submission(), status).await?;
+        let version = apply_status(self.uses.writer, self.submission(), version, status).await?;
         let shown = self
             .uses
             .stores

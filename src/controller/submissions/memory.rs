@@ -48,17 +48,16 @@ struct Written {
 }
 
 impl Memory {
-    /// The object with the status that we wrote last, where the cache does not have it yet.
+    /// The object with the status that we wrote last, and the version that has it, where the cache does not have it yet.
     pub fn with_own_status(&self, submission: Arc<Submission>) -> Arc<Submission> {
         self.is_shown(&submission);
         let entries = lock(&self.entries);
-        let written = entries
-            .get(uid(submission.as_ref()))
-            .and_then(|e| e.written.as_ref()?.status.as_deref());
-        match written {
-            Some(status) => {
+        let written = entries.get(uid(submission.as_ref())).and_then(|e| e.written.as_ref());
+        match written.and_then(|written| written.status.as_deref().zip(Some(written.version))) {
+            Some((status, version)) => {
                 let mut newer = submission.as_ref().clone();
                 newer.status = Some(status.clone());
+                newer.metadata.resource_version = Some(version.to_string());
                 Arc::new(newer)
             }
             None => submission,
@@ -268,12 +267,17 @@ mod tests {
         memory.wrote(&old, &new, "12", Some(&old));
         let reason = |shown: &Submission| {
             let shown = memory.with_own_status(Arc::new(shown.clone()));
-            shown.status.as_ref().unwrap().reason.clone().unwrap()
+            let version = objects::version(shown.as_ref());
+            (shown.status.as_ref().unwrap().reason.clone().unwrap(), version)
         };
-        assert_eq!(reason(&old), "new");
+        assert_eq!(
+            reason(&old),
+            ("new".into(), 12),
+            "what follows is applied to that version"
+        );
         memory.is_shown(&object("11", "between"));
-        assert_eq!(reason(&old), "new");
-        assert_eq!(reason(&object("13", "newer")), "newer");
+        assert_eq!(reason(&old), ("new".into(), 12));
+        assert_eq!(reason(&object("13", "newer")), ("newer".into(), 13));
     }
 
     #[test]

@@ -31,8 +31,8 @@ use crate::controller::submissions::memory::Memory;
 use crate::controller::submissions::observe::causes::Causes;
 use crate::controller::submissions::observe::workers::Workers;
 use crate::controller::submissions::team_use::Teams;
-use crate::kubernetes::Namespaces;
 use crate::kubernetes::objects::{Job, Owner, Pod};
+use crate::kubernetes::{Namespaces, Writer};
 use crate::kubernetes::{Store, Synced};
 use crate::observability::shutdown::Stop;
 use crate::observability::tasks::Tasks;
@@ -114,6 +114,7 @@ pub async fn surroundings(cluster: Cluster, endpoint: &str) -> Surroundings {
     }
     let (looks, wanted) = mpsc::unbounded_channel();
     let context = Context {
+        writer: Writer::new(client.clone(), || true),
         settings: settings(),
         stores: stores(cluster),
         memory: Memory::default(),

@@ -116,7 +116,7 @@ async fn a_write_is_answered_with_metadata_alone() {
     };
     let deleted = Answer::Json(200, json!({"kind": "Status", "metadata": {}, "status": "Success"}));
     let (client, mut sent) = answered(vec![partial(), partial(), partial(), deleted, status(409, "Conflict")]);
-    let api = Writes::<Submission>::new(client, "ns");
+    let api = Writes::<Submission>::new(&Writer::new(client.clone(), || true), "ns");
     let patch = Patch::Merge(json!({}));
     let (post, params) = (PostParams::default(), PatchParams::default());
     for answer in [
@@ -129,6 +129,8 @@ async fn a_write_is_answered_with_metadata_alone() {
     assert!(api.delete("a", &DeleteParams::default()).await.is_ok());
     let refused = api.patch("a", &params, &patch).await;
     assert!(matches!(refused, Err(kube::Error::Api(status)) if status.code == 409));
+    let lost = Writes::<Submission>::new(&Writer::new(client, || false), "ns");
+    assert!(lost.patch("a", &params, &patch).await.is_err(), "nothing is sent");
     let all = "/apis/leaderboard.carla.org/v1alpha1/namespaces/ns/submissions";
     let (one, of_status) = (format!("{all}/a"), format!("{all}/a/status"));
     for expected in [
@@ -142,4 +144,5 @@ async fn a_write_is_answered_with_metadata_alone() {
         assert_eq!(request, expected);
         assert_eq!(accept, "application/json;as=PartialObjectMetadata;g=meta.k8s.io;v=v1");
     }
+    assert!(sent.try_recv().is_err());
 }

@@ -15,6 +15,8 @@ pub struct ObservedLease {
     pub record: Option<Record>,
     /// Highest term ever seen; outlives the deletion of the Lease.
     pub last_term: Option<i32>,
+    /// The last term that was handed over; outlives our own writes whose answer was lost.
+    pub released: Option<i32>,
     /// When the record was first seen as it is.
     pub changed_at: Duration,
 }
@@ -24,11 +26,17 @@ impl ObservedLease {
     pub fn note(&mut self, record: Option<Record>, now: Duration) {
         if let Some(record) = &record {
             self.last_term = self.last_term.max(Some(record.term));
+            self.released = self.released.max(record.is_free.then_some(record.term));
         }
         if self.record != record {
             self.record = record;
             self.changed_at = now;
         }
+    }
+
+    /// True if nothing that was sent to EvalAI before this term can still be under way.
+    pub fn is_quiet_before(&self, term: i32) -> bool {
+        term == FIRST_TERM || self.released == Some(term - 1)
     }
 
     fn next_term(&self) -> i32 {
@@ -110,7 +118,7 @@ fn stand(seen: &ObservedLease, me: &Identity, timing: &Timing, now: Duration) ->
         None if seen.last_term.is_none() => return acquire,
         None => timing.lease,
         Some(record) => match record.holder.as_deref() {
-            None if record.is_free() => return acquire,
+            None if record.is_free => return acquire,
             // Our own write, whose answer was lost.
             Some(holder) if holder == me.as_str() => return Decision::Acquire { term: record.term },
             Some(holder) if me.succeeds(holder) => return acquire,
@@ -148,8 +156,7 @@ mod tests {
             term,
             duration: secs(15),
             renewed: None,
-            drained: None,
-            released: None,
+            is_free: false,
         }
     }
 
@@ -157,6 +164,7 @@ mod tests {
         ObservedLease {
             record,
             last_term,
+            released: None,
             changed_at: secs(100),
         }
     }
@@ -167,32 +175,19 @@ mod tests {
         let before = Identity::of_pod("pod", "uid");
         let (acquire, wait) = (|term| Decision::Acquire { term }, Decision::Wait { until: secs(115) });
         let foreign = || Some(record(Some("other"), 3));
+        let free = |term| {
+            Some(Record {
+                is_free: true,
+                ..record(None, term)
+            })
+        };
         for (what, record, last_term, now, expected) in [
             ("no Lease was ever seen", None, None, 100, acquire(1)),
             ("a Lease has vanished", None, Some(3), 101, wait.clone()),
             ("a Lease has vanished long ago", None, Some(3), 115, acquire(4)),
-            ("a Lease made by hand", Some(record(None, 0)), Some(0), 100, acquire(1)),
-            (
-                "released",
-                Some(Record {
-                    released: Some(3),
-                    ..record(None, 3)
-                }),
-                Some(3),
-                100,
-                acquire(4),
-            ),
+            ("a Lease made by hand", free(0), Some(0), 100, acquire(1)),
+            ("released", free(3), Some(3), 100, acquire(4)),
             ("cleared by hand", Some(record(None, 3)), Some(3), 101, wait.clone()),
-            (
-                "cleared after an older release",
-                Some(Record {
-                    released: Some(2),
-                    ..record(None, 3)
-                }),
-                Some(3),
-                101,
-                wait.clone(),
-            ),
             ("held and fresh", foreign(), Some(3), 114, wait),
             ("held and expired", foreign(), Some(3), 115, acquire(4)),
             (
@@ -270,16 +265,32 @@ mod tests {
         assert_eq!((seen.changed_at, seen.last_term), (secs(12), Some(3)));
     }
 
+    #[test]
+    fn only_the_term_after_a_released_one_is_quiet_at_once() {
+        let mut seen = ObservedLease::default();
+        assert!(seen.is_quiet_before(1) && !seen.is_quiet_before(2));
+        let free = Record {
+            is_free: true,
+            ..record(None, 3)
+        };
+        seen.note(Some(free), secs(5));
+        assert!(seen.is_quiet_before(4));
+        // Our own write, or another one's.
+        seen.note(Some(record(Some("other"), 4)), secs(6));
+        assert!(seen.is_quiet_before(4) && !seen.is_quiet_before(5));
+        seen.note(Some(record(None, 4)), secs(7));
+        assert!(!seen.is_quiet_before(5), "a person has cleared it");
+    }
+
     fn any_record() -> impl Strategy<Value = Option<Record>> {
         let holder = prop_oneof![Just(None), Just(Some("other".to_owned())), Just(Some("me".to_owned()))];
-        let one = (holder, 0..5i32, 0..40u64, proptest::option::of(0..5i32));
-        proptest::option::of(one.prop_map(|(holder, term, duration, released)| Record {
+        let one = (holder, 0..5i32, 0..40u64, any::<bool>());
+        proptest::option::of(one.prop_map(|(holder, term, duration, was_released)| Record {
+            is_free: holder.is_none() && was_released,
             holder,
             term,
             duration: secs(duration),
             renewed: None,
-            drained: None,
-            released,
         }))
     }
 
@@ -300,7 +311,7 @@ mod tests {
             let now = secs(changed + later);
             let leading = renewed.map(|ago| Leading { term: 2, renewed_at: now.saturating_sub(secs(ago)) });
             let foreign = record.as_ref().filter(|r| r.holder.as_deref() == Some("other"));
-            let is_free = record.as_ref().is_none_or(Record::is_free);
+            let is_free = record.as_ref().is_none_or(|record| record.is_free);
             match decide(&seen, &me, leading.as_ref(), &TIMING, now) {
                 Decision::Acquire { term } => {
                     prop_assert!(leading.is_none());

@@ -29,7 +29,6 @@ const RELEASE_TRIES: u32 = 3;
 pub(super) struct Outlets {
     pub publish: watch::Sender<Leadership>,
     pub fence: Fence,
-    pub is_drained: watch::Receiver<bool>,
 }
 
 pub(super) struct Elector {
@@ -68,7 +67,7 @@ impl Elector {
     }
 
     /// Until the Lease is lost or handed over.
-    pub(super) async fn run(mut self, mut release: oneshot::Receiver<oneshot::Sender<Result<(), String>>>) {
+    pub(super) async fn run(mut self, mut release: oneshot::Receiver<()>) {
         loop {
             let pause = match self.round().await {
                 Next::After(pause) => pause,
@@ -77,7 +76,7 @@ impl Elector {
             tokio::select! {
                 () = sleep(pause) => {}
                 asked = &mut release => return match asked {
-                    Ok(answer) => self.hand_over(answer).await,
+                    Ok(()) => self.hand_over().await,
                     Err(_) => self.lose("the election was abandoned by its process"),
                 },
             }
@@ -174,25 +173,15 @@ impl Elector {
     fn lead(&mut self, term: i32, sent: Duration) {
         self.outlets.fence.renewed(sent);
         if self.leading.replace(Leading { term, renewed_at: sent }).is_none() {
-            let since = Instant::now();
-            let drained_before = self
-                .seen
-                .record
-                .as_ref()
-                .is_some_and(|record| record.is_drained_before(term));
-            let quiet = if drained_before {
+            let quiet = if self.seen.is_quiet_before(term) {
                 Duration::ZERO
             } else {
                 self.settings.timing.evalai_quiet
             };
-            self.outlets.fence.begin(term, since + quiet);
+            self.outlets.fence.begin(Instant::now() + quiet);
             self.metrics.set_leading(Some(term));
-            tracing::info!(term, drained_before, lease = self.settings.name, "leading");
-            self.outlets.publish.send_replace(Leadership::Leader {
-                term,
-                since,
-                drained_before,
-            });
+            tracing::info!(term, quiet = quiet.as_secs(), lease = self.settings.name, "leading");
+            self.outlets.publish.send_replace(Leadership::Leader { term });
         }
     }
 
@@ -231,34 +220,26 @@ impl Elector {
         jittered(self.settings.timing.retry, 0.1)
     }
 
-    async fn hand_over(&mut self, answer: oneshot::Sender<Result<(), String>>) {
-        let result = match self.leading {
-            Some(leading) => self.release(leading.term).await,
-            None => Ok(()),
-        };
-        self.outlets.fence.close();
+    async fn hand_over(&mut self) {
+        if let Some(leading) = self.leading {
+            self.release(leading.term).await;
+        }
         self.metrics.set_leading(None);
         self.outlets.publish.send_replace(Leadership::Standby);
-        // A caller that no longer waits has nothing to do with the answer.
-        let _ = answer.send(result);
     }
 
-    async fn release(&mut self, term: i32) -> Result<(), String> {
-        let is_drained = *self.outlets.is_drained.borrow();
-        let mut why = String::new();
+    async fn release(&mut self, term: i32) {
         for _ in 0..RELEASE_TRIES {
-            match self.try_release(term, is_drained).await {
-                Ok(()) => {
-                    tracing::info!(term, is_drained, lease = self.settings.name, "released the Lease");
-                    return Ok(());
+            match self.try_release(term).await {
+                Ok(()) => return tracing::info!(term, lease = self.settings.name, "released the Lease"),
+                Err(error) => {
+                    tracing::warn!("{error}; until a try succeeds, the next leader waits for the Lease to expire");
                 }
-                Err(error) => why = error.to_string(),
             }
         }
-        Err(why)
     }
 
-    async fn try_release(&mut self, term: i32, is_drained: bool) -> Result<(), CallError> {
+    async fn try_release(&mut self, term: i32) -> Result<(), CallError> {
         // The renewal deadline no longer bounds a call: the fence is closed.
         self.leading = None;
         self.look().await?;
@@ -271,9 +252,7 @@ impl Elector {
         let Some(lease) = self.lease.take().filter(|_| is_ours) else {
             return Ok(());
         };
-        self.send(&released(lease, term, is_drained, Timestamp::now()))
-            .await
-            .map(|_| ())
+        self.send(&released(lease, Timestamp::now())).await.map(|_| ())
     }
 }
 

@@ -1,4 +1,4 @@
-//! The fence: whether this process may write to EvalAI and DynamoDB at this very moment.
+//! The fence: whether this process may write to EvalAI, DynamoDB and Kubernetes at this very moment.
 //!
 //! Written by the election alone, asked by every such write. Cheap, without a lock or a call. Counts by the boot clock,
 //! which goes on while the process or the machine is paused: a leader that wakes up late finds its fence closed.
@@ -53,13 +53,8 @@ struct Inner {
     /// Nanoseconds of the clock at which the last successful renewal was sent.
     renewed: AtomicU64,
     is_closed: AtomicBool,
-    start: OnceLock<Start>,
-}
-
-#[derive(Debug)]
-struct Start {
-    term: i32,
-    evalai_not_before: Instant,
+    /// Set once this process leads.
+    evalai_not_before: OnceLock<Instant>,
 }
 
 impl Fence {
@@ -71,12 +66,12 @@ impl Fence {
             limit,
             renewed,
             is_closed: AtomicBool::new(false),
-            start: OnceLock::new(),
+            evalai_not_before: OnceLock::new(),
         }))
     }
 
     /// True while the last successful renewal was sent less than 10 s ago and the process is not handing over. To be
-    /// asked right before each write to EvalAI and DynamoDB.
+    /// asked right before each write to EvalAI, DynamoDB and Kubernetes.
     pub fn may_write(&self) -> bool {
         let renewed = self.0.renewed.load(Ordering::SeqCst);
         if renewed == NEVER || self.0.is_closed.load(Ordering::SeqCst) {
@@ -88,21 +83,13 @@ impl Fence {
     /// No write to EvalAI before this moment, since the leader before may have left some under way. None until this
     /// process leads.
     pub fn evalai_not_before(&self) -> Option<Instant> {
-        self.0.start.get().map(|start| start.evalai_not_before)
-    }
-
-    /// The term in which this process leads or led.
-    pub fn term(&self) -> Option<i32> {
-        self.0.start.get().map(|start| start.term)
+        self.0.evalai_not_before.get().copied()
     }
 
     /// This process leads from now on.
-    pub(super) fn begin(&self, term: i32, evalai_not_before: Instant) {
+    pub(super) fn begin(&self, evalai_not_before: Instant) {
         // A process leads once, so that a second start is none.
-        let _ = self.0.start.set(Start {
-            term,
-            evalai_not_before,
-        });
+        let _ = self.0.evalai_not_before.set(evalai_not_before);
     }
 
     /// A renewal that was sent at this time has succeeded.

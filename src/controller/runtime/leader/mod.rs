@@ -1,6 +1,6 @@
-//! Which replica leads: a Lease of our own, and the fence that every write outside the cluster asks.
+//! Which replica leads: a Lease of our own, and the fence that writes ask.
 //!
-//! `main` starts it once; every writer to EvalAI or DynamoDB asks `Fence::may_write` right before. `decide` is pure,
+//! `main` starts it once; every writer to EvalAI, DynamoDB or Kubernetes asks `Fence::may_write` right before. `decide` is pure,
 //! `record` translates between Leases and what `decide` reads, `elector` does the calls. Knows no Submission.
 //!
 //! What is promised: at any moment at most one process may write, also when processes are paused, answers are lost and
@@ -25,12 +25,6 @@ pub use fence::{Clock, Fence};
 pub use record::Identity;
 
 use crate::observability::Observability;
-
-/// Annotation on the Lease: the term whose leader has had an answer to all it sent to EvalAI.
-pub const ANNOTATION_DRAINED: &str = "leaderboard.carla.org/drained";
-
-/// Annotation on the Lease: the term whose leader has handed it over, and has closed its fence before.
-pub const ANNOTATION_RELEASED: &str = "leaderboard.carla.org/released";
 
 /// Times of the election.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
@@ -101,9 +95,6 @@ pub enum Leadership {
     Leader {
         /// Grows with every change of leaders.
         term: i32,
-        since: Instant,
-        /// Nothing sent to EvalAI by the leader before can still be worked on, or there was none.
-        drained_before: bool,
     },
     /// It led and does no more: stop starting work and exit with an error.
     Lost { why: String },
@@ -113,29 +104,18 @@ impl Leadership {
     /// The term, while it leads.
     pub fn term(&self) -> Option<i32> {
         match self {
-            Self::Leader { term, .. } => Some(*term),
+            Self::Leader { term } => Some(*term),
             Self::Standby | Self::Lost { .. } => None,
         }
     }
 }
 
-/// Why a Lease could not be handed over in order. Nobody has to do anything: it expires by itself.
-#[derive(Debug, thiserror::Error)]
-pub enum ReleaseError {
-    #[error("the Lease {name} could not be released: {why}; the next leader waits until it expires")]
-    NotReleased { name: String, why: String },
-    #[error("the task of the Lease {name} has ended before its time; the next leader waits until it expires")]
-    TaskEnded { name: String },
-}
-
 /// The part of an election that other parts hold.
 #[derive(Debug)]
 pub struct Leader {
-    name: String,
     leadership: watch::Receiver<Leadership>,
     fence: Fence,
-    drained: watch::Sender<bool>,
-    release: oneshot::Sender<oneshot::Sender<Result<(), String>>>,
+    release: oneshot::Sender<()>,
     task: JoinHandle<Option<()>>,
 }
 
@@ -155,23 +135,18 @@ pub fn lease_client(mut config: kube::Config) -> Result<kube::Client, kube::Erro
 /// Starts to stand for leader. `client` is one from `lease_client`.
 pub fn start(client: kube::Client, settings: Settings, telemetry: &Observability) -> Leader {
     let (publish, leadership) = watch::channel(Leadership::Standby);
-    let (drained, is_drained) = watch::channel(false);
     let (release, released) = oneshot::channel();
     let fence = Fence::new(settings.clock.clone(), settings.timing.renew_deadline);
-    let name = settings.name.clone();
     let outlets = elector::Outlets {
         publish,
         fence: fence.clone(),
-        is_drained,
     };
     let elector = elector::Elector::new(client, settings, outlets, telemetry);
     // Its orderly end means that the Lease is lost or released.
     let task = telemetry.tasks.may_end("lease", elector.run(released));
     Leader {
-        name,
         leadership,
         fence,
-        drained,
         release,
         task,
     }
@@ -188,31 +163,17 @@ impl Leader {
         self.fence.clone()
     }
 
-    /// Every request to EvalAI is answered and no other write is under way. Closes the fence for good, so that this
-    /// stays true, and lets the successor write at once.
-    pub fn drained(&self) {
+    /// Hands the Lease over: closes the fence and clears the holder, so that the successor writes at once. The last thing a stopping
+    /// process does, and only if EvalAI has answered all its writes; bounded by a few calls. A standby, or a process that has lost the
+    /// Lease, has nothing to release.
+    pub async fn release(self) {
         self.fence.close();
-        self.drained.send_replace(true);
-    }
-
-    /// Hands the Lease over: clears the holder, with the note of `drained` if that was called. The last thing a stopping
-    /// process does; bounded by a few calls. A standby, or a process that has lost the Lease, has nothing to release.
-    ///
-    /// # Errors
-    /// If the Lease could not be written. The successor then waits for its expiry.
-    pub async fn release(self) -> Result<(), ReleaseError> {
-        self.fence.close();
-        let (answer, answered) = oneshot::channel();
-        if self.release.send(answer).is_err() {
-            // The election ends by itself only when the Lease is lost.
-            return Ok(());
+        if self.fence.evalai_not_before().is_some_and(|at| Instant::now() < at) {
+            // The leader before may have left a write under way, for which the next one waits only if the Lease expires.
+            return;
         }
-        let name = self.name;
-        let result = answered
-            .await
-            .map_err(|_| ReleaseError::TaskEnded { name: name.clone() })?;
-        // The task has answered; what is left of it is its return.
+        // The election ends by itself only when the Lease is lost.
+        let _ = self.release.send(());
         let _ = self.task.await;
-        result.map_err(|why| ReleaseError::NotReleased { name, why })
     }
 }

@@ -8,7 +8,7 @@ use jiff::Timestamp;
 use k8s_openapi::api::coordination::v1::{Lease, LeaseSpec};
 use k8s_openapi::apimachinery::pkg::apis::meta::v1::{MicroTime, ObjectMeta};
 
-use super::{ANNOTATION_DRAINED, ANNOTATION_RELEASED, Settings};
+use super::Settings;
 use leaderboard_api::names::{LABEL_MANAGED_BY, OPERATOR};
 
 /// Term of the first leader there ever was.
@@ -64,23 +64,21 @@ pub struct Record {
     pub duration: Duration,
     /// The holder's own time: only compared with itself, to see that something has changed.
     pub renewed: Option<Timestamp>,
-    /// The last term that ended with all its requests to EvalAI answered.
-    pub drained: Option<i32>,
-    /// The last term that was handed over in order.
-    pub released: Option<i32>,
+    /// It was handed over, or nobody has ever held it: no process can think of itself as the holder. One that a person clears shows since
+    /// when its holder has held it.
+    pub is_free: bool,
 }
 
 impl Record {
     /// Reads a Lease. What is absent or senseless is as if nobody had held it.
     pub fn read(lease: &Lease) -> Self {
         let spec = lease.spec.clone().unwrap_or_default();
-        let annotations = lease.metadata.annotations.as_ref();
-        let number = |key: &str| annotations?.get(key)?.parse().ok();
         let holder = spec.holder_identity.filter(|holder| !holder.is_empty());
         let term = spec.lease_transitions.unwrap_or(0).max(0);
         Self {
             // A holder without a count was not ours, but it was one.
             term: if holder.is_some() { term.max(FIRST_TERM) } else { term },
+            is_free: holder.is_none() && spec.acquire_time.is_none(),
             holder,
             duration: Duration::from_secs(
                 spec.lease_duration_seconds
@@ -88,21 +86,7 @@ impl Record {
                     .unwrap_or(0),
             ),
             renewed: spec.renew_time.map(|time| time.0),
-            drained: number(ANNOTATION_DRAINED),
-            released: number(ANNOTATION_RELEASED),
         }
-    }
-
-    /// True if nobody can think of itself as the holder: never held, or handed over in order. A holder that a person has
-    /// cleared may not know it yet.
-    pub fn is_free(&self) -> bool {
-        self.holder.is_none() && (self.term == 0 || self.released == Some(self.term))
-    }
-
-    /// True if nothing that was sent to EvalAI before `term`, which is this record's own or its next, can still be under
-    /// way.
-    pub fn is_drained_before(&self, term: i32) -> bool {
-        term == FIRST_TERM || self.drained == Some(term - 1)
     }
 }
 
@@ -127,16 +111,11 @@ pub(super) fn held(read: Option<&Lease>, settings: &Settings, term: i32, now: Ti
     lease
 }
 
-/// The Lease that shows that nobody leads, and whether `term` has ended with all its requests to EvalAI answered.
-pub(super) fn released(mut lease: Lease, term: i32, is_drained: bool, now: Timestamp) -> Lease {
+/// The Lease that shows that nobody leads, and that the last leader has left nothing under way.
+pub(super) fn released(mut lease: Lease, now: Timestamp) -> Lease {
     let spec = lease.spec.get_or_insert_default();
-    spec.holder_identity = None;
+    (spec.holder_identity, spec.acquire_time) = (None, None);
     spec.renew_time = Some(MicroTime(now));
-    let annotations = lease.metadata.annotations.get_or_insert_default();
-    annotations.insert(ANNOTATION_RELEASED.to_owned(), term.to_string());
-    if is_drained {
-        annotations.insert(ANNOTATION_DRAINED.to_owned(), term.to_string());
-    }
     lease
 }
 
@@ -167,18 +146,16 @@ mod tests {
             term: 0,
             duration: Duration::ZERO,
             renewed: None,
-            drained: None,
-            released: None,
+            is_free: true,
         };
         for value in [
             json!({"metadata": {}}),
-            json!({"metadata": {"annotations": {ANNOTATION_DRAINED: "soon"}}, "spec": {"holderIdentity": "", "leaseTransitions": -4, "leaseDurationSeconds": -1}}),
+            json!({"metadata": {}, "spec": {"holderIdentity": "", "leaseTransitions": -4, "leaseDurationSeconds": -1}}),
         ] {
             assert_eq!(Record::read(&lease(value)), never);
         }
         let foreign = Record::read(&lease(json!({"metadata": {}, "spec": {"holderIdentity": "x"}})));
-        assert_eq!(foreign.term, FIRST_TERM);
-        assert!(!foreign.is_drained_before(foreign.term + 1));
+        assert_eq!((foreign.term, foreign.is_free), (FIRST_TERM, false));
     }
 
     #[test]
@@ -206,18 +183,15 @@ mod tests {
     }
 
     #[test]
-    fn a_released_lease_has_no_holder_and_names_the_drained_term_only_if_it_was() {
+    fn a_released_lease_is_free_and_one_that_a_person_clears_is_not() {
         let settings = Settings::new("ns", "operator", Identity::random("host"));
         let now = Timestamp::from_second(1_800_000_000).unwrap();
         let lease = held(None, &settings, 4, now);
-        let record = Record::read(&released(lease.clone(), 4, true, now));
-        assert_eq!((record.holder.clone(), record.term, record.drained), (None, 4, Some(4)));
-        assert!(record.is_drained_before(5) && !record.is_drained_before(6) && record.is_free());
-        let record = Record::read(&released(lease.clone(), 4, false, now));
-        assert!(record.drained.is_none() && record.is_free());
+        let record = Record::read(&released(lease.clone(), now));
+        assert_eq!((record.holder, record.term, record.is_free), (None, 4, true));
         let mut cleared = lease;
         cleared.spec.as_mut().unwrap().holder_identity = None;
-        assert!(!Record::read(&cleared).is_free(), "a person's edit is no handing over");
+        assert!(!Record::read(&cleared).is_free, "a person's edit is no handing over");
     }
 
     #[test]

@@ -145,12 +145,21 @@ impl State {
         }
     }
 
-    /// Puts a Lease there, as another process would.
-    pub fn put(&mut self, holder: Option<&str>, term: i32, annotations: &Value) {
-        let spec = json!({"holderIdentity": holder, "leaseTransitions": term, "leaseDurationSeconds": 15,
+    /// Puts a Lease there, as another process would. Without a holder a person has cleared it.
+    pub fn put(&mut self, holder: Option<&str>, term: i32) {
+        self.put_since(holder, term, &json!("2026-01-01T00:00:00.000000Z"));
+    }
+
+    /// Puts a Lease there that was handed over.
+    pub fn put_free(&mut self, term: i32) {
+        self.put_since(None, term, &Value::Null);
+    }
+
+    fn put_since(&mut self, holder: Option<&str>, term: i32, acquired: &Value) {
+        let spec = json!({"holderIdentity": holder, "leaseTransitions": term, "leaseDurationSeconds": 15, "acquireTime": acquired,
             "renewTime": format!("2026-01-01T00:00:{:02}.000000Z", self.version % 60)});
         self.store(json!({"apiVersion": "coordination.k8s.io/v1", "kind": "Lease",
-            "metadata": {"name": "operator", "namespace": "ns", "annotations": annotations}, "spec": spec}));
+            "metadata": {"name": "operator", "namespace": "ns"}, "spec": spec}));
     }
 
     /// A field of the Lease's spec.

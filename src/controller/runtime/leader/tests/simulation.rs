@@ -147,8 +147,7 @@ impl World {
             term,
             duration: self.timing.lease,
             renewed: jiff::Timestamp::from_second(self.renewals).ok(),
-            drained: None,
-            released: None,
+            is_free: false,
         };
         candidate.writes.push(Write {
             version,
