@@ -47,7 +47,6 @@ struct World {
 fn timing() -> Timing {
     Timing {
         hold: Duration::from_millis(1500),
-        accept: Duration::from_millis(50),
         lost: Duration::ZERO,
         missing: Duration::from_millis(100),
         ..Timing::default()

@@ -31,7 +31,7 @@ async fn evalai_and_its_users_do_what_they_may() {
         let evalai = Evalai::start_wide(scene, 3).await;
         let _operator = (controller(scene), bridge(scene));
         let cases = vec![
-            cancelled_after_a_list(scene, &evalai, FIRST_PHASE).boxed_local(),
+            cancelled_after_a_read(scene, &evalai, FIRST_PHASE).boxed_local(),
             deleted_by_the_participant(scene, &evalai, FIRST_PHASE + 1).boxed_local(),
             images_that_are_none(scene, &evalai, FIRST_PHASE + 2).boxed_local(),
         ];
@@ -52,9 +52,9 @@ pub async fn board(scene: &Scene, evalai: &Evalai, phase: u64, change: Value) {
     scene.evalai_leaderboard(&format!("lb-{phase}"), evalai, base).await;
 }
 
-/// Each cancel comes when a list has shown the submission as waiting and nothing of it was written yet.
-async fn cancelled_after_a_list(scene: &Scene, evalai: &Evalai, phase: u64) {
-    let mut case = Case::open("40 cancels between a list and the PATCH", "40 of 40 stay cancelled");
+/// Each cancel comes when a read has shown the submission as waiting and nothing of it was written yet.
+async fn cancelled_after_a_read(scene: &Scene, evalai: &Evalai, phase: u64) {
+    let mut case = Case::open("40 cancels between a read and the PATCH", "40 of 40 stay cancelled");
     board(scene, evalai, phase, json!({"paused": true})).await;
     scene.ready(&format!("lb-{phase}")).await;
     let cancels = (0..CANCELS).map(|_| cancelled_at_the_worst_moment(scene, evalai, phase));
@@ -67,13 +67,15 @@ async fn cancelled_after_a_list(scene: &Scene, evalai: &Evalai, phase: u64) {
 async fn cancelled_at_the_worst_moment(scene: &Scene, evalai: &Evalai, phase: u64) -> bool {
     let before = evalai.requests().last().map_or(0, |entry| entry.id);
     let pk = evalai.submit(&scene.lab.challenge("agent:standard"), phase).await;
-    let listed = evalai.handle.wait_until(|_, log| {
-        let mut lists = log.entries().filter(|entry| entry.id > before && entry.method == "GET");
-        lists.any(|entry| entry.path.contains("submission/?status=submitted") && entry.answered.is_some())
+    let row = format!("/submission/{pk}");
+    let read = evalai.handle.wait_until(|_, log| {
+        let mut reads = log.entries().filter(|entry| entry.id > before && entry.method == "GET");
+        reads.any(|entry| {
+            let shows_it = entry.path.ends_with(&row) || entry.path.contains("submission/?status=submitted");
+            shows_it && entry.answered.is_some()
+        })
     });
-    tokio::time::timeout(LIMIT, listed)
-        .await
-        .expect("no list of new submissions is asked for");
+    tokio::time::timeout(LIMIT, read).await.expect("its row is not read");
     let cancelled_at = evalai.handle.with_state(|state| {
         state.submissions.get_mut(&pk).unwrap().status = Status::Cancelled;
         Timestamp::now()

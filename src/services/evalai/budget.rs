@@ -40,7 +40,7 @@ impl Budget {
 
     /// Requests that may be made at once after a rest.
     pub fn burst(&self) -> u32 {
-        (self.limit / 6).max(2).min(self.limit)
+        (self.limit / 6).max(3).min(self.limit)
     }
 
     /// Requests of a minute that are kept for lists of cancelled submissions: after a burst nothing else is left for ten
@@ -61,15 +61,9 @@ impl Budget {
         self.credit = self.credit.min(self.interval() * self.burst());
     }
 
-    /// When `count` requests may be made, one after the other, if nothing else is. More than a burst counts as a burst.
-    pub fn ready_at(&self, now: Duration, count: u32) -> Duration {
-        self.ready_behind(now, count, 0, 0)
-    }
-
-    /// The same, if `keep` more of the minute's requests are left for what comes at any time, and after `ahead` others. Those are not cut to
-    /// a burst: what has to let more than that pass waits until there are fewer.
-    pub fn ready_behind(&self, now: Duration, count: u32, keep: u32, ahead: u32) -> Duration {
-        let count = count.clamp(1, self.burst()).saturating_add(ahead);
+    /// When `count` requests may be made, one after the other, if nothing else is, and `keep` more of the minute's are left. More than a burst
+    /// has to wait until there are fewer.
+    pub fn ready_at(&self, now: Duration, count: u32, keep: u32) -> Duration {
         let credit = self.credit_at(now);
         let earned = now + (self.interval().saturating_mul(count)).saturating_sub(credit);
         let recent = self.sent.iter().filter(|at| **at + WINDOW > now);
@@ -126,13 +120,13 @@ mod tests {
     fn it_starts_empty_and_earns_a_burst() {
         let start = seconds(100.0);
         let mut budget = Budget::new(54, start);
-        assert_eq!(budget.ready_at(start, 1), start + budget.interval());
+        assert_eq!(budget.ready_at(start, 1, 0), start + budget.interval());
         let later = start + seconds(60.0);
         for _ in 0..9 {
-            assert_eq!(budget.ready_at(later, 1), later);
+            assert_eq!(budget.ready_at(later, 1, 0), later);
             budget.take(later);
         }
-        assert_eq!(budget.ready_at(later, 1), later + budget.interval());
+        assert_eq!(budget.ready_at(later, 1, 0), later + budget.interval());
         assert_eq!((budget.used(later), budget.limit()), (9, 54));
         assert_eq!(budget.used(later + WINDOW), 0);
     }
@@ -142,19 +136,15 @@ mod tests {
         let mut budget = Budget::new(54, Duration::ZERO);
         budget.close_until(seconds(200.0));
         budget.close_until(seconds(150.0));
-        assert_eq!(budget.ready_at(seconds(100.0), 1), seconds(200.0));
-        assert_eq!(budget.ready_at(seconds(201.0), 1), seconds(201.0));
+        assert_eq!(budget.ready_at(seconds(100.0), 1, 0), seconds(200.0));
+        assert_eq!(budget.ready_at(seconds(201.0), 1, 0), seconds(201.0));
     }
 
     #[test]
     fn a_small_budget_still_has_room_for_a_read_and_a_write() {
         let budget = Budget::new(6, Duration::ZERO);
-        assert_eq!(budget.burst(), 2);
-        assert_eq!(
-            budget.ready_at(seconds(60.0), 9),
-            seconds(60.0),
-            "more than a burst counts as a burst"
-        );
+        assert_eq!(budget.burst(), 3);
+        assert_eq!(budget.ready_at(seconds(60.0), 3, 0), seconds(60.0));
     }
 
     #[test]
@@ -164,7 +154,7 @@ mod tests {
             budget.take(seconds(10.0));
         }
         budget.set_limit(12, seconds(10.0));
-        assert_eq!(budget.ready_at(seconds(11.0), 1), seconds(70.0));
+        assert_eq!(budget.ready_at(seconds(11.0), 1, 0), seconds(70.0));
     }
 
     proptest! {
@@ -176,7 +166,7 @@ mod tests {
             for wait in waits {
                 // Mostly greedy: a long pause now and then earns the burst.
                 now += if wait > 3_990 { seconds(90.0) } else if wait > 2_000 { Duration::from_millis(wait) } else { Duration::ZERO };
-                now = budget.ready_at(now, 1);
+                now = budget.ready_at(now, 1, 0);
                 budget.take(now);
                 sent.push(now);
             }
@@ -192,7 +182,7 @@ mod tests {
             let mut now = Duration::ZERO;
             let mut count = 0;
             while now < seconds(600.0) {
-                now = budget.ready_at(now, 1);
+                now = budget.ready_at(now, 1, 0);
                 budget.take(now);
                 count += 1;
             }

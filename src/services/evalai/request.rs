@@ -6,7 +6,7 @@ use jiff::Timestamp;
 
 use super::answer::Answer;
 use super::row::{DatasetSplit, Phase, Received, Row, Split};
-use super::status::{Outcome, Progress, Status};
+use super::status::{Outcome, Progress};
 use super::types::{ImageAnswer, Key, Payload};
 use crate::observability::about::LogSpan;
 use leaderboard_api::Attempt;
@@ -28,16 +28,10 @@ pub struct SubmissionRef {
 pub enum Purpose {
     /// `cancelled`: whose runs are to stop.
     Cancel,
-    /// `submitted`: many new submissions at once.
-    Accept,
-    /// `submitted`: whose message was lost.
+    /// `submitted`: whose message was lost, and which wait here to hear whether they may run.
     SweepSubmitted,
     /// `resuming`: whose message was lost.
     SweepResuming,
-    /// `queued`: many live submissions at once.
-    Queued,
-    /// `running`: many live submissions at once.
-    Running,
 }
 
 impl Purpose {
@@ -45,19 +39,8 @@ impl Purpose {
     pub fn status(self) -> &'static str {
         match self {
             Self::Cancel => "cancelled",
-            Self::Accept | Self::SweepSubmitted => "submitted",
+            Self::SweepSubmitted => "submitted",
             Self::SweepResuming => "resuming",
-            Self::Queued => "queued",
-            Self::Running => "running",
-        }
-    }
-
-    /// The list that holds live submissions of a status. There is none of those that are partially evaluated.
-    pub fn of_live(status: Status) -> Option<Self> {
-        match status {
-            Status::Queued => Some(Self::Queued),
-            Status::Running => Some(Self::Running),
-            _ => None,
         }
     }
 }
@@ -129,11 +112,8 @@ impl Request {
             Self::Final(_, Outcome::Cancelled, _) => "put_cancelled",
             Self::List { purpose, .. } => match purpose {
                 Purpose::Cancel => "list_cancelled",
-                Purpose::Accept => "list_submitted",
                 Purpose::SweepSubmitted => "sweep_submitted",
                 Purpose::SweepResuming => "sweep_resuming",
-                Purpose::Queued => "list_queued",
-                Purpose::Running => "list_running",
             },
             Self::Phases(_) => "get_phases",
             Self::Splits(_) => "get_splits",
@@ -155,11 +135,8 @@ impl Request {
             Self::Final(_, outcome, _) => outcome.as_str(),
             Self::List { purpose, .. } => match purpose {
                 Purpose::Cancel => "list of cancelled",
-                Purpose::Accept => "list of submitted",
                 Purpose::SweepSubmitted => "sweep of submitted",
                 Purpose::SweepResuming => "sweep of resuming",
-                Purpose::Queued => "list of queued",
-                Purpose::Running => "list of running",
             },
             Self::Phases(_) => "phases",
             Self::Splits(_) => "splits",

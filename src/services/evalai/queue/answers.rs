@@ -55,7 +55,7 @@ impl Queue {
             .submission()
             .and_then(|subject| self.lanes.get_mut(&subject.pk))
         {
-            (lane.busy, lane.reread) = (None, true);
+            lane.busy = None;
         }
     }
 

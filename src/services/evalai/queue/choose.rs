@@ -1,49 +1,71 @@
-//! Which request is next: what is due, what may be sent, what comes first.
+//! Which request is next: one order of all that is due.
 //!
 //! Owned by `queue`. Pure.
 
-use std::collections::BTreeMap;
 use std::time::Duration;
 
 use jiff::Timestamp;
 
 use super::poll::{Challenge, Poll};
-use super::purse::{Price, Rank};
 use super::sub::{Sub, Write};
 use super::{Busy, Lane, MAX_IN_FLIGHT, Next, Now, Queue, Ticket};
 use crate::services::evalai::request::{Purpose, Request, SubmissionRef};
-use crate::services::evalai::status::{Outcome, Progress, Status};
+use crate::services::evalai::status::{Progress, Status};
 use crate::services::evalai::types::Key;
 
-/// More submissions than these that wait for acceptance are asked for by one list.
-const ASKED_ONE_BY_ONE: usize = 5;
-/// More live submissions than these that one list holds are read again by that list.
-const READ_ONE_BY_ONE: usize = 5;
-/// After so long a question whether a submission may run comes before ends.
-const OVERDUE: Duration = Duration::from_mins(1);
+/// Age at which a question goes before ends.
+const LATE: Duration = Duration::from_mins(1);
+/// Reads of live submissions take one request in so many.
+const REFRESH_SHARE: u32 = 2;
 /// While writes are not allowed they are checked again so often: no event reports that they are.
 const RECHECK: Duration = Duration::from_secs(1);
 
-/// First comes first.
+/// The order of all requests. What is due and comes first is sent next; all that comes after it waits for the budget.
 #[derive(Clone, Copy, Debug, PartialEq, Eq, PartialOrd, Ord)]
-pub(super) enum Priority {
+enum Class {
     /// Not of the API.
     Free,
-    /// A write whose read has just been answered: it would be worth nothing a moment later.
+    /// A write whose read has just been answered: that read is worth nothing a moment later.
     Write,
-    /// A question that ends have kept waiting: nothing can start before its answer.
-    Overdue,
-    End,
-    CancelList,
-    Acceptance,
-    Sweep,
-    /// The next request about a challenge's queue.
-    Inbox,
-    Progress,
-    /// An end that EvalAI knows already, or refused several times.
+    /// The list of cancelled submissions. One request in each of its periods is its own.
     Cancelled,
-    /// What is left.
+    /// A question that ends have kept waiting: nothing can start before its answer.
+    LateQuestion,
+    /// The oldest end first.
+    End,
+    /// Which submissions ask to run, whether one may, and what a challenge's leaderboards and queue hold.
+    Question,
+    Progress,
+    /// Partial results, and reads of what runs.
     Rest,
+}
+
+impl Class {
+    /// Of the read that a write follows.
+    fn of(write: Write) -> Self {
+        match write {
+            Write::End => Self::End,
+            Write::Progress => Self::Progress,
+            Write::Partial => Self::Rest,
+        }
+    }
+}
+
+/// Less comes first: whether it has failed twice, its class, when its end came to be, and since when it is due.
+type Rank = (bool, Class, Option<Timestamp>, Duration);
+
+/// A failing list of cancelled submissions keeps its place: it waits by itself, and after an outage runs are to stop before ends are
+/// published.
+fn rank(class: Class, failures: u32, ended: Option<Timestamp>, since: Duration) -> Rank {
+    (failures > 1 && class > Class::Cancelled, class, ended, since)
+}
+
+fn question(since: Duration, now: &Now) -> Class {
+    if now.at.saturating_sub(since) < LATE {
+        Class::Question
+    } else {
+        Class::LateQuestion
+    }
 }
 
 #[derive(Clone, Copy, Debug)]
@@ -66,19 +88,9 @@ enum Step {
 /// A request that is due at `ready`.
 #[derive(Clone, Copy, Debug)]
 struct Offer<'a> {
-    priority: Priority,
-    /// Of an end: when it came to be.
-    ended: Option<Timestamp>,
-    since: Duration,
+    rank: Rank,
     ready: Duration,
     what: What<'a>,
-}
-
-impl Offer<'_> {
-    /// Less comes first.
-    fn rank(&self) -> Rank {
-        (self.priority, self.ended, self.since)
-    }
 }
 
 impl Queue {
@@ -89,310 +101,170 @@ impl Queue {
             .offers(&now, may_write)
             .into_iter()
             .partition(|offer| offer.ready <= now.at);
-        let best = due.iter().min_by_key(|offer| offer.rank());
-        // Writes wait until the budget has two requests left; the list of the runs that are to stop goes in between.
-        let list = due
-            .iter()
-            .filter(|offer| offer.priority == Priority::CancelList)
-            .min_by_key(|offer| offer.rank());
-        let chosen = [best, list].into_iter().flatten();
-        let (now_affordable, not_yet): (Vec<_>, Vec<_>) = chosen
-            .map(|offer| (self.affordable_at(&now, offer), offer))
-            .partition(|(at, _)| *at <= now.at);
-        self.claim(&now, not_yet.first().map(|(_, offer)| *offer));
-        let Some((_, best)) = now_affordable.first() else {
-            let waits = later
-                .iter()
-                .map(|offer| offer.ready)
-                .chain(not_yet.iter().map(|(at, _)| *at));
+        let best = due.into_iter().min_by_key(|offer| offer.rank);
+        let affordable = best.map(|best| self.affordable_at(&now, best.rank));
+        let Some(best) = best.filter(|_| affordable <= Some(now.at)) else {
             let opens = (!self.open).then_some(self.not_before);
-            return Next::Wait(waits.chain((!may_write).then(|| now.at + RECHECK)).chain(opens).min());
+            let again = (!may_write).then(|| now.at + RECHECK);
+            let waits = later.iter().map(|offer| offer.ready).chain(affordable);
+            return Next::Wait(waits.chain(again).chain(opens).min());
         };
-        let mut leave_by = None;
         let started = match best.what {
             What::Sub(key, step) => {
                 let key = key.clone();
-                leave_by = self.leave_by(&key, step);
                 self.start_sub(&key, step)
             }
-            What::List(id, purpose) => self.start_list(id, purpose, &now),
-            What::Check(id) => self.start_check(id),
+            What::List(id, purpose) => self.start_list(id, purpose).map(|list| (list, None)),
+            What::Check(id) => self.start_check(id).map(|check| (check, None)),
             What::Inbox(name) => {
                 let name = name.to_owned();
-                self.inboxes.start(&name, now.at)
+                self.inboxes.start(&name, now.at).map(|request| (request, None))
             }
         };
-        match started {
-            Some(request) => {
-                if request.counts() {
-                    self.share.take(now.at);
-                }
-                Next::Send(Ticket {
-                    request,
-                    requested: now.at,
-                    leave_by,
-                })
-            }
-            None => Next::Wait(Some(now.at + RECHECK)),
-        }
-    }
-
-    /// When the budget allows it, and the token is not refused.
-    fn affordable_at(&self, now: &Now, offer: &Offer<'_>) -> Duration {
-        if offer.priority == Priority::Free {
-            return now.at;
-        }
-        let token = self.token_refused.as_ref().map_or(now.at, |(_, until)| *until);
-        self.share.ready_at(self.price(offer), now.at).max(token)
-    }
-
-    /// What it takes: every read for a write keeps one request back for the write that follows it.
-    fn price(&self, offer: &Offer<'_>) -> Price {
-        let is_write = offer.priority == Priority::Write;
-        let count = match offer.what {
-            _ if is_write => 1,
-            What::Sub(_, Step::GetForWrite) => self.reserved().saturating_add(2),
-            _ => self.reserved().saturating_add(1),
+        let Some((request, leave_by)) = started else {
+            return Next::Wait(Some(now.at + RECHECK));
         };
-        // A list that is due, and a write whose read is made, may use what the others leave.
-        let is_urgent = is_write || offer.priority == Priority::CancelList;
-        Price {
-            rank: offer.rank(),
-            count,
-            keep: if is_urgent {
-                0
-            } else {
-                self.share.budget(|budget| budget.kept())
-            },
-            is_after_reserved: !is_write,
+        if request.counts() {
+            self.share.budget(|budget| budget.take(now.at));
         }
-    }
-
-    /// Writes that follow the reads on their way.
-    fn reserved(&self) -> u32 {
-        let reads = self.lanes.values().filter(|lane| lane.busy == Some(Busy::ReadForWrite));
-        u32::try_from(reads.count()).unwrap_or(u32::MAX)
-    }
-
-    /// Tells the other queues of the same user what waits for the budget here. A refused token needs nothing of it.
-    fn claim(&self, now: &Now, waits: Option<&Offer<'_>>) {
-        let is_refused = self.token_refused.as_ref().is_some_and(|(_, until)| *until > now.at);
-        let waits = waits.filter(|_| !is_refused).map(|offer| {
-            let price = self.price(offer);
-            (price.rank, price.count)
-        });
-        self.share.claim(self.reserved(), waits);
-    }
-
-    fn offers(&self, now: &Now, may_write: bool) -> Vec<Offer<'_>> {
-        let (asked, live) = (self.asked_by_list(), self.live_by_list());
-        let in_flight = self.lanes.values().filter(|lane| lane.busy.is_some()).count();
-        let mut offers = Vec::new();
-        if in_flight < MAX_IN_FLIGHT {
-            let subs = self.subs.iter().filter_map(|(key, sub)| {
-                let is_listed = |list| live.contains_key(&(sub.challenge, list));
-                let terms = Terms {
-                    may_write,
-                    acceptance: match asked.contains_key(&sub.challenge) {
-                        true if self.fails_to_list(sub.challenge) => AskedBy::FailingList,
-                        true => AskedBy::List,
-                        false => AskedBy::Itself,
-                    },
-                    live_by_list: list_of_live(sub).is_some_and(is_listed) || self.is_swept(sub),
-                };
-                self.offer_of(key, sub, now, terms)
-            });
-            offers.extend(subs);
-        }
-        for (id, challenge) in &self.challenges {
-            offers.extend(self.offers_of(*id, challenge, asked.get(id).copied(), now));
-        }
-        let lists = live.keys().filter_map(|(id, purpose)| {
-            let challenge = self.challenges.get(id)?;
-            offer_of_list(Priority::Sweep, challenge, *id, *purpose)
-        });
-        offers.extend(lists);
-        // Only a leader makes objects of messages.
-        if may_write {
-            offers.extend(self.inboxes.offers(now.at).map(|(name, due)| Offer {
-                priority: Priority::Inbox,
-                ended: None,
-                since: due,
-                ready: due,
-                what: What::Inbox(name),
-            }));
-        }
-        offers
-    }
-
-    /// Whether the sweep's lists hold it, going by its last row.
-    fn is_swept(&self, sub: &Sub) -> bool {
-        let row = sub.view.row.as_ref();
-        row.is_some_and(|row| matches!(row.status, Status::Submitted | Status::Resuming))
-            && self.challenges.get(&sub.challenge).is_some_and(|c| c.sweep.is_some())
-    }
-
-    /// Challenges with so many waiting submissions that one list is asked for all, and since when the first of them waits.
-    fn asked_by_list(&self) -> BTreeMap<i64, Duration> {
-        let mut counts = BTreeMap::new();
-        for sub in self.subs.values() {
-            if let Some(asked) = sub.asked.as_ref().filter(|asked| !asked.listed) {
-                let (count, since) = counts.entry(sub.challenge).or_insert((0, asked.since));
-                (*count, *since) = (*count + 1, asked.since.min(*since));
-            }
-        }
-        counts.retain(|_, (count, _)| *count > ASKED_ONE_BY_ONE);
-        counts.into_iter().map(|(id, (_, since))| (id, since)).collect()
-    }
-
-    /// Whether the list of those that wait for acceptance has failed too often to wait for it.
-    fn fails_to_list(&self, challenge: i64) -> bool {
-        let known = self.challenges.get(&challenge);
-        known
-            .and_then(|known| known.lists.get(&Purpose::Accept))
-            .is_some_and(Poll::fails_for_long)
-    }
-
-    /// Lists of live submissions that hold so many that one request is made for all.
-    fn live_by_list(&self) -> BTreeMap<(i64, Purpose), usize> {
-        let mut counts = BTreeMap::new();
-        for sub in self.subs.values() {
-            if let Some(list) = list_of_live(sub) {
-                *counts.entry((sub.challenge, list)).or_insert(0) += 1;
-            }
-        }
-        counts.retain(|_, count| *count > READ_ONE_BY_ONE);
-        counts
-    }
-
-    fn offer_of<'a>(&self, key: &'a Key, sub: &Sub, now: &Now, terms: Terms) -> Option<Offer<'a>> {
-        let idle = Lane::default();
-        let lane = self.lanes.get(&sub.pk).unwrap_or(&idle);
-        if lane.busy.is_some() {
-            return None;
-        }
-        let (priority, since, write, step) = self.step_of(sub, lane, now, terms)?;
-        let again = if step == Step::Image {
-            sub.image_at
-        } else {
-            sub.retry_at
-        };
-        let pause = again.max(lane.hold_until);
-        let is_end = matches!(priority, Priority::End | Priority::Cancelled);
-        Some(Offer {
-            priority,
-            ended: sub.end_since().filter(|_| is_end),
-            since,
-            ready: if write { pause.max(self.not_before) } else { pause },
-            what: What::Sub(key, step),
+        Next::Send(Ticket {
+            request,
+            requested: now.at,
+            leave_by,
         })
     }
 
-    /// What a submission wants first: priority, since when, whether it leads to a write, and the request.
-    fn step_of(&self, sub: &Sub, lane: &Lane, now: &Now, terms: Terms) -> Option<(Priority, Duration, bool, Step)> {
-        let write = if terms.may_write {
-            self.step_to_write(sub, lane, now)
-        } else {
-            None
-        };
-        if write.is_some_and(|(priority, ..)| priority != Priority::Rest) {
-            return write;
-        }
-        if let Some(asked) = &sub.asked {
-            let priority = match terms.acceptance {
-                AskedBy::List if !asked.listed => None,
-                // One row that EvalAI breaks down over must not keep all others from being asked for. Ends go first: EvalAI may as
-                // well be away.
-                AskedBy::FailingList if !asked.listed => Some(Priority::Acceptance),
-                _ => Some(acceptance(asked.since, now)),
+    /// When the budget allows a request, and the token is not refused. Each class leaves requests for those before it, so that the order holds
+    /// between the queues of one user too: all but writes leave one for each write that follows a read on its way. Only writes and lists
+    /// of cancelled submissions use what is kept of each minute.
+    fn affordable_at(&self, now: &Now, (has_failed, class, ..): Rank) -> Duration {
+        let reads = self.lanes.values().filter(|lane| lane.busy == Some(Busy::ReadForWrite));
+        let reserved = u32::try_from(reads.count()).unwrap_or(u32::MAX);
+        let token = self.token_refused.as_ref().map_or(now.at, |(_, until)| *until);
+        self.share.budget(|budget| {
+            let (count, keep) = match class {
+                Class::Free => return now.at,
+                Class::Write => (1, 0),
+                Class::Cancelled => (reserved.saturating_add(1), 0),
+                Class::LateQuestion | Class::End | Class::Question if !has_failed => {
+                    (reserved.saturating_add(2), budget.kept())
+                }
+                _ => (reserved.saturating_add(3), budget.kept()),
             };
-            return priority.map(|priority| (priority, asked.since, false, Step::Get));
-        }
-        let refresh = self.refresh_of(sub, now, terms);
-        // A file that is not there must not keep its submission from being read.
-        if sub.wants_image() && (sub.image_at <= now.at || refresh.is_none()) {
-            return Some((Priority::Free, now.at, false, Step::Image));
-        }
-        write.or(refresh)
+            budget.ready_at(now.at, count, keep).max(token)
+        })
     }
 
-    /// A live submission is read again now and then.
-    fn refresh_of(&self, sub: &Sub, now: &Now, terms: Terms) -> Option<(Priority, Duration, bool, Step)> {
-        // One that its list has missed has another status by now.
-        let refresh = self.timing.refresh * if terms.live_by_list { 2 } else { 1 };
-        let due = sub.read.unwrap_or_default() + refresh;
-        let stale = sub.read.is_none() || sub.outdated || due <= now.at;
-        (sub.live.is_some() && stale).then_some((Priority::Rest, due, false, Step::Get))
-    }
-
-    /// What the next write needs: a read, then at once the write, if the read allows it.
-    fn step_to_write(&self, sub: &Sub, lane: &Lane, now: &Now) -> Option<(Priority, Duration, bool, Step)> {
-        let (write, since) = sub.next_write()?;
-        let is_checked = lane
-            .checked
-            .is_some_and(|at| now.at <= at + self.fresh(sub, lane, write));
-        if is_checked && sub.may_write(write) {
-            return Some((Priority::Write, since, true, Step::Write(write)));
-        }
-        let is_cancel = sub.end.as_ref().is_some_and(|end| end.what.0 == Outcome::Cancelled);
-        let priority = match write {
-            // Ends that EvalAI breaks down over must not keep it from being asked for cancellations.
-            Write::End if is_cancel || sub.write_failures > 1 => Priority::Cancelled,
-            Write::End => Priority::End,
-            Write::Progress => Priority::Progress,
-            Write::Partial => Priority::Rest,
-        };
-        Some((priority, since, true, Step::GetForWrite))
-    }
-
-    /// How old the read of a write may be. A run that just begins is cancelled more often than any other, and `running` is little to lose.
-    fn fresh(&self, sub: &Sub, lane: &Lane, write: Write) -> Duration {
-        let is_running = sub
-            .progress
-            .as_ref()
-            .is_some_and(|wanted| wanted.what == Progress::Running);
-        if write == Write::Progress && is_running && !lane.reread {
-            self.timing.fresh_running
-        } else {
-            self.timing.fresh
-        }
-    }
-
-    /// When the read of a write that is about to be sent gets too old.
-    fn leave_by(&self, key: &Key, step: Step) -> Option<Duration> {
-        let Step::Write(write) = step else { return None };
-        let sub = self.subs.get(key)?;
-        let lane = self.lanes.get(&sub.pk)?;
-        Some(lane.checked? + self.fresh(sub, lane, write))
-    }
-
-    fn offers_of(&self, id: i64, challenge: &Challenge, asked: Option<Duration>, now: &Now) -> Vec<Offer<'static>> {
-        let list = |priority, purpose| offer_of_list(priority, challenge, id, purpose);
+    fn offers(&self, now: &Now, may_write: bool) -> Vec<Offer<'_>> {
         let mut offers = Vec::new();
-        if self.subs.values().any(|sub| sub.challenge == id && sub.live.is_some()) {
-            offers.extend(list(Priority::CancelList, Purpose::Cancel));
-        }
-        if let Some(since) = asked {
-            offers.extend(list(acceptance(since, now), Purpose::Accept));
-        }
-        if challenge.sweep.is_some() {
-            offers.extend(list(Priority::Sweep, Purpose::SweepSubmitted));
-            offers.extend(list(Priority::Sweep, Purpose::SweepResuming));
-            if !challenge.check.poll.busy {
-                offers.push(Offer {
-                    priority: Priority::Sweep,
-                    ended: None,
-                    since: challenge.check.poll.due,
-                    ready: challenge.check.poll.due,
-                    what: What::Check(id),
-                });
+        let in_flight = self.lanes.values().filter(|lane| lane.busy.is_some()).count();
+        if in_flight < MAX_IN_FLIGHT {
+            let refresh = self.refresh();
+            for (key, sub) in &self.subs {
+                offers.extend(self.offers_of(key, sub, now, may_write, refresh));
             }
         }
+        for (id, challenge) in &self.challenges {
+            offers.extend(self.offers_of_challenge(*id, challenge, now));
+        }
+        // Only a leader makes objects of messages.
+        let inboxes = self.inboxes.offers(now.at).filter(|_| may_write);
+        offers.extend(inboxes.map(|(name, due)| Offer {
+            rank: rank(question(due, now), 0, None, due),
+            ready: due,
+            what: What::Inbox(name),
+        }));
         offers
     }
 
-    fn start_list(&mut self, challenge: i64, purpose: Purpose, now: &Now) -> Option<Request> {
-        let after = self.list_after(challenge, purpose, now.wall)?;
+    /// Time after which a live submission is read again.
+    fn refresh(&self) -> Duration {
+        let live = self.subs.values().filter(|sub| sub.live.is_some()).count();
+        let live = u32::try_from(live).unwrap_or(u32::MAX);
+        let interval = self.share.budget(|budget| budget.interval());
+        self.timing
+            .refresh
+            .max(interval.saturating_mul(live.saturating_mul(REFRESH_SHARE)))
+    }
+
+    /// What a submission waits for. One read serves all that wants one, at the first place of these.
+    fn offers_of<'a>(
+        &self,
+        key: &'a Key,
+        sub: &Sub,
+        now: &Now,
+        may_write: bool,
+        refresh: Duration,
+    ) -> impl Iterator<Item = Offer<'a>> + use<'a> {
+        let idle = Lane::default();
+        let lane = self.lanes.get(&sub.pk).unwrap_or(&idle);
+        let failures = sub.failures.max(sub.write_failures);
+        let offer = |class, since, ready: Duration, step| Offer {
+            rank: rank(class, failures, sub.end_since().filter(|_| class == Class::End), since),
+            ready: ready.max(lane.hold_until),
+            what: What::Sub(key, step),
+        };
+        let write = sub.next_write().filter(|_| may_write && now.at >= self.not_before);
+        // A list that is on its way may answer it.
+        let sweep = self
+            .challenges
+            .get(&sub.challenge)
+            .and_then(|c| c.lists.get(&Purpose::SweepSubmitted));
+        let asked = sub.asked.filter(|_| !sweep.is_some_and(|sweep| sweep.busy));
+        let is_checked = lane.checked.is_some_and(|at| now.at <= at + self.timing.fresh);
+        let next = match write {
+            Some((write, since)) if is_checked && sub.may_write(write) => {
+                Some(offer(Class::Write, since, sub.retry_at, Step::Write(write)))
+            }
+            _ => {
+                let read = sub
+                    .read
+                    .filter(|_| !sub.outdated)
+                    .map_or(Duration::ZERO, |read| read + refresh);
+                let step = write.map_or(Step::Get, |_| Step::GetForWrite);
+                let wants = [
+                    write.map(|(write, since)| (Class::of(write), since, now.at)),
+                    asked.map(|since| (question(since, now), since, now.at)),
+                    sub.live.map(|_| (Class::Rest, read, read)),
+                ];
+                let first = wants.into_iter().flatten().min();
+                first.map(|(class, since, due)| offer(class, since, due.max(sub.retry_at), step))
+            }
+        };
+        let image = sub.wants_image() && sub.asked.is_none();
+        let image = image.then(|| offer(Class::Free, now.at, sub.image_at, Step::Image));
+        let is_free = lane.busy.is_none();
+        let offers = [next, image].into_iter().flatten();
+        offers.filter(move |_| is_free)
+    }
+
+    fn offers_of_challenge(&self, id: i64, challenge: &Challenge, now: &Now) -> Vec<Offer<'static>> {
+        let offer = |poll: Poll, class, what| {
+            (!poll.busy).then_some(Offer {
+                rank: rank(class, poll.failures, None, poll.due),
+                ready: poll.due,
+                what,
+            })
+        };
+        let list = |purpose| challenge.lists.get(&purpose).copied().unwrap_or_default();
+        let is_live = self.subs.values().any(|sub| sub.challenge == id && sub.live.is_some());
+        let cancelled = is_live.then(|| {
+            let purpose = Purpose::Cancel;
+            offer(list(purpose), Class::Cancelled, What::List(id, purpose))
+        });
+        let sweeps = [Purpose::SweepSubmitted, Purpose::SweepResuming].map(|purpose| {
+            let poll = list(purpose);
+            offer(poll, question(poll.due, now), What::List(id, purpose))
+        });
+        let check = challenge.check.poll;
+        let check = offer(check, question(check.due, now), What::Check(id));
+        let served = sweeps.into_iter().chain([check]);
+        let served = served.filter(|_| challenge.sweep.is_some());
+        cancelled.into_iter().chain(served).flatten().collect()
+    }
+
+    fn start_list(&mut self, challenge: i64, purpose: Purpose) -> Option<Request> {
+        let after = self.list_after(challenge, purpose)?;
         self.challenges.get_mut(&challenge)?.poll(purpose).busy = true;
         Some(Request::List {
             challenge,
@@ -408,7 +280,8 @@ impl Queue {
         Some(request)
     }
 
-    fn start_sub(&mut self, key: &Key, step: Step) -> Option<Request> {
+    /// A request about a submission, and by when it has to leave.
+    fn start_sub(&mut self, key: &Key, step: Step) -> Option<(Request, Option<Duration>)> {
         let sub = self.subs.get_mut(key)?;
         let subject = SubmissionRef {
             key: key.clone(),
@@ -429,62 +302,14 @@ impl Queue {
             Step::Write(Write::End) => Request::Final(subject, sub.outcome()?, sub.end.as_ref()?.what.1.clone()),
         };
         let lane = self.lanes.entry(sub.pk).or_default();
-        let was_checked = lane.checked.take().is_some();
-        lane.reread = step == Step::GetForWrite && (was_checked || lane.reread);
+        let checked = lane.checked.take().filter(|_| request.is_write());
         lane.busy = Some(match step {
             Step::GetForWrite => Busy::ReadForWrite,
-            _ if request.is_write() => Busy::Write,
-            _ => Busy::Read,
+            Step::Write(_) => Busy::Write,
+            Step::Get | Step::Image => Busy::Read,
         });
-        Some(request)
+        Some((request, checked.map(|at| at + self.timing.fresh)))
     }
-}
-
-/// How EvalAI is asked whether a submission may run.
-#[derive(Clone, Copy)]
-enum AskedBy {
-    /// By a request of its own.
-    Itself,
-    /// With all others of its challenge.
-    List,
-    /// The same, but that list fails, and goes on failing.
-    FailingList,
-}
-
-/// What holds for the next request of a submission.
-#[derive(Clone, Copy)]
-struct Terms {
-    /// Writes are allowed.
-    may_write: bool,
-    acceptance: AskedBy,
-    /// A list is asked whether it was ended in a way that changes no status.
-    live_by_list: bool,
-}
-
-/// The priority of a question that waits since then.
-fn acceptance(since: Duration, now: &Now) -> Priority {
-    if now.at.saturating_sub(since) < OVERDUE {
-        Priority::Acceptance
-    } else {
-        Priority::Overdue
-    }
-}
-
-/// The list that holds a live submission, going by its last row.
-pub(super) fn list_of_live(sub: &Sub) -> Option<Purpose> {
-    let row = sub.view.row.as_ref().filter(|_| sub.live.is_some())?;
-    Purpose::of_live(row.status)
-}
-
-fn offer_of_list(priority: Priority, challenge: &Challenge, id: i64, purpose: Purpose) -> Option<Offer<'static>> {
-    let poll = challenge.lists.get(&purpose).copied().unwrap_or_default();
-    (!poll.busy).then_some(Offer {
-        priority,
-        ended: None,
-        since: poll.due,
-        ready: poll.due,
-        what: What::List(id, purpose),
-    })
 }
 
 impl Progress {

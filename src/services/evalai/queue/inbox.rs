@@ -158,7 +158,7 @@ impl Inboxes {
 
     /// Each queue with something to ask, and when that is due.
     pub(super) fn offers(&self, now: Duration) -> impl Iterator<Item = (&str, Duration)> {
-        let share = self.share.ready_at(now, 1);
+        let share = self.share.ready_at(now, 1, 0);
         self.by_name.iter().filter_map(move |(name, inbox)| {
             let due = match &inbox.hand {
                 Hand::Busy(_) => return None,

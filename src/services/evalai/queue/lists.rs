@@ -8,7 +8,6 @@ use std::time::Duration;
 
 use jiff::{SignedDuration, Timestamp};
 
-use super::choose::list_of_live;
 use super::sub::Sub;
 use super::{Now, Queue};
 use crate::services::evalai::answer::{About, Answer};
@@ -23,8 +22,6 @@ const SWEPT_FOR: Duration = Duration::from_mins(10);
 /// Before a failed check is retried.
 const RETRY_CHECK: Duration = Duration::from_mins(1);
 
-/// How far back a list of new submissions reaches: the queue's messages live four days.
-const ACCEPT_REACH: SignedDuration = SignedDuration::from_hours(5 * 24);
 /// How far before its Leaderboard a re-run or resumed submission may first have been submitted: it keeps that time.
 const SWEEP_REACH: SignedDuration = SignedDuration::from_hours(180 * 24);
 
@@ -75,7 +72,7 @@ impl Queue {
     }
 
     /// From when on a list reaches: never the whole table, which is costly for the server.
-    pub(super) fn list_after(&self, id: i64, purpose: Purpose, wall: Timestamp) -> Option<Timestamp> {
+    pub(super) fn list_after(&self, id: i64, purpose: Purpose) -> Option<Timestamp> {
         match purpose {
             Purpose::Cancel => {
                 let live = self
@@ -85,12 +82,6 @@ impl Queue {
                 let first = live.filter_map(Sub::submitted_at).min()?;
                 Some(back(first, SignedDuration::from_secs(1)))
             }
-            Purpose::Queued | Purpose::Running => {
-                let listed = |sub: &&Sub| sub.challenge == id && list_of_live(sub) == Some(purpose);
-                let first = self.subs.values().filter(listed).filter_map(Sub::submitted_at).min()?;
-                Some(back(first, SignedDuration::from_secs(1)))
-            }
-            Purpose::Accept => Some(back(wall, ACCEPT_REACH)),
             Purpose::SweepSubmitted | Purpose::SweepResuming => {
                 let (_, since) = self.challenges.get(&id)?.sweep?;
                 Some(back(since, SWEEP_REACH))
@@ -100,16 +91,14 @@ impl Queue {
 
     fn took_list(&mut self, list: (i64, Purpose), requested: Duration, answer: Answer<Vec<Row>>, now: &Now) {
         let (id, purpose) = list;
-        let (accept, refresh) = (self.timing.accept, self.timing.refresh);
         let Some(challenge) = self.challenges.get_mut(&id) else {
             return;
         };
         let every = match purpose {
             Purpose::Cancel => challenge.period,
-            Purpose::Accept => accept,
-            Purpose::SweepSubmitted | Purpose::SweepResuming => challenge.sweep.map_or(accept, |(every, _)| every),
-            // A deletion is to be observed within `refresh`, the time of the answer included.
-            Purpose::Queued | Purpose::Running => refresh * 3 / 4,
+            Purpose::SweepSubmitted | Purpose::SweepResuming => {
+                challenge.sweep.map_or(challenge.period, |(every, _)| every)
+            }
         };
         let rows = match answer {
             Answer::Done(rows) => rows,
@@ -119,13 +108,10 @@ impl Queue {
                 return;
             }
             other => {
-                let is_news = !challenge.poll(purpose).is_failing();
+                let is_news = challenge.poll(purpose).failures == 0;
                 challenge.poll(purpose).failed(now.at, every);
-                if let Answer::Refused(refusal) = other {
-                    if is_news && refusal.about == About::Challenge {
-                        challenge.check.hurry(now.at);
-                    }
-                    self.listed(id, purpose, now.at);
+                if is_news && matches!(other, Answer::Refused(refusal) if refusal.about == About::Challenge) {
+                    challenge.check.hurry(now.at);
                 }
                 return;
             }
@@ -140,7 +126,6 @@ impl Queue {
             }
             self.spread(&Arc::new(row), requested, now, |_| {});
         }
-        self.listed(id, purpose, requested);
     }
 
     /// Wakes the submissions that have their end and were cancelled since the last list. A re-run that is live lets the list reach back to its
@@ -171,21 +156,6 @@ impl Queue {
         let target = self.served.get(leaderboard)?;
         let (at, listed) = &self.challenges.get(&target.challenge)?.cancelled;
         listed.contains(&pk).then_some(*at)
-    }
-
-    /// A submission that still waits after a list of new ones is asked for alone.
-    fn listed(&mut self, id: i64, purpose: Purpose, requested: Duration) {
-        if purpose != Purpose::Accept {
-            return;
-        }
-        let asked = self
-            .subs
-            .values_mut()
-            .filter(|sub| sub.challenge == id)
-            .filter_map(|sub| sub.asked.as_mut());
-        for asked in asked.filter(|asked| asked.since <= requested) {
-            asked.listed = true;
-        }
     }
 
     /// A row that asks to be run, long enough ago for its message to be lost, and that no object here is for.

@@ -3,7 +3,7 @@
 //! `hub` puts updates in, `task` takes requests out ([`Queue::next`]) and brings their answers back ([`Queue::answered`]).
 //! What holds for every request:
 //!
-//! - the budget of the token's user, priorities by [`choose`], oldest first within one;
+//! - the budget of the token's user, and the one order of [`choose`];
 //! - one request in flight for a submission, whatever it is, and [`MAX_IN_FLIGHT`] in all;
 //! - after a write without an answer nothing for that submission until the server must have given up, then a read;
 //! - each write follows at once a read of its own, judged by [`super::guard`]: the server overwrites whatever it has stored in
@@ -13,7 +13,6 @@ mod answers;
 mod choose;
 mod inbox;
 mod lists;
-mod outlook;
 mod poll;
 mod purse;
 mod silence;
@@ -27,21 +26,24 @@ use std::collections::{BTreeMap, BTreeSet};
 use std::sync::Arc;
 use std::time::Duration;
 
-use jiff::Timestamp;
+use jiff::{SignedDuration, Timestamp};
 
 use self::inbox::Inboxes;
-use self::poll::Challenge;
+use self::poll::{Challenge, Poll};
 pub use self::purse::{Purse, Share};
 use self::silence::Silent;
-use self::sub::{Asked, Pending, Sub};
+use self::sub::{Pending, Sub};
+use super::budget::WINDOW;
 use super::labels::{Labels, compare};
 use super::payload::{check, digest, for_split};
-use super::request::Request;
+use super::request::{Purpose, Request};
 use super::status::{Outcome, Progress};
-use super::types::{Changed, DesiredUpdate, Ended, Key, Payload, Subject, SubmissionState, SweepRow, Target};
+use super::types::{Changed, DesiredUpdate, Ended, Key, Payload, Subject, SubmissionState, SweepRow, Target, Usage};
 
 /// Requests about submissions that may wait for an answer at once; lists come on top, one of a kind.
 const MAX_IN_FLIGHT: usize = 4;
+/// A read for each, and the write that follows it, and in between a list of cancelled submissions.
+const REQUESTS_OF_FOUR_ENDS: u32 = 9;
 /// Of so many requests one at most is a list of cancelled submissions, which may go before most others: a write takes two, and
 /// would never get them if a short period asked for each.
 const LIST_SHARE: u32 = 3;
@@ -62,21 +64,17 @@ pub struct Timing {
     pub hold: Duration,
     /// A write follows the answer to its read by no more; else it is read again.
     pub fresh: Duration,
-    /// Between two lists of new submissions.
-    pub accept: Duration,
     /// A message that has not come for so long is lost.
     pub lost: Duration,
     /// A live submission is read again, in case it was ended in a way that no list shows. Above all its participant
-    /// may have deleted it: that leaves its status as it is, so the list of cancelled ones never holds it; and no list has
-    /// those that are partially evaluated.
+    /// may have deleted it: that leaves its status as it is, so the list of cancelled ones never holds it. With many live submissions
+    /// the time is longer: their reads take half of the requests at most.
     pub refresh: Duration,
     /// Between two checks of a challenge's leaderboards.
     pub check: Duration,
     /// A submission that EvalAI does not have is asked for again after so long, before that counts: one answer may be of a server that is just
     /// being replaced, and would end a run.
     pub missing: Duration,
-    /// Like `fresh`, for `running` alone; the read is made again once only.
-    pub fresh_running: Duration,
 }
 
 impl Default for Timing {
@@ -84,13 +82,11 @@ impl Default for Timing {
         Self {
             hold: Duration::from_secs(75),
             fresh: Duration::from_secs(1),
-            accept: Duration::from_secs(5),
             lost: Duration::from_mins(2),
             // What is deleted is to be ended there within a minute, and its Pod takes some seconds to stop.
             refresh: Duration::from_secs(40),
             check: Duration::from_hours(1),
             missing: Duration::from_secs(30),
-            fresh_running: Duration::from_millis(100),
         }
     }
 }
@@ -123,8 +119,6 @@ struct Lane {
     unsure: bool,
     /// Answer of a read that was made for a write, until anything else is sent.
     checked: Option<Duration>,
-    /// A write was not sent soon enough after its read, and that is made once more.
-    reread: bool,
     /// EvalAI does not have the submission, as of this read, and had it before.
     missing_since: Option<Duration>,
 }
@@ -194,6 +188,9 @@ impl Queue {
         let ends = self.subs.values_mut().filter(|sub| sub.challenge == target.challenge);
         ends.for_each(|sub| sub.fit_end(target, &now));
         if let Some(challenge) = self.challenges.get_mut(&target.challenge) {
+            for purpose in [Purpose::SweepSubmitted, Purpose::SweepResuming] {
+                challenge.lists.entry(purpose).or_insert_with(|| Poll::due(now.at));
+            }
             challenge.check.poll.due = now.at;
             challenge.check.restart();
         }
@@ -241,10 +238,7 @@ impl Queue {
         sub.image |= image;
         if sub.view.answered < Some(subject.run.attempt) && sub.asked.is_none() {
             news = true;
-            sub.asked = Some(Asked {
-                since: now.at,
-                listed: false,
-            });
+            sub.asked = Some(now.at);
         }
         news
     }
@@ -359,6 +353,26 @@ impl Queue {
         self.subs.values().map(of).sum()
     }
 
+    /// Requests of the last minute, and the ends that wait for one.
+    pub fn usage(&self, now: Now) -> Usage {
+        let waiting = self.subs.values().filter(|sub| sub.has_end_to_publish()).count();
+        let (used, limit, begin) =
+            (self.share).budget(|budget| (budget.used(now.at), budget.limit(), budget.ready_at(now.at, 1, 0)));
+        let token = self.token_refused.as_ref().map_or(now.at, |(_, until)| *until);
+        let begin = begin.max(self.not_before).max(token).saturating_sub(now.at);
+        let requests = u32::try_from(waiting)
+            .unwrap_or(u32::MAX)
+            .saturating_mul(REQUESTS_OF_FOUR_ENDS)
+            / 4;
+        Usage {
+            used,
+            limit,
+            waiting,
+            last_expected: (waiting > 0)
+                .then(|| next_minute(now.wall, begin + WINDOW.saturating_mul(requests) / limit)),
+        }
+    }
+
     /// EvalAI's answer to the token, if it refused it.
     pub fn token_refused(&self) -> Option<&str> {
         self.token_refused.as_ref().map(|(why, _)| why.as_str())
@@ -426,6 +440,14 @@ impl Queue {
         }
         self.arrange_inboxes(&now);
     }
+}
+
+/// The moment is given to the minute: what shifts it by less is no news.
+fn next_minute(now: Timestamp, after: Duration) -> Timestamp {
+    let after = SignedDuration::try_from(after).unwrap_or(SignedDuration::MAX);
+    let at = now.checked_add(after).unwrap_or(Timestamp::MAX).as_second();
+    let next = at.saturating_add(60 - at.rem_euclid(60));
+    Timestamp::from_second(next).unwrap_or(Timestamp::MAX)
 }
 
 fn request_progress(sub: &mut Sub, wanted: Progress, now: Now) -> bool {

@@ -15,18 +15,21 @@ use crate::services::evalai::row::{Phase, Split};
 /// Waits after failures in a row. Without jitter: one task makes all requests of a token.
 const RETRY: Backoff = Backoff::new(Duration::from_secs(5), Duration::from_mins(1));
 
-/// Failures in a row after which nobody counts on a list any more.
-const FAILS_FOR_LONG: u32 = 3;
-
 /// A request that is repeated, one at a time.
 #[derive(Clone, Copy, Debug, Default)]
 pub(super) struct Poll {
     pub busy: bool,
     pub due: Duration,
-    failures: u32,
+    /// Failures in a row.
+    pub failures: u32,
 }
 
 impl Poll {
+    /// One that is due then.
+    pub fn due(due: Duration) -> Self {
+        Self { due, ..Self::default() }
+    }
+
     /// It succeeded: next time `every` after the request, however long its answer took. A server that needs the whole time
     /// for its answer is given a rest.
     pub fn done(&mut self, requested: Duration, now: Duration, every: Duration) {
@@ -35,16 +38,6 @@ impl Poll {
             due: (requested + every).max(now + every / 4),
             failures: 0,
         };
-    }
-
-    /// Whether it failed last.
-    pub fn is_failing(&self) -> bool {
-        self.failures > 0
-    }
-
-    /// Whether it has failed so often that what hangs on it is asked for in another way.
-    pub fn fails_for_long(&self) -> bool {
-        self.failures >= FAILS_FOR_LONG
     }
 
     /// It failed: again later, and later each time.

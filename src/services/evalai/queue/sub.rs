@@ -27,14 +27,6 @@ pub(super) struct Pending<T> {
     pub since: Duration,
 }
 
-/// A question whether an attempt may run.
-#[derive(Debug, Clone)]
-pub(super) struct Asked {
-    pub since: Duration,
-    /// A list was asked and did not hold it.
-    pub listed: bool,
-}
-
 /// What is written of a submission.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 pub(super) enum Write {
@@ -52,7 +44,8 @@ pub(super) struct Sub {
     pub run: Run,
     /// When it was submitted, while its run may be cancelled.
     pub live: Option<Timestamp>,
-    pub asked: Option<Asked>,
+    /// Since when it is asked whether this attempt may run.
+    pub asked: Option<Duration>,
     pub image: bool,
     pub progress: Option<Pending<Progress>>,
     pub partial: Option<Pending<Arc<Payload>>>,
@@ -275,7 +268,7 @@ impl Sub {
     }
 
     fn answer(&mut self, requested: Duration) {
-        if self.asked.as_ref().is_some_and(|asked| requested >= asked.since) {
+        if self.asked.is_some_and(|since| requested >= since) {
             self.asked = None;
             self.view.answered = Some(self.run.attempt);
         }

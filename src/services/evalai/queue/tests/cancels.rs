@@ -212,7 +212,7 @@ fn a_row_that_was_live_before_a_restart_is_ended_by_what_ends_it_then() {
     ] {
         let mut bench = Bench::new();
         bench.running(7);
-        bench.wait(1.0);
+        bench.wait(2.0);
         bench.ask(7, 2);
         bench.get(7, row(7, status));
         assert_eq!((bench.view(7).answered, bench.view(7).ended), (Some(Attempt(2)), ended));
@@ -385,7 +385,7 @@ fn a_read_that_is_not_followed_at_once_is_made_again() {
     // The lease is away for a moment.
     let now = bench.now();
     assert!(matches!(bench.queue.next(now, false), Next::Wait(_)));
-    bench.wait(1.1);
+    bench.wait(2.5);
     bench.get(7, row(7, Status::Running));
     bench.write("partial 7");
 }
@@ -477,24 +477,6 @@ fn a_cancel_is_not_written_over_what_had_finished_before_any_run_of_ours() {
 }
 
 #[test]
-fn running_follows_its_read_at_once_or_the_read_is_made_once_more() {
-    let mut bench = Bench::new();
-    bench.live(7, 1);
-    bench.list("list of cancelled", vec![]);
-    bench.update(7, 1, DesiredUpdate::Running);
-    bench.get(7, row(7, Status::Queued));
-    bench.wait(0.15);
-    bench.get(7, row(7, Status::Queued));
-    // A machine that is always so slow must not keep it from being written.
-    bench.wait(0.15);
-    bench.write("running 7");
-    bench.update(7, 1, DesiredUpdate::Partial(results(41.0)));
-    bench.get(7, row(7, Status::Running));
-    bench.wait(0.9);
-    bench.write("partial 7");
-}
-
-#[test]
 fn a_write_that_was_chosen_and_not_sent_in_time_is_read_for_again() {
     let mut bench = Bench::new();
     bench.live(7, 1);
@@ -503,7 +485,7 @@ fn a_write_that_was_chosen_and_not_sent_in_time_is_read_for_again() {
     bench.get(7, row(7, Status::Queued));
     let chosen = bench.expect("running 7");
     let left = chosen.leave_by.unwrap().checked_sub(chosen.requested).unwrap();
-    assert!(left <= Duration::from_millis(100), "{left:?}");
+    assert!(left <= Duration::from_secs(1), "{left:?}");
     bench.queue.not_sent(&chosen);
     bench.get(7, row(7, Status::Cancelled));
     bench.expect_nothing();

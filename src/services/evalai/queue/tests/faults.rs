@@ -447,23 +447,3 @@ fn a_user_who_is_no_host_is_refused_for_that_challenge_and_stops_no_other() {
     }
     assert_eq!(bench.queue.challenge_refused(&key(100)), None);
 }
-
-#[test]
-fn a_list_that_goes_on_failing_keeps_no_submission_from_being_asked_for() {
-    let mut bench = Bench::new();
-    for pk in 1..=8 {
-        bench.ask(pk, 1);
-    }
-    for wait in [5.0, 10.0, 0.0] {
-        let ticket = bench.expect("list of submitted");
-        bench.answer(&ticket, Reply::Rows(Answer::Broken("EvalAI has broken down".into())));
-        if wait > 0.0 {
-            bench.expect_nothing();
-        }
-        bench.wait(wait);
-    }
-    for pk in 1..=3 {
-        bench.get(pk, row(pk, Status::Submitted));
-        assert_eq!(bench.view(pk).answered, Some(Attempt(1)));
-    }
-}

@@ -278,6 +278,7 @@ fn a_later_attempt_makes_the_requests_of_the_earlier_one_void() {
     bench.expect_nothing();
     bench.answer(&put, Reply::Written(Answer::Done(())));
     assert_eq!((bench.view(7).attempt, bench.view(7).end), (Attempt(2), None));
+    bench.wait(2.5);
     bench.get(7, row(7, Status::Failed));
     assert_eq!((bench.view(7).answered, bench.view(7).ended), (Some(Attempt(2)), None));
 }
