@@ -2,8 +2,8 @@
 
 use serde_json::{Map, Value, json};
 
-use super::queue::Received;
 use super::route::DeadReason;
+use super::source::Received;
 
 /// Longest text of an attribute, in characters.
 const LONGEST: usize = 1024;
@@ -77,6 +77,7 @@ mod tests {
             first_seen_ms: 0,
             receives: 1,
             group: None,
+            hindrance: None,
         }
     }
 

@@ -1,12 +1,11 @@
 //! Reads one queue: receives, lets `route` and `ingest` decide, and carries out the outcome of each message.
 //!
-//! One task for each queue, started and stopped by the supervisor. Holds no policy.
+//! One task for each queue, whatever its `source`, started and stopped by `pollers`. Holds no policy.
 
 use std::collections::HashMap;
 use std::sync::Arc;
 use std::time::Duration;
 
-use aws_sdk_sqs::Client as Sqs;
 use futures::future::{join, join_all};
 use kube::runtime::events::{Event, EventType};
 use kube::{Api, Resource};
@@ -18,9 +17,9 @@ use super::ages::Ages;
 use super::ingest::{self, Incoming, IngestError, Outcome};
 use super::leaderboards::Leaderboards;
 use super::message;
-use super::queue::{QueueError, Reader, Received, batch_size};
+use super::pollers::Shared;
 use super::route::{self, DeadReason, Envelope, Later, MessageOutcome, Rules};
-use super::{PULSE_LIMIT, Shared};
+use super::source::{Received, Source, named};
 use crate::backoff::Backoff;
 use crate::kubernetes::call_within;
 use leaderboard_api::text::one_line;
@@ -32,22 +31,21 @@ const MESSAGE_LIMIT: Duration = Duration::from_secs(20);
 const EXTENSION: i32 = 30;
 /// The longest visibility that SQS allows, in seconds.
 const LONGEST_VISIBILITY: i32 = 43_200;
-/// How often the queue's attributes are read anew.
-const REOPEN: Duration = Duration::from_mins(10);
-/// A message that can be received again is, within so long: a receive looks into a part of the queue.
-const SEEN_AGAIN: Duration = Duration::from_mins(1);
+/// A message that can be received again is, within so long: a receive looks into a part of the queue, and those before it come first.
+const SEEN_AGAIN: Duration = Duration::from_mins(5);
+/// How soon the API server must answer about events and Leaderboards.
+const CALL_LIMIT: Duration = Duration::from_secs(5);
 /// Pauses after failures in a row.
 const RETRY: Backoff = Backoff::new(Duration::from_secs(1), Duration::from_mins(1));
 /// Time between two events with the same reason about one queue.
 const EVENT_PAUSE: Duration = Duration::from_mins(1);
 
 /// Reads one queue.
-pub struct Poller {
-    url: String,
-    sqs: Sqs,
+pub struct Poller<S> {
+    queue: String,
+    source: S,
     shared: Arc<Shared>,
     stop: watch::Receiver<bool>,
-    reader: Option<(Reader, Instant)>,
     /// Mean time that a message takes.
     each: Duration,
     ages: Ages,
@@ -63,15 +61,14 @@ struct Readers {
     fresh: OnceCell<Option<Leaderboards>>,
 }
 
-impl Poller {
-    /// A poller of the queue at `url` that runs until `stop` becomes true.
-    pub fn new(url: String, sqs: Sqs, shared: Arc<Shared>, stop: watch::Receiver<bool>) -> Self {
+impl<S: Source> Poller<S> {
+    /// A poller of a queue that runs until `stop` becomes true.
+    pub fn new(queue: String, source: S, shared: Arc<Shared>, stop: watch::Receiver<bool>) -> Self {
         Self {
-            url,
-            sqs,
+            queue,
+            source,
             shared,
             stop,
-            reader: None,
             each: Duration::from_millis(50),
             ages: Ages::default(),
             events: HashMap::new(),
@@ -81,7 +78,7 @@ impl Poller {
     /// Reads the queue until the stop, and finishes what is in hand.
     pub async fn run(mut self) {
         let mut failures: u32 = 0;
-        while !*self.stop.borrow() {
+        while !self.is_over() {
             let Err(problem) = self.round().await else {
                 failures = 0;
                 continue;
@@ -89,32 +86,27 @@ impl Poller {
             failures = failures.saturating_add(1);
             let pause = RETRY.after(failures);
             tracing::warn!(
-                queue = self.url,
+                queue = self.queue,
                 problem,
                 retry_seconds = pause.as_secs_f64(),
                 "the queue is not read"
             );
-            if !*self.stop.borrow() {
-                self.shared.problems.set(&self.url, Some(problem));
+            if !self.is_over() {
+                self.shared.problems.set(&self.queue, Some(problem));
             }
             let _ = tokio::time::timeout(pause, self.stop.wait_for(|stop| *stop)).await;
         }
-        self.shared.telemetry.metrics.set_oldest_message(&self.url, None);
+        self.shared.telemetry.metrics.set_oldest_message(&self.queue, None);
+    }
+
+    /// It was stopped, or what stops it is gone.
+    fn is_over(&self) -> bool {
+        *self.stop.borrow() || self.stop.has_changed().is_err()
     }
 
     /// Receives once and processes what came.
     async fn round(&mut self) -> Result<(), String> {
-        let pulse = self.shared.check_pulse().await;
-        pulse.map_err(|text| {
-            format!(
-                "queue {} is not read while the API server does not answer: {text}",
-                self.url
-            )
-        })?;
-        let received = self.receive().await.map_err(|error| {
-            self.reader = None;
-            error.to_string()
-        })?;
+        let received = self.receive().await?;
         self.remember(&received);
         if !received.is_empty() {
             self.batch(received).await;
@@ -126,8 +118,7 @@ impl Poller {
     /// What was received is in hand; what was to come back by now, and did not, is gone.
     fn remember(&mut self, received: &[Received]) {
         let now = Instant::now();
-        let visibility = self.reader.as_ref().map(|(reader, _)| reader.visibility());
-        let until = now + visibility.unwrap_or_default() + SEEN_AGAIN;
+        let until = now + self.source.visibility() + SEEN_AGAIN;
         for message in received {
             self.ages.keep(&message.id, message.sent_ms, until);
         }
@@ -137,45 +128,38 @@ impl Poller {
 
     fn show_oldest(&self) {
         let oldest = self.ages.oldest_ms();
-        self.shared.telemetry.metrics.set_oldest_message(&self.url, oldest);
+        self.shared.telemetry.metrics.set_oldest_message(&self.queue, oldest);
     }
 
-    async fn receive(&mut self) -> Result<Vec<Received>, QueueError> {
-        if self.reader.as_ref().is_none_or(|(_, since)| since.elapsed() > REOPEN) {
-            let meter = self.shared.aws.meter().clone();
-            self.reader = Some((Reader::open(self.sqs.clone(), &self.url, meter).await?, Instant::now()));
-        }
-        let Some((reader, _)) = &self.reader else {
-            return Ok(Vec::new());
-        };
-        let most = batch_size(reader.visibility(), self.each);
+    async fn receive(&mut self) -> Result<Vec<Received>, String> {
         let mut stop = self.stop.clone();
         let received = tokio::select! {
             _ = stop.wait_for(|stop| *stop) => return Ok(Vec::new()),
-            received = reader.receive(most) => received?,
+            received = self.source.receive(self.each) => received?,
         };
-        if !*self.stop.borrow() {
-            self.shared.problems.set(&self.url, None);
+        if !self.is_over() {
+            self.shared.problems.set(&self.queue, None);
         }
         Ok(received)
     }
 
     async fn batch(&mut self, received: Vec<Received>) {
-        let Some((reader, since)) = self.reader.take() else {
-            return;
-        };
         let begun = Instant::now();
-        let readers = Readers::of(
-            &self.url,
-            &Leaderboards::cached(&self.shared.leaderboards, &self.shared.scope.allowed),
-        );
-        let outcomes = self.outcomes(&reader, &received, &readers).await;
+        let cached = Leaderboards::cached(&self.shared.leaderboards, &self.shared.scope.allowed);
+        let all = self.source.readers(&cached.all);
+        let readers = Readers {
+            rules: self.source.rules(&all),
+            all,
+            is_complete: cached.is_complete,
+            fresh: OnceCell::new(),
+        };
+        let outcomes = self.outcomes(&received, &readers).await;
         let count = u32::try_from(received.len()).unwrap_or(1);
         self.each = (self.each * 3 + begun.elapsed() / count) / 4;
         let (mut deletes, mut held_back) = (Vec::new(), 0_u32);
         for (message, mut outcome) in received.iter().zip(outcomes) {
             if let MessageOutcome::Dead(reason) = &outcome {
-                outcome = self.dead_letter(&reader, message, reason, &readers).await;
+                outcome = self.set_aside(message, reason, &readers).await;
             }
             self.shared
                 .telemetry
@@ -189,18 +173,17 @@ impl Poller {
                 MessageOutcome::Delete(_) | MessageOutcome::Dead(_) => deletes.push(message),
                 MessageOutcome::Later { seconds, why } => {
                     self.left(message, seconds, why);
-                    report(reader.hold(&[&message.receipt], seconds).await);
+                    report(self.source.hold(&[message], seconds).await);
                 }
                 MessageOutcome::Lapse | MessageOutcome::Ingest { .. } => {}
             }
         }
-        self.delete(&reader, &deletes).await;
+        self.delete(&deletes).await;
         if held_back > 0 {
             // The controller does not take what is in flight for another reader's then.
             let note = format!("{held_back} messages of the queue cannot be used yet and are received again later.");
             self.publish(&readers, reasons::MESSAGES_HELD_BACK, &note).await;
         }
-        self.reader = Some((reader, since));
     }
 
     /// A message stays in the queue and comes back after so many seconds. How long another reader takes is not ours to show.
@@ -215,9 +198,8 @@ impl Poller {
         }
     }
 
-    async fn delete(&mut self, reader: &Reader, messages: &[&Received]) {
-        let receipts: Vec<_> = messages.iter().map(|message| message.receipt.as_str()).collect();
-        let deleted = reader.delete(&receipts).await;
+    async fn delete(&mut self, messages: &[&Received]) {
+        let deleted = self.source.delete(messages).await;
         if deleted.is_ok() {
             for message in messages {
                 self.ages.forget(&message.id);
@@ -227,13 +209,14 @@ impl Poller {
     }
 
     /// Decides on all messages at once; extends their visibility if half of it is over before all are decided.
-    async fn outcomes(&self, reader: &Reader, received: &[Received], readers: &Readers) -> Vec<MessageOutcome> {
+    async fn outcomes(&self, received: &[Received], readers: &Readers) -> Vec<MessageOutcome> {
         let work = join_all(received.iter().map(|message| self.outcome(message, readers)));
-        let receipts: Vec<&str> = received.iter().map(|message| message.receipt.as_str()).collect();
-        let seconds = i32::try_from(reader.visibility().as_secs()).unwrap_or(i32::MAX);
+        let messages: Vec<&Received> = received.iter().collect();
+        let visibility = self.source.visibility();
+        let seconds = i32::try_from(visibility.as_secs()).unwrap_or(i32::MAX);
         let seconds = seconds.clamp(EXTENSION, LONGEST_VISIBILITY);
-        let extend = async { report(reader.hold(&receipts, seconds).await) };
-        extended(work, reader.visibility() / 2, extend).await
+        let extend = async { report(self.source.hold(&messages, seconds).await) };
+        extended(work, visibility / 2, extend).await
     }
 
     async fn outcome(&self, received: &Received, readers: &Readers) -> MessageOutcome {
@@ -241,11 +224,16 @@ impl Poller {
             content: message::parse(&received.body),
             sent_ms: received.sent_ms,
             receives: received.receives,
+            hindrance: received.hindrance.clone(),
         };
-        let outcome = match route::route(&envelope, &readers.all, now_ms(), readers.is_complete) {
+        let rules = &readers.rules;
+        let outcome = match route::route(rules, &envelope, &readers.all, now_ms(), readers.is_complete) {
             // The watch may be behind: nothing is given up by its cache alone.
             MessageOutcome::Dead(DeadReason::Unknown(_)) => match self.fresh(readers).await {
-                Some(fresh) => route::route(&envelope, &fresh.all, now_ms(), fresh.is_complete),
+                Some(fresh) => {
+                    let rules = self.source.rules(&fresh.all);
+                    route::route(&rules, &envelope, &fresh.all, now_ms(), fresh.is_complete)
+                }
                 None => MessageOutcome::Lapse,
             },
             outcome => outcome,
@@ -256,7 +244,7 @@ impl Poller {
                 let span = ingest::span(&namespace, &leaderboard, incoming.submission);
                 let ingested = self.ingest(&namespace, &leaderboard, &incoming).instrument(span).await;
                 ingested.map_or(MessageOutcome::Lapse, |ingested| {
-                    route::settle(&envelope, &ingested, &readers.rules, now_ms())
+                    route::settle(&envelope, &ingested, rules, now_ms())
                 })
             }
             (_, outcome) => outcome,
@@ -306,46 +294,24 @@ impl Poller {
         Some(outcome)
     }
 
-    /// Moves a message to the dead-letter queue, or lets it come back later if that can't be done.
-    async fn dead_letter(
-        &mut self,
-        reader: &Reader,
-        message: &Received,
-        reason: &DeadReason,
-        readers: &Readers,
-    ) -> MessageOutcome {
-        let what = format!("message {} ({}): {}", message.id, reason.as_str(), reason.detail());
-        let problem = match &readers.rules.dead_letter {
-            None => "no Leaderboard of this queue has queue.deadLetterURL".to_owned(),
-            Some(url) => match reader.send_dead(url, message, reason).await {
-                Ok(()) => {
-                    tracing::warn!(
-                        queue = self.url,
-                        message = message.id,
-                        reason = reason.as_str(),
-                        "{what}"
-                    );
-                    self.publish(
-                        readers,
-                        reasons::DEAD_LETTER,
-                        &format!("Moved to the dead-letter queue: {what}"),
-                    )
-                    .await;
-                    return MessageOutcome::Dead(reason.clone());
-                }
-                Err(error) => error.to_string(),
-            },
+    /// Keeps a message that cannot be used where people find it, or lets it come back later if that can't be done.
+    async fn set_aside(&mut self, message: &Received, reason: &DeadReason, readers: &Readers) -> MessageOutcome {
+        let aside = self.source.set_aside(message, reason, &readers.rules).await;
+        let (event, note) = match &aside {
+            Ok(aside) => (aside.reason, aside.note.clone()),
+            Err(problem) => {
+                let what = named(message, reason);
+                let note = format!("A message can't be used and stays in the queue: {what}. {problem}");
+                (reasons::QUEUE_BLOCKED, note)
+            }
         };
-        tracing::warn!(
-            queue = self.url,
-            message = message.id,
-            reason = reason.as_str(),
-            problem,
-            "{what}"
-        );
-        let note = format!("A message can't be used and stays in the queue: {what}. {problem}");
-        self.publish(readers, reasons::QUEUE_BLOCKED, &note).await;
-        route::blocked(message.receives)
+        let (queue, reason_name) = (&self.queue, reason.as_str());
+        tracing::warn!(queue, message = message.id, reason = reason_name, "{note}");
+        self.publish(readers, event, &note).await;
+        match aside {
+            Ok(_) => MessageOutcome::Dead(reason.clone()),
+            Err(_) => route::blocked(message.receives),
+        }
     }
 
     /// An event on the oldest Leaderboard of the queue.
@@ -365,7 +331,7 @@ impl Poller {
         let reference = leaderboard.object_ref(&());
         let published = self.shared.recorder.publish(&event, &reference);
         let name = reference.name.as_deref().unwrap_or_default();
-        if let Err(error) = call_within(PULSE_LIMIT, "an event", name, published).await {
+        if let Err(error) = call_within(CALL_LIMIT, "an event", name, published).await {
             tracing::warn!(reason, "{error}");
         }
     }
@@ -374,27 +340,15 @@ impl Poller {
     async fn fresh<'a>(&self, readers: &'a Readers) -> Option<&'a Leaderboards> {
         let ask = || async {
             let read = Leaderboards::read(&self.shared.client, &self.shared.scope);
-            let read = call_within(PULSE_LIMIT, "the Leaderboards", &self.url, read)
+            let read = call_within(CALL_LIMIT, "the Leaderboards", &self.queue, read)
                 .await
                 .ok()?;
             Some(Leaderboards {
-                all: route::readers(&self.url, &read.all),
+                all: self.source.readers(&read.all),
                 ..read
             })
         };
         readers.fresh.get_or_init(ask).await.as_ref()
-    }
-}
-
-impl Readers {
-    fn of(url: &str, leaderboards: &Leaderboards) -> Self {
-        let all = route::readers(url, &leaderboards.all);
-        Self {
-            rules: route::rules(&all),
-            all,
-            is_complete: leaderboards.is_complete,
-            fresh: OnceCell::new(),
-        }
     }
 }
 
@@ -413,9 +367,9 @@ fn now_ms() -> i64 {
     jiff::Timestamp::now().as_millisecond()
 }
 
-fn report(done: Result<(), QueueError>) {
+fn report(done: Result<(), String>) {
     if let Err(error) = done {
-        tracing::warn!(%error, "messages could not be held any longer and will come back early");
+        tracing::warn!(error, "messages could not be held any longer and will come back early");
     }
 }
 

@@ -1,16 +1,22 @@
 //! The pollers, one for each queue that a Leaderboard names: started, stopped, and what keeps them from reading.
 
-use std::collections::{BTreeMap, BTreeSet};
+use std::collections::BTreeMap;
 use std::sync::{Arc, Mutex};
 use std::time::Duration;
 
+use futures::{FutureExt, StreamExt};
+use kube::Client;
+use kube::runtime::events::Recorder;
 use tokio::sync::watch;
 use tokio::task::JoinHandle;
 
-use super::Shared;
+use super::Scope;
+use super::leaderboards::Leaderboards;
 use super::poller::Poller;
-use super::route;
+use super::source::Source;
+use crate::kubernetes::Watch;
 use crate::lock::lock;
+use crate::observability::Observability;
 use crate::observability::readiness::Readiness;
 use leaderboard_api::Leaderboard;
 
@@ -19,97 +25,92 @@ const DRAIN: Duration = Duration::from_secs(20);
 /// Name of the readiness check.
 const CHECK: &str = "queues";
 
-/// How to reach a queue.
-#[derive(Clone, Debug, PartialEq, Eq)]
-pub(super) struct Connection {
-    region: Option<String>,
-    endpoint: Option<String>,
+/// What all pollers share.
+pub struct Shared {
+    pub client: Client,
+    pub scope: Scope,
+    pub leaderboards: Watch<Leaderboard>,
+    pub recorder: Recorder,
+    pub telemetry: Observability,
+    pub problems: Problems,
 }
 
-/// The queues that Leaderboards name, each reached by the connection of the oldest of them.
-pub(super) fn desired(leaderboards: &[Arc<Leaderboard>]) -> BTreeMap<String, Connection> {
-    let urls: BTreeSet<&String> = leaderboards
-        .iter()
-        .filter_map(|lb| route::queue_of(lb))
-        .map(|queue| &queue.url)
-        .collect();
-    let mut desired = BTreeMap::new();
-    for url in urls {
-        let readers = route::readers(url, leaderboards);
-        if let Some(queue) = readers.first().and_then(|lb| route::queue_of(lb)) {
-            let (region, endpoint) = (queue.region.clone(), queue.endpoint.clone());
-            desired.insert(url.clone(), Connection { region, endpoint });
+/// Reads the queues that Leaderboards name until the stop; then finishes what is in hand. `desired` has the queues, each with the way to it,
+/// and `open` makes a source of one.
+pub async fn follow<W: Clone + PartialEq, S: Source>(
+    shared: Arc<Shared>,
+    desired: impl Fn(&[Arc<Leaderboard>]) -> BTreeMap<String, W>,
+    open: impl Fn(&str, &W) -> S,
+) {
+    let stop = shared.telemetry.stop.clone();
+    let mut events = shared.leaderboards.subscribe();
+    let mut pollers = Pollers {
+        shared: Arc::clone(&shared),
+        running: BTreeMap::new(),
+        started: Vec::new(),
+    };
+    loop {
+        tokio::select! {
+            biased;
+            () = stop.wait() => break,
+            Some(_) = events.next() => {}
         }
+        // A list brings many at once.
+        while events.next().now_or_never().flatten().is_some() {}
+        let all = Leaderboards::cached(&shared.leaderboards, &shared.scope.allowed).all;
+        pollers.adjust(&desired(&all), &open);
     }
-    desired
+    pollers.drain().await;
 }
 
 /// A poller that runs.
-struct Running {
-    connection: Connection,
+struct Running<W> {
+    way: W,
     stop: watch::Sender<bool>,
 }
 
-pub(super) struct Pollers {
+struct Pollers<W> {
     shared: Arc<Shared>,
-    running: BTreeMap<String, Running>,
+    running: BTreeMap<String, Running<W>>,
     /// All that have begun, those whose queue is no longer read until they have finished what is in hand.
     started: Vec<JoinHandle<Option<()>>>,
 }
 
-impl Pollers {
-    pub fn new(shared: Arc<Shared>) -> Self {
-        Self {
-            shared,
-            running: BTreeMap::new(),
-            started: Vec::new(),
-        }
-    }
-
+impl<W: Clone + PartialEq> Pollers<W> {
     /// Stops what is no longer desired, starts what is missing.
-    pub fn adjust(&mut self, desired: &BTreeMap<String, Connection>) {
+    fn adjust<S: Source>(&mut self, desired: &BTreeMap<String, W>, open: impl Fn(&str, &W) -> S) {
         let problems = &self.shared.problems;
-        self.running.retain(|url, running| {
-            let keep = desired.get(url) == Some(&running.connection);
+        self.running.retain(|queue, running| {
+            let keep = desired.get(queue) == Some(&running.way);
             if !keep {
-                tracing::info!(queue = url, "stopped reading the queue with its former settings");
+                tracing::info!(queue, "stopped reading the queue with its former settings");
                 running.stop.send_replace(true);
-                problems.forget(url);
+                problems.forget(queue);
             }
             keep
         });
-        for (url, connection) in desired {
-            if !self.running.contains_key(url) {
-                self.start(url, connection);
+        for (queue, way) in desired {
+            if !self.running.contains_key(queue) {
+                self.start(queue, way, open(queue, way));
             }
         }
         self.started.retain(|task| !task.is_finished());
     }
 
-    fn start(&mut self, url: &str, connection: &Connection) {
-        tracing::info!(queue = url, "reading the queue");
+    fn start(&mut self, queue: &str, way: &W, source: impl Source) {
+        tracing::info!(queue, "reading the queue");
         let (stop, stopped) = watch::channel(false);
-        let sqs = self
-            .shared
-            .aws
-            .sqs(connection.region.as_deref(), connection.endpoint.as_deref());
-        let poller = Poller::new(url.to_owned(), sqs, self.shared.clone(), stopped);
-        let running = Running {
-            connection: connection.clone(),
-            stop,
-        };
+        let poller = Poller::new(queue.to_owned(), source, self.shared.clone(), stopped);
         // It may end before the process does: its queue may be taken out of the Leaderboards.
-        let task = self
-            .shared
-            .telemetry
-            .tasks
-            .may_end(format!("queue {url}"), poller.run());
+        let tasks = &self.shared.telemetry.tasks;
+        let task = tasks.may_end(format!("queue {queue}"), poller.run());
         self.started.push(task);
-        self.running.insert(url.to_owned(), running);
+        let way = way.clone();
+        self.running.insert(queue.to_owned(), Running { way, stop });
     }
 
     /// Lets each poller finish what it has in hand.
-    pub async fn drain(self) {
+    async fn drain(self) {
         for running in self.running.values() {
             running.stop.send_replace(true);
         }
@@ -121,7 +122,7 @@ impl Pollers {
 }
 
 /// What keeps each queue from being read. The process is ready while at least one can be read, or there is none.
-pub(super) struct Problems {
+pub struct Problems {
     queues: Mutex<BTreeMap<String, Option<String>>>,
     readiness: Readiness,
 }

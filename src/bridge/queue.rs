@@ -1,6 +1,6 @@
-//! One SQS queue as the poller needs it: receive, extend, postpone, delete, move to the dead-letter queue.
+//! One SQS queue: receive, extend, postpone, delete, move to the dead-letter queue.
 //!
-//! Called by the poller. Knows no Leaderboards and no policy; errors name the queue and what to do.
+//! Called by `sqs`. Knows no Leaderboards and no policy; errors name the queue and what to do.
 
 use std::time::Duration;
 
@@ -15,6 +15,7 @@ use thiserror::Error;
 
 use super::dead_letter::{self, DeadLetter};
 use super::route::DeadReason;
+use super::source::Received;
 use crate::services::fault::{self, Fault};
 use crate::services::meter::Meter;
 
@@ -27,25 +28,6 @@ const DEFAULT_VISIBILITY: Duration = Duration::from_secs(30);
 
 /// How the name of a FIFO queue ends.
 const FIFO: &str = ".fifo";
-
-/// A message that was received and is ours until its visibility lapses.
-#[derive(Clone, Debug)]
-pub struct Received {
-    /// Id given by SQS.
-    pub id: String,
-    /// What deletes this receive of it.
-    pub receipt: String,
-    /// The body.
-    pub body: String,
-    /// When it was sent, in milliseconds since 1970.
-    pub sent_ms: i64,
-    /// When it was first received, in milliseconds since 1970.
-    pub first_seen_ms: i64,
-    /// How often it has been received, this time included.
-    pub receives: i32,
-    /// Group of a message in a FIFO queue.
-    pub group: Option<String>,
-}
 
 /// Why a queue could not be used.
 #[derive(Clone, Debug, PartialEq, Eq, Error)]
@@ -265,6 +247,7 @@ fn received(message: Message) -> Option<Received> {
             .and_then(|count| i32::try_from(count).ok())
             .unwrap_or(1),
         group: attributes.get(&MessageSystemAttributeName::MessageGroupId).cloned(),
+        hindrance: None,
     })
 }
 
@@ -329,6 +312,7 @@ mod tests {
             first_seen_ms: 0,
             receives: 1,
             group: Some("1-3".into()),
+            hindrance: None,
         }
     }
 

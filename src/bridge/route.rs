@@ -26,6 +26,17 @@ pub struct Envelope {
     pub sent_ms: i64,
     /// How often it has been received, this time included.
     pub receives: i32,
+    /// Why it makes no Submission, whatever it holds.
+    pub hindrance: Option<Hindrance>,
+}
+
+/// Why a message makes no Submission.
+#[derive(Clone, Debug, PartialEq, Eq)]
+pub enum Hindrance {
+    /// Its submission is not there to be run, for this reason.
+    Unusable(String),
+    /// EvalAI does not show its submission now.
+    Hidden,
 }
 
 /// What the Leaderboards that share a queue want done with its messages.
@@ -37,6 +48,8 @@ pub struct Rules {
     pub unknown_after_ms: i64,
     /// True if any of them leaves foreign messages to another reader.
     pub leaves_foreign: bool,
+    /// True if other challenges may have the same queue: an EvalAI in debug mode has one for all.
+    pub is_common: bool,
 }
 
 /// Why a message goes to the dead-letter queue.
@@ -185,16 +198,12 @@ pub fn rules(readers: &[Arc<Leaderboard>]) -> Rules {
             .unwrap_or_default()
             * 1000,
         leaves_foreign: queues().any(|queue| queue.foreign == Foreign::Leave),
+        is_common: false,
     }
 }
 
 /// Finds the Leaderboard of a message. `readers` are the queue's, the oldest first; `is_complete`: none can be missing.
-pub fn route(envelope: &Envelope, readers: &[Arc<Leaderboard>], now_ms: i64, is_complete: bool) -> MessageOutcome {
-    route_by(&rules(readers), envelope, readers, now_ms, is_complete)
-}
-
-/// The same for a queue with these rules.
-pub fn route_by(
+pub fn route(
     rules: &Rules,
     envelope: &Envelope,
     readers: &[Arc<Leaderboard>],
@@ -212,6 +221,16 @@ pub fn route_by(
         }
         Err(malformed) => return MessageOutcome::Dead(DeadReason::Malformed(malformed.to_string())),
     };
+    let is_of_reader =
+        |lb: &Arc<Leaderboard>| (lb.spec.evalai.as_ref()).is_some_and(|e| e.challenge == message.challenge);
+    if rules.is_common && !readers.iter().any(is_of_reader) {
+        return later(envelope.receives, SHORT_WAIT, Later::Foreign);
+    }
+    match &envelope.hindrance {
+        Some(Hindrance::Unusable(why)) => return MessageOutcome::Dead(DeadReason::Malformed(why.clone())),
+        Some(Hindrance::Hidden) => return MessageOutcome::Lapse,
+        None => {}
+    }
     if let Some(leaderboard) = readers.iter().find(|lb| lb.serves(message.challenge, message.phase)) {
         return MessageOutcome::Ingest {
             namespace: leaderboard.namespace().unwrap_or_default(),

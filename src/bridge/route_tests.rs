@@ -55,6 +55,7 @@ fn envelope(challenge: i64, phase: i64, age_seconds: i64) -> Envelope {
         }),
         sent_ms: NOW - age_seconds * 1000,
         receives: 1,
+        hindrance: None,
     }
 }
 
@@ -84,7 +85,7 @@ fn queue_mut(leaderboard: &mut Leaderboard) -> &mut Queue {
 }
 
 fn check(what: &str, envelope: &Envelope, readers: &[Arc<Leaderboard>], synced: bool, want: &MessageOutcome) {
-    assert_eq!(route(envelope, readers, NOW, synced), *want, "{what}");
+    assert_eq!(route(&rules(readers), envelope, readers, NOW, synced), *want, "{what}");
 }
 
 #[test]
@@ -170,6 +171,7 @@ fn a_malformed_message_is_given_up_at_once() {
 #[test]
 fn waits_double_up_to_their_limit() {
     let seconds = |receives, readers: &[Arc<Leaderboard>]| match route(
+        &rules(readers),
         &Envelope {
             receives,
             ..envelope(1, 9, 1)
@@ -215,7 +217,7 @@ fn of_two_that_claim_a_phase_the_older_serves_it() {
         "other queues are others'"
     );
     let both = readers(URL, &[queue(board("a", 20)), queue(board("b", 10))]);
-    assert_eq!(route(&envelope(1, 2, 0), &both, NOW, true), to("b"));
+    assert_eq!(route(&rules(&both), &envelope(1, 2, 0), &both, NOW, true), to("b"));
 }
 
 #[test]
@@ -232,8 +234,39 @@ fn leaderboards_that_share_a_queue_agree_on_the_most_patient_rules() {
         dead_letter: Some("https://q/dead".into()),
         unknown_after_ms: 900_000,
         leaves_foreign: true,
+        is_common: false,
     };
     assert_eq!(rules(&[older, newer]), want);
+}
+
+#[test]
+fn a_message_whose_submission_cannot_run_is_given_up_and_one_whose_row_is_hidden_comes_back() {
+    let of = |challenge, phase, age, hindrance: &Hindrance| Envelope {
+        hindrance: Some(hindrance.clone()),
+        ..envelope(challenge, phase, age)
+    };
+    let gone = Hindrance::Unusable("EvalAI has no submission 7".into());
+    let dead = MessageOutcome::Dead(DeadReason::Malformed("EvalAI has no submission 7".into()));
+    check("it is not there", &of(1, 2, 0, &gone), &one(), true, &dead);
+    for phase in [2, 9] {
+        let hidden = of(1, phase, 90_000, &Hindrance::Hidden);
+        check("its row is not shown", &hidden, &one(), true, &MessageOutcome::Lapse);
+    }
+    let common = Rules {
+        is_common: true,
+        ..rules(&one())
+    };
+    let foreign = wait(30, Later::Foreign);
+    for envelope in [
+        envelope(9, 2, 90_000),
+        of(9, 2, 0, &gone),
+        of(9, 2, 0, &Hindrance::Hidden),
+    ] {
+        let found = route(&common, &envelope, &one(), NOW, true);
+        assert_eq!(found, foreign, "another challenge's: {envelope:?}");
+    }
+    assert_eq!(route(&common, &envelope(1, 2, 0), &one(), NOW, true), to("a"));
+    assert_eq!(route(&common, &envelope(1, 9, 901), &one(), NOW, true), unknown(1, 9));
 }
 
 #[test]

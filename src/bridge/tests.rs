@@ -1,12 +1,16 @@
 //! The bridge's supervisor on a mock of the API server's client.
 
+use std::time::Duration;
+
 use http::{Request, Response};
 use kube::client::Body;
 use serde_json::{Value, json};
 use tokio::sync::watch;
 use tokio::task::JoinHandle;
+use tokio::time::Instant;
 use tower_test::mock::{Handle, pair};
 
+use super::sqs::{PULSE_AGE, PULSE_LIMIT};
 use super::*;
 use crate::bridge::route::tests::{board, with_queue};
 use crate::observability::metrics::Program;
@@ -62,19 +66,15 @@ fn is_list(request: &Request<Body>) -> bool {
     request.uri().query().is_some_and(|query| query.contains("limit=100"))
 }
 
-async fn shared() -> (Shared, Server, watch::Sender<bool>) {
+fn a_pulse() -> (Pulse, Server, watch::Sender<bool>) {
     let (clients, handle) = client();
     let (telemetry, stop) = telemetry();
-    (
-        Shared::new(clients, Aws::load("bridge").await, everything(), telemetry),
-        handle,
-        stop,
-    )
+    (pulse(&shared(clients, everything(), telemetry)), handle, stop)
 }
 
 #[tokio::test(start_paused = true)]
 async fn an_answer_of_the_api_server_counts_for_five_seconds() {
-    let (shared, mut handle, _stop) = shared().await;
+    let (pulse, mut handle, _stop) = a_pulse();
     let server = tokio::spawn(async move {
         let mut held = Vec::new();
         let mut pulses = 0;
@@ -89,19 +89,19 @@ async fn an_answer_of_the_api_server_counts_for_five_seconds() {
         }
         (handle, held)
     });
-    assert_eq!(shared.check_pulse().await, Ok(()));
-    assert_eq!(shared.check_pulse().await, Ok(()), "without a request");
+    assert_eq!(pulse.check().await, Ok(()));
+    assert_eq!(pulse.check().await, Ok(()), "without a request");
     tokio::time::advance(PULSE_AGE).await;
-    assert_eq!(shared.check_pulse().await, Ok(()));
+    assert_eq!(pulse.check().await, Ok(()));
     server.await.unwrap();
 }
 
 #[tokio::test(start_paused = true)]
 async fn a_silent_api_server_keeps_the_queue_unread() {
-    let (shared, _handle, _stop) = shared().await;
+    let (pulse, _handle, _stop) = a_pulse();
     let begun = Instant::now();
     assert_eq!(
-        shared.check_pulse().await,
+        pulse.check().await,
         Err("the API server did not answer within 5 s".to_owned())
     );
     assert_eq!(begun.elapsed(), PULSE_LIMIT);
@@ -157,7 +157,7 @@ async fn a_broken_watch_of_leaderboards_fails_liveness_while_the_api_server_answ
             });
         }
     });
-    let shared = Shared::new(clients, Aws::load("bridge").await, everything(), telemetry.clone());
+    let shared = shared(clients, everything(), telemetry.clone());
     shared.leaderboards.store.wait_until_ready().await.unwrap();
     tokio::time::sleep(Duration::from_mins(12)).await;
     assert_eq!(
@@ -165,7 +165,7 @@ async fn a_broken_watch_of_leaderboards_fails_liveness_while_the_api_server_answ
         Vec::<String>::new(),
         "nothing else has answered"
     );
-    assert_eq!(shared.check_pulse().await, Ok(()));
+    assert_eq!(pulse(&shared).check().await, Ok(()));
     let problems = telemetry.liveness.problems().join("");
     assert!(problems.contains("the watch of Leaderboard"), "{problems:?}");
 }

@@ -167,7 +167,7 @@ impl Bridge {
 
     /// So many messages had this outcome.
     pub(super) fn count(&self, outcome: &str) -> u64 {
-        let sample = format!("leaderboard_sqs_messages_total{{outcome=\"{outcome}\"}} ");
+        let sample = format!("leaderboard_queue_messages_total{{outcome=\"{outcome}\"}} ");
         self.sample(&sample).map_or(0, |value| value.parse().unwrap())
     }
 

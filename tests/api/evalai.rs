@@ -107,7 +107,6 @@ impl World {
             not_before,
             changed: wake,
             sweep: found,
-            arrived: mpsc::unbounded_channel().0,
             timing,
             timeouts,
             meter: Meter::default(),

@@ -160,7 +160,7 @@ async fn a_message_of_no_use_is_named_and_deleted_and_another_challenges_stays()
         .await;
     world.send(json!({"challenge_pk": 1, "what": "a \u{1b}[31mtext"})).await;
     let note = world.event("MessageDropped").await;
-    assert!(note.contains("phase_pk is missing (Malformed)"), "{note}");
+    assert!(note.contains("(Malformed): phase_pk is missing"), "{note}");
     assert!(
         note.contains(r#""challenge_pk":1"#) && !note.contains('\u{1b}'),
         "{note}"

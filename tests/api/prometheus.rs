@@ -34,7 +34,7 @@ const SEEN: [(&str, &str); 8] = [
     ("sum(leaderboard_is_leader)", "1"),
     ("count(leaderboard_is_leader)", "2"),
     ("count(leaderboard_leader_term)", "1"),
-    (r#"sum(leaderboard_sqs_messages_total{outcome="created"})"#, "1"),
+    (r#"sum(leaderboard_queue_messages_total{outcome="created"})"#, "1"),
     ("sum(leaderboard_submission_failures_total)", "1"),
     (
         "count(increase(leaderboard_submission_phase_duration_seconds_count[1h]) > 0)",
@@ -42,11 +42,12 @@ const SEEN: [(&str, &str); 8] = [
     ),
 ];
 
-/// What a standby shows of itself.
-const OF_STANDBY: [&str; 5] = [
+/// What a standby shows of itself: of messages that none has waited.
+const OF_STANDBY: [&str; 6] = [
     "leaderboard_build_",
     "leaderboard_is_leader",
     "leaderboard_lease_",
+    "leaderboard_queue_message_wait_",
     "leaderboard_runtime_",
     "leaderboard_watch_",
 ];
@@ -250,7 +251,7 @@ async fn a_real_prometheus_reads_each_metric_and_evaluates_each_alert_and_each_p
     prometheus
         .until("count(leaderboard_submission_phase_duration_seconds_count)", "10")
         .await;
-    prometheus.until("count(leaderboard_sqs_messages_total)", "11").await;
+    prometheus.until("count(leaderboard_queue_messages_total)", "11").await;
     live(&world, &queue).await;
     for (query, value) in SEEN {
         prometheus.until(query, value).await;

@@ -1,288 +1,242 @@
-//! Messages of EvalAI's own queues: each becomes a Submission, as the bridge makes them of messages in SQS, by the same rules and the
-//! same `ingest`.
+//! EvalAI's own queues as a source of messages, which become Submissions as those of SQS do in the bridge.
 //!
-//! Started by the controller's leader. EvalAI shows neither the id of a message nor when it was sent. The time at which its row asked
-//! to be run takes the place of both, so a message that comes twice is a repeat.
+//! Started by the controller's leader: it has the tokens, and a third of their requests are for these queues. EvalAI shows neither the id of
+//! a message nor when it was sent. The time at which its row asked to be run takes the place of both, so a message that comes twice is a
+//! repeat. EvalAI has no dead-letter queue: the log and an event keep what a message held that is deleted unused.
 
 use std::collections::BTreeMap;
 use std::sync::Arc;
 use std::time::Duration;
 
 use jiff::Timestamp;
-use kube::runtime::events::{Event, EventType, Recorder};
-use kube::{Api, Client, Resource, ResourceExt};
-use tokio::sync::mpsc;
-use tokio::time::{Instant, sleep_until};
-use tracing::Instrument;
+use tokio::time::{Instant, sleep};
 
-use crate::bridge::ages::Ages;
-use crate::bridge::ingest::{self, Incoming, IngestError, Outcome};
-use crate::bridge::message::{self, Malformed, Message};
-use crate::bridge::route::{self, DeadReason, Envelope, MessageOutcome, Rules};
+use crate::backoff::Backoff;
+use crate::bridge::message;
+use crate::bridge::pollers::{Shared, follow};
+use crate::bridge::route::{DeadReason, Hindrance, OUTCOMES, Rules};
+use crate::bridge::source::{Received, SetAside, Source, named};
 use crate::controller::leaderboards::operator;
-use crate::kubernetes::{Watch, call};
-use crate::observability::metrics::Metrics;
-use crate::services::evalai::{Arrival, Arrived, Origin, Settled};
+use crate::controller::objects::key_of;
+use crate::services::ObjectKey;
+use crate::services::evalai::answer::{About, Answer};
+use crate::services::evalai::request::{Reply, Request};
+use crate::services::evalai::{Hub, Row};
 use leaderboard_api::text::one_line;
-use leaderboard_api::{Evalai, EvalaiQueue, Leaderboard, Submission, reasons};
+use leaderboard_api::{EvalaiQueue, Leaderboard, reasons};
 
 /// Most characters of a message that an event and the log quote.
 const QUOTED: usize = 500;
-/// A message that is left comes back after EvalAI's 30 s, once those before it were read, which takes three requests each.
-const SEEN_AGAIN: Duration = Duration::from_mins(5);
+/// How long EvalAI hides a message that was received.
+const VISIBILITY: Duration = Duration::from_secs(30);
+/// Waits before an empty queue is asked again. Three requests a minute at rest.
+const IDLE: Backoff = Backoff::new(Duration::from_secs(5), Duration::from_secs(20));
+/// EvalAI did not have a submission when its message came: a second message of it within so long shows that it is not there.
+const MISSING: Duration = Duration::from_mins(10);
 
-/// What messages are taken in with.
-pub(super) struct Intake {
-    pub client: Client,
-    pub leaderboards: Watch<Leaderboard>,
-    /// Who drives the Leaderboards that count.
-    pub operator: String,
-    pub recorder: Recorder,
-    pub metrics: Arc<Metrics>,
-}
-
-/// What a message means, before anything is written.
+/// A queue, and the Leaderboard by whose token it is read: the oldest that names it.
 #[derive(Clone, Debug, PartialEq, Eq)]
-enum Verdict {
-    /// Make or bump its Submission.
-    Ingest {
-        namespace: String,
-        leaderboard: String,
-        message: Message,
-        sent_ms: i64,
-    },
-    /// It is of no use, now or later.
-    Drop(DeadReason),
-    /// It may be of use later.
-    Leave,
-    /// It is another reader's.
-    Foreign,
+struct Way {
+    server: String,
+    name: String,
+    leaderboard: ObjectKey,
 }
 
-impl Intake {
-    /// Takes messages in until their sender is gone.
-    pub(super) async fn into_cluster(self, mut arrived: mpsc::UnboundedReceiver<Arrived>) {
-        let mut waiting = Waiting::new(&self.metrics);
-        loop {
-            let arrived = tokio::select! {
-                arrived = arrived.recv() => arrived,
-                () = waiting.expired() => continue,
-            };
-            let Some(arrived) = arrived else { return };
-            let settled = self.take(&arrived.arrival, &mut waiting).await;
-            if settled == Settled::Delete {
-                waiting.forget(&arrived.arrival);
-            }
-            arrived.settle(settled);
-        }
-    }
-
-    async fn take(&self, arrival: &Arrival, waiting: &mut Waiting) -> Settled {
-        // Asked first: what is complete now has all that is read below.
-        let is_complete = self.leaderboards.is_complete();
-        let readers = readers(&self.leaderboards.store.state(), &self.operator, arrival);
-        let now_ms = Timestamp::now().as_millisecond();
-        let verdict = judge(arrival, &readers, now_ms, is_complete);
-        if let Some(sent_ms) = sent_ms(arrival, now_ms).filter(|_| verdict != Verdict::Foreign) {
-            waiting.keep(arrival, sent_ms);
-        }
-        match verdict {
-            Verdict::Leave | Verdict::Foreign => Settled::Leave,
-            Verdict::Drop(reason) => self.drop(arrival, &readers, &reason).await,
-            Verdict::Ingest {
-                namespace,
-                leaderboard,
-                message,
-                sent_ms,
-            } => {
-                let span = ingest::span(&namespace, &leaderboard, message.submission);
-                let incoming = incoming(&message, sent_ms);
-                let outcome = self.ingest(&namespace, &leaderboard, &incoming).instrument(span).await;
-                let envelope = envelope(Ok(message), sent_ms);
-                match route::settle(&envelope, &outcome, &rules(&readers), now_ms) {
-                    MessageOutcome::Delete(_) => Settled::Delete,
-                    MessageOutcome::Dead(reason) => self.drop(arrival, &readers, &reason).await,
-                    MessageOutcome::Later { .. } | MessageOutcome::Lapse | MessageOutcome::Ingest { .. } => {
-                        Settled::Leave
-                    }
-                }
-            }
-        }
-    }
-
-    /// Applies it, and logs what came of it.
-    async fn ingest(&self, namespace: &str, leaderboard: &str, incoming: &Incoming) -> Result<Outcome, IngestError> {
-        let api: Api<Submission> = Api::namespaced(self.client.clone(), namespace);
-        let outcome = ingest::apply(&api, leaderboard, incoming).await;
-        match &outcome {
-            Ok(outcome) => tracing::info!(%outcome, "a message of EvalAI was taken in"),
-            Err(error) => tracing::warn!(%error, "a message of EvalAI was not taken in"),
-        }
-        outcome
-    }
-
-    /// Deletes a message that nothing can be made of. EvalAI has no dead-letter queue: the log and an event keep what it held.
-    async fn drop(&self, arrival: &Arrival, readers: &[Arc<Leaderboard>], reason: &DeadReason) -> Settled {
-        let (queue, text) = (&arrival.queue, one_line(&arrival.body, QUOTED));
-        let (reason, detail) = (reason.as_str(), reason.detail());
-        tracing::warn!(
-            queue,
-            reason,
-            detail,
-            text,
-            "a message of EvalAI cannot be used and is deleted"
-        );
-        let Some(oldest) = readers.first() else {
-            return Settled::Delete;
-        };
-        let note = format!("A message of EvalAI's queue {queue} was deleted: {detail} ({reason}). It was {text}");
-        let event = Event {
-            type_: EventType::Warning,
-            reason: reasons::MESSAGE_DROPPED.to_owned(),
-            note: Some(one_line(&note, 1000)),
-            action: "ReadQueue".to_owned(),
-            secondary: None,
-        };
-        let reference = oldest.object_ref(&());
-        let published = self.recorder.publish(&event, &reference);
-        if let Err(error) = call("an event", &oldest.name_any(), published).await {
-            tracing::warn!(queue, reason, "{error}");
-        }
-        Settled::Delete
-    }
+/// One queue.
+struct Inbox {
+    way: Way,
+    hub: Hub,
+    operator: String,
+    /// Answers in a row without a message.
+    empty: u32,
+    /// Submissions that EvalAI does not have, and since when.
+    missing: BTreeMap<i64, Instant>,
 }
 
-fn queue_of(leaderboard: &Leaderboard) -> Option<&EvalaiQueue> {
-    leaderboard.spec.evalai.as_ref()?.queue.as_ref()
-}
-
-/// The Leaderboards that read the queue, the oldest first.
-fn readers(all: &[Arc<Leaderboard>], operator: &str, arrival: &Arrival) -> Vec<Arc<Leaderboard>> {
-    let reads = |leaderboard: &&Arc<Leaderboard>| {
-        leaderboard.spec.evalai.as_ref().map(Evalai::server).as_ref() == Some(&arrival.server)
-            && queue_of(leaderboard).is_some_and(|queue| queue.name == arrival.queue)
-            && leaderboard.metadata.deletion_timestamp.is_none()
-            && operator::is_ours(leaderboard, operator)
+/// Reads the queues that this operator's Leaderboards name until the stop.
+pub(super) async fn read(shared: Arc<Shared>, hub: Hub, operator: String) {
+    let metrics = Arc::clone(&shared.telemetry.metrics);
+    let open = |_: &str, way: &Way| {
+        for outcome in OUTCOMES {
+            metrics.messages.total.of([outcome]);
+        }
+        Inbox {
+            way: way.clone(),
+            hub: hub.clone(),
+            operator: operator.clone(),
+            empty: 0,
+            missing: BTreeMap::new(),
+        }
     };
-    let mut readers: Vec<_> = all.iter().filter(reads).cloned().collect();
-    readers.sort_by_key(|leaderboard| leaderboard.seniority());
-    readers
+    follow(shared, |all| desired(all, &operator), open).await;
 }
 
-/// A message waits as long as the most patient reader allows.
-fn rules(readers: &[Arc<Leaderboard>]) -> Rules {
-    let waits = readers.iter().filter_map(|leaderboard| queue_of(leaderboard));
-    Rules {
-        unknown_after_ms: waits.map(|queue| queue.unknown_after_seconds).max().unwrap_or_default() * 1000,
-        ..Rules::default()
+fn desired(all: &[Arc<Leaderboard>], operator: &str) -> BTreeMap<String, Way> {
+    let mut ways = BTreeMap::new();
+    for leaderboard in by_age(all.to_vec()) {
+        if let Some((server, queue)) = queue_of(&leaderboard, operator) {
+            let name = queue.name.clone();
+            let leaderboard = key_of(leaderboard.as_ref());
+            ways.entry(format!("{server}: {name}")).or_insert(Way {
+                server,
+                name,
+                leaderboard,
+            });
+        }
     }
+    ways
 }
 
-/// Decides on a message.
-fn judge(arrival: &Arrival, readers: &[Arc<Leaderboard>], now_ms: i64, is_complete: bool) -> Verdict {
-    let content = message::parse(&arrival.body);
-    if let Ok(message) = &content {
-        let challenges = readers
-            .iter()
-            .filter_map(|leaderboard| leaderboard.spec.evalai.as_ref());
-        // An EvalAI in debug mode has one queue for all challenges: what others wait for is not ours to delete.
-        if challenges
-            .into_iter()
-            .all(|evalai| evalai.challenge != message.challenge)
-        {
-            return Verdict::Foreign;
-        }
-        let submission = message.submission;
-        let unusable = match arrival.origin {
-            Origin::Missing => Some(format!("EvalAI has no submission {submission}")),
-            Origin::Foreign => Some(format!(
-                "EvalAI does not show submission {submission} to a host of this challenge: its row has a phase of another challenge"
-            )),
-            Origin::Wanted(_) | Origin::Hidden => None,
-        };
-        if let Some(why) = unusable {
-            return Verdict::Drop(DeadReason::Malformed(why));
-        }
-    }
-    let sent_ms = sent_ms(arrival, now_ms);
-    let envelope = envelope(content, sent_ms.unwrap_or(now_ms));
-    match (
-        route::route_by(&rules(readers), &envelope, readers, now_ms, is_complete),
-        envelope.content,
-        sent_ms,
-    ) {
-        (MessageOutcome::Dead(reason), ..) => Verdict::Drop(reason),
-        (MessageOutcome::Ingest { namespace, leaderboard }, Ok(message), Some(sent_ms)) => Verdict::Ingest {
-            namespace,
-            leaderboard,
-            message,
-            sent_ms,
+/// The server and the queue that a Leaderboard of ours names, if it takes messages.
+fn queue_of<'a>(leaderboard: &'a Leaderboard, operator: &str) -> Option<(String, &'a EvalaiQueue)> {
+    let evalai = leaderboard.spec.evalai.as_ref()?;
+    let is_read = leaderboard.metadata.deletion_timestamp.is_none() && operator::is_ours(leaderboard, operator);
+    let queue = evalai.queue.as_ref().filter(|_| is_read)?;
+    Some((evalai.server(), queue))
+}
+
+fn by_age(mut all: Vec<Arc<Leaderboard>>) -> Vec<Arc<Leaderboard>> {
+    all.sort_by_key(|leaderboard| leaderboard.seniority());
+    all
+}
+
+/// When a message was sent, if its row shows that, and why it makes no Submission.
+fn origin(submission: i64, answer: Answer<Row>, now: Timestamp) -> Result<(Option<i64>, Option<Hindrance>), String> {
+    let hindrance = match answer {
+        Answer::Done(row) => match row.wanted_at() {
+            // A row's times are its participant's to edit: one of the future would keep later resumes from being newer.
+            Some(at) => return Ok((Some(at.min(now).as_millisecond()), None)),
+            None => Hindrance::Hidden,
         },
-        _ => Verdict::Leave,
+        Answer::Refused(refusal) if refusal.about == About::Missing => {
+            Hindrance::Unusable(format!("EvalAI has no submission {submission}"))
+        }
+        Answer::Refused(refusal) if refusal.is_of_another_challenge() => Hindrance::Unusable(format!(
+            "EvalAI does not show submission {submission} to a host of this challenge: its row has a phase of another challenge"
+        )),
+        Answer::Refused(_) => Hindrance::Hidden,
+        other => return Err(other.error().unwrap_or_default()),
+    };
+    Ok((None, Some(hindrance)))
+}
+
+impl Inbox {
+    /// EvalAI's answer; none while the Leaderboard is not served.
+    async fn ask(&self, request: Request) -> Option<Reply> {
+        self.hub.pass(&self.way.leaderboard, request).await
     }
-}
 
-/// A row's times are its participant's to edit: one of the future would keep later resumes from being newer.
-fn sent_ms(arrival: &Arrival, now_ms: i64) -> Option<i64> {
-    match arrival.origin {
-        Origin::Wanted(time) => Some(time.as_millisecond().min(now_ms)),
-        Origin::Missing | Origin::Foreign | Origin::Hidden => None,
-    }
-}
-
-/// How old the messages are that were handed over and are not deleted, by queue. EvalAI shows no id of one: its text takes that place.
-struct Waiting {
-    by_queue: BTreeMap<String, Ages>,
-    metrics: Arc<Metrics>,
-}
-
-impl Waiting {
-    fn new(metrics: &Arc<Metrics>) -> Self {
-        Self {
-            by_queue: BTreeMap::new(),
-            metrics: Arc::clone(metrics),
+    /// Notes that EvalAI does not have a submission. True if it was not asked for before: one answer may be of a server that is just being
+    /// replaced.
+    fn is_first_miss(&mut self, submission: i64) -> bool {
+        self.missing.retain(|_, since| since.elapsed() < MISSING);
+        match self.missing.remove(&submission) {
+            Some(_) => false,
+            None => self.missing.insert(submission, Instant::now()).is_none(),
         }
     }
 
-    fn keep(&mut self, arrival: &Arrival, sent_ms: i64) {
-        let until = Instant::now() + SEEN_AGAIN;
-        self.change(&arrival.queue, |ages| ages.keep(&arrival.body, sent_ms, until));
+    /// What EvalAI shows of a message; none if it is to come back first.
+    async fn look_up(&mut self, body: String, receipt: String) -> Result<Option<Received>, String> {
+        let now = Timestamp::now();
+        let (mut id, mut sent, mut hindrance) = ("evalai".to_owned(), None, None);
+        if let Ok(message) = message::parse(&body) {
+            let submission = message.submission;
+            let Some(Reply::Row(answer)) = self.ask(Request::MessageRow(submission)).await else {
+                return Ok(None);
+            };
+            let is_missing = matches!(&answer, Answer::Refused(refusal) if refusal.about == About::Missing);
+            if is_missing && self.is_first_miss(submission) {
+                return Ok(None);
+            }
+            (sent, hindrance) = origin(submission, answer, now)?;
+            id = format!("evalai-{submission}-{}", sent.unwrap_or_default());
+        }
+        let now = now.as_millisecond();
+        Ok(Some(Received {
+            id,
+            receipt,
+            body,
+            sent_ms: sent.unwrap_or(now),
+            first_seen_ms: now,
+            receives: 1,
+            group: None,
+            hindrance,
+        }))
     }
+}
 
-    fn forget(&mut self, arrival: &Arrival) {
-        self.change(&arrival.queue, |ages| ages.forget(&arrival.body));
-    }
-
-    fn change(&mut self, queue: &str, change: impl FnOnce(&mut Ages)) {
-        let ages = self.by_queue.entry(queue.to_owned()).or_default();
-        change(ages);
-        self.metrics.set_oldest_message(queue, ages.oldest_ms());
-    }
-
-    /// Waits until a message has not come back in time, and forgets it.
-    async fn expired(&mut self) {
-        let next = self.by_queue.values().filter_map(Ages::next_expiry).min();
-        let Some(next) = next else {
-            return std::future::pending().await;
+impl Source for Inbox {
+    fn readers(&self, all: &[Arc<Leaderboard>]) -> Vec<Arc<Leaderboard>> {
+        let Way { server, name, .. } = &self.way;
+        let names = |leaderboard: &&Arc<Leaderboard>| {
+            queue_of(leaderboard, &self.operator).is_some_and(|(on, queue)| on == *server && queue.name == *name)
         };
-        sleep_until(next).await;
-        for (queue, ages) in &mut self.by_queue {
-            ages.expire(Instant::now());
-            self.metrics.set_oldest_message(queue, ages.oldest_ms());
+        by_age(all.iter().filter(names).cloned().collect())
+    }
+
+    fn rules(&self, readers: &[Arc<Leaderboard>]) -> Rules {
+        let queues = readers.iter().filter_map(|reader| queue_of(reader, &self.operator));
+        let longest = queues.map(|(_, queue)| queue.unknown_after_seconds).max();
+        Rules {
+            unknown_after_ms: longest.unwrap_or_default() * 1000,
+            is_common: true,
+            ..Rules::default()
         }
     }
-}
 
-/// EvalAI shows no id of a message.
-fn incoming(message: &Message, sent_ms: i64) -> Incoming {
-    Incoming::of(message, format!("evalai-{sent_ms}"), sent_ms)
-}
+    async fn receive(&mut self, _: Duration) -> Result<Vec<Received>, String> {
+        if self.empty > 0 {
+            sleep(IDLE.bound(self.empty)).await;
+        }
+        self.empty = self.empty.saturating_add(1);
+        let Some(Reply::Message(answer)) = self.ask(Request::Receive(self.way.name.clone())).await else {
+            return Ok(Vec::new());
+        };
+        let Answer::Done(found) = answer else {
+            return Err(answer.error().unwrap_or_default());
+        };
+        let (Some(receipt), false) = (found.receipt_handle, found.body.is_null()) else {
+            return Ok(Vec::new());
+        };
+        self.empty = 0;
+        let received = self.look_up(found.body.to_string(), receipt).await?;
+        Ok(received.into_iter().collect())
+    }
 
-fn envelope(content: Result<Message, Malformed>, sent_ms: i64) -> Envelope {
-    Envelope {
-        content,
-        sent_ms,
-        receives: 1,
+    fn visibility(&self) -> Duration {
+        VISIBILITY
+    }
+
+    /// It comes back after the same time anyway.
+    async fn hold(&self, _: &[&Received], _: i32) -> Result<(), String> {
+        Ok(())
+    }
+
+    async fn delete(&self, messages: &[&Received]) -> Result<(), String> {
+        for message in messages {
+            let request = Request::DeleteMessage(self.way.name.clone(), message.receipt.clone());
+            let answer = self.ask(request).await.map(|reply| reply.answer());
+            let why = match answer {
+                Some(Answer::Done(())) => continue,
+                Some(other) => other.error().unwrap_or_default(),
+                None => "its Leaderboard is not served".to_owned(),
+            };
+            return Err(format!(
+                "a message of EvalAI's queue {} was not deleted: {why}",
+                self.way.name
+            ));
+        }
+        Ok(())
+    }
+
+    async fn set_aside(&self, message: &Received, reason: &DeadReason, _: &Rules) -> Result<SetAside, String> {
+        let text = one_line(&message.body, QUOTED);
+        let (queue, what) = (&self.way.name, named(message, reason));
+        Ok(SetAside {
+            reason: reasons::MESSAGE_DROPPED,
+            note: format!("Deleted from EvalAI's queue {queue}: {what}. It was {text}"),
+        })
     }
 }
 

@@ -19,7 +19,7 @@ use std::time::Duration;
 
 use jiff::Timestamp;
 use kube::Client;
-use kube::runtime::events::{Recorder as EventRecorder, Reporter};
+use kube::runtime::events::Recorder;
 use kube::runtime::watcher::Config;
 use tokio::sync::mpsc;
 use tokio::task::JoinHandle;
@@ -29,6 +29,7 @@ use super::leaderboards::looks::{self, Look};
 use super::leaderboards::state::LeaderboardState;
 use super::leaderboards::{isolation, operator};
 use super::settings::Settings;
+use crate::bridge::{self, Scope, pollers};
 use crate::controller::submissions::external::ExternalSystems;
 use crate::controller::submissions::memory::Memory;
 use crate::controller::submissions::observe::causes::{Causes, OF_JOBS, OF_PODS, Objects};
@@ -39,13 +40,14 @@ use crate::kubernetes::objects::Event;
 use crate::kubernetes::preflight::{self, await_kinds};
 use crate::kubernetes::{Writer, spawn_uncached};
 use crate::observability::Observability;
+use crate::observability::readiness::Readiness;
 use crate::observability::tasks::TaskFailed;
 use crate::page::Page;
 use crate::services::ObjectKey;
 use crate::services::aws::Aws;
-use crate::services::evalai::{Arrived, Changed, Hub, Options, SweepRow, Timeouts, Timing};
+use crate::services::evalai::{Changed, Hub, Options, SweepRow, Timeouts, Timing};
 use crate::services::meter::Meter;
-use crate::services::table::Recorder;
+use crate::services::table;
 use backoff::BackoffMap;
 use context::Context;
 use leader::{Leader, Leadership};
@@ -196,23 +198,42 @@ impl Parts {
         evalai: mpsc::UnboundedSender<Changed>,
         rows: mpsc::UnboundedSender<ObjectKey>,
     ) -> ExternalSystems {
-        let (watches, telemetry) = (&self.watches, &self.telemetry);
-        let intake = inbox::Intake {
-            client: self.client.clone(),
-            leaderboards: watches.leaderboards.clone(),
-            operator: self.settings.operator.clone(),
-            recorder: events(&self.client),
-            metrics: Arc::clone(&telemetry.metrics),
-        };
-        let hub = hub(fence, evalai, intake, telemetry);
+        let telemetry = &self.telemetry;
+        let hub = hub(fence, evalai, self.sweep(), telemetry);
+        let inbox = inbox::read(self.inbox(), hub.clone(), self.settings.operator.clone());
+        telemetry.tasks.stay("inbox", inbox);
         let fence = fence.clone();
-        let recorder = Recorder::new(
+        let recorder = table::Recorder::new(
             self.aws.clone(),
             move || fence.may_write(),
             rows,
             telemetry.tasks.clone(),
         );
         ExternalSystems::new(hub, recorder, self.settings.allowed.clone())
+    }
+
+    /// Where the sweep's finds go.
+    fn sweep(&self) -> mpsc::UnboundedSender<SweepRow> {
+        let (sweep, rows) = mpsc::unbounded_channel();
+        let leaderboards = self.watches.leaderboards.store.clone();
+        let swept = sweep::into_cluster(self.client.clone(), leaderboards, rows);
+        self.telemetry.tasks.until_stop("sweep", swept);
+        sweep
+    }
+
+    /// What messages of EvalAI's queues are taken in with. A queue that cannot be read shows in its Leaderboards' `Ready`.
+    fn inbox(&self) -> Arc<pollers::Shared> {
+        Arc::new(pollers::Shared {
+            client: self.client.clone(),
+            scope: Scope {
+                namespaces: self.settings.namespaces.clone(),
+                allowed: self.settings.allowed.clone(),
+            },
+            leaderboards: self.watches.leaderboards.clone(),
+            recorder: events(&self.client),
+            telemetry: self.telemetry.clone(),
+            problems: pollers::Problems::new(Readiness::default()),
+        })
     }
 
     /// What all reconciles share.
@@ -313,12 +334,8 @@ async fn end<T>(
     result
 }
 
-fn events(client: &Client) -> EventRecorder {
-    let reporter = Reporter {
-        controller: "leaderboard.carla.org/controller".into(),
-        instance: std::env::var("POD_NAME").ok(),
-    };
-    EventRecorder::new(client.clone(), reporter)
+fn events(client: &Client) -> Recorder {
+    bridge::events(client, "controller")
 }
 
 /// Waits to become the leader. False if the stop comes before.
@@ -356,15 +373,9 @@ async fn lost(mut leadership: tokio::sync::watch::Receiver<Leadership>) -> Strin
 fn hub(
     fence: &leader::Fence,
     changed: mpsc::UnboundedSender<Changed>,
-    intake: inbox::Intake,
+    sweep: mpsc::UnboundedSender<SweepRow>,
     telemetry: &Observability,
 ) -> Hub {
-    let (sweep, rows) = mpsc::unbounded_channel::<SweepRow>();
-    let (arrived, messages) = mpsc::unbounded_channel::<Arrived>();
-    let (client, leaderboards) = (intake.client.clone(), intake.leaderboards.store.clone());
-    let tasks = &telemetry.tasks;
-    tasks.until_stop("sweep", sweep::into_cluster(client, leaderboards, rows));
-    tasks.until_stop("inbox", intake.into_cluster(messages));
     let not_before = fence.evalai_not_before().unwrap_or_else(Instant::now);
     let writes = fence.clone();
     Hub::new(Options {
@@ -372,11 +383,10 @@ fn hub(
         not_before,
         changed,
         sweep,
-        arrived,
         timing: Timing::default(),
         timeouts: Timeouts::default(),
         meter: Meter::for_metrics(&telemetry.metrics),
-        tasks: tasks.clone(),
+        tasks: telemetry.tasks.clone(),
     })
 }
 

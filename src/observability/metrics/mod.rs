@@ -88,7 +88,7 @@ impl Shared {
             oldest_message: r.gauges(
                 "queue_oldest_message_timestamp_seconds",
                 ["queue"],
-                "Unix time at which the oldest message was sent that was received and is not deleted; absent without one. `queue` is the URL of a queue in SQS, or the name of one in EvalAI, where a message is as old as its row's last request to be run",
+                "Unix time at which the oldest message was sent that was received and is not deleted; absent without one. `queue` is the URL of a queue in SQS, or server and name of one in EvalAI, where a message is as old as its row's last request to be run",
             ),
         }
     }
@@ -214,7 +214,7 @@ impl Evalai {
     }
 }
 
-/// The messages of a bridge.
+/// The messages of the queues.
 #[derive(Debug)]
 pub struct Messages {
     pub total: Counters<1>,
@@ -224,9 +224,13 @@ pub struct Messages {
 impl Messages {
     fn new(r: &mut Families<'_>) -> Self {
         Self {
-            total: r.counters("sqs_messages", ["outcome"], "Messages by outcome"),
+            total: r.counters(
+                "queue_messages",
+                ["outcome"],
+                "Messages by outcome, those of EvalAI's own queues in the controller that leads",
+            ),
             wait: r.days(
-                "sqs_message_wait_duration_seconds",
+                "queue_message_wait_duration_seconds",
                 "Time from sending a message to the Submission that it made or resumed",
             ),
         }
@@ -248,20 +252,21 @@ impl Metrics {
         let build = Info::new([("version", env!("CARGO_PKG_VERSION")), ("revision", REVISION)]);
         both.register("build", "The running program", build);
         let shared = Shared::new(&mut Families(both));
-        let (controller, bridge) = match program {
-            Program::Controller => (both, &mut unexported),
-            Program::Bridge => (&mut unexported, both),
+        let messages = Messages::new(&mut Families(both));
+        let controller = match program {
+            Program::Controller => both,
+            Program::Bridge => &mut unexported,
         };
         let leader = Arc::new(Leader::default());
         controller.register_collector(Box::new(Arc::clone(&leader)));
-        let (mut controller, mut bridge) = (Families(controller), Families(bridge));
+        let mut controller = Families(controller);
         Self {
             leader,
             shared,
             work: Work::new(&mut controller),
             submissions: Submissions::new(&mut controller),
             evalai: Evalai::new(&mut controller),
-            messages: Messages::new(&mut bridge),
+            messages,
             registry,
         }
     }

@@ -44,7 +44,7 @@ pub struct Refusal {
 
 impl Refusal {
     /// Of one submission, to a host of the challenge whose queue named it: EvalAI says that only of another challenge's.
-    pub(super) fn is_of_another_challenge(&self) -> bool {
+    pub fn is_of_another_challenge(&self) -> bool {
         self.about == About::Request && self.status == 401 && self.message.contains(NOT_AUTHORIZED)
     }
 }

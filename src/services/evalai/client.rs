@@ -113,7 +113,7 @@ impl Client {
                 let path = format!("jobs/challenge/queues/{queue}/");
                 Reply::Message(self.get(token, &path).await.of_hosts())
             }
-            Request::MessageRow(_, pk) => Reply::Row(self.row(token, *pk).await),
+            Request::MessageRow(pk) => Reply::Row(self.row(token, *pk).await),
             Request::DeleteMessage(queue, receipt) => {
                 let body = BTreeMap::from([("receipt_handle", receipt)]);
                 let path = format!("jobs/queues/{queue}/");

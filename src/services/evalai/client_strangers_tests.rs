@@ -96,7 +96,7 @@ async fn a_row_that_its_participant_has_filled_is_not_read() {
     let names = r#""a","#.repeat(1 << 19);
     let row = format!(r#"{{"id":7,"status":"running","job_name":[{names}"submission-7-1"]}}"#);
     let server = Server::answering("200 OK", "", &row).await;
-    let answer = send(&server, &Request::MessageRow("q".into(), 7)).await.answer();
+    let answer = send(&server, &Request::MessageRow(7)).await.answer();
     assert!(
         matches!(&answer, Answer::Refused(refusal) if refusal.message.contains("more than is read")),
         "{answer:?}"

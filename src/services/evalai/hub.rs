@@ -16,7 +16,8 @@ use super::client::Client;
 use super::http::{ClientError, Timeouts};
 use super::labels::Labels;
 use super::queue::{Now, Purse, Queue, Timing};
-use super::task::{Arrived, Outlets, Shared, Task, now, run};
+use super::request::{Reply, Request};
+use super::task::{Outlets, Shared, Task, now, run};
 use super::types::{
     Changed, DesiredUpdate, InboxTrouble, Key, Load, Publisher, Subject, SubmissionState, SweepRow, Target, Usage,
     WriteGuard,
@@ -34,8 +35,6 @@ pub struct Options {
     pub changed: mpsc::UnboundedSender<Changed>,
     /// Receives submissions whose message was lost.
     pub sweep: mpsc::UnboundedSender<SweepRow>,
-    /// Receives messages of the challenges' queues in EvalAI.
-    pub arrived: mpsc::UnboundedSender<Arrived>,
     pub timing: Timing,
     pub timeouts: Timeouts,
     /// Counts the requests.
@@ -53,7 +52,6 @@ impl Options {
             not_before: Instant::now(),
             changed: mpsc::unbounded_channel().0,
             sweep: mpsc::unbounded_channel().0,
-            arrived: mpsc::unbounded_channel().0,
             timing: Timing::default(),
             timeouts: Timeouts::default(),
             meter: Meter::default(),
@@ -196,7 +194,6 @@ impl Hub {
         let outlets = Outlets {
             changed: options.changed.clone(),
             sweep: options.sweep.clone(),
-            arrived: options.arrived.clone(),
         };
         Self(Arc::new(Inner {
             writes_from: wall(options.not_before),
@@ -312,6 +309,12 @@ impl Hub {
         let shared = self.place(leaderboard)?;
         let queue = shared.queue();
         queue.silence().map(|(since, why)| (since, why.to_owned()))
+    }
+
+    /// Makes a request about the queue of a Leaderboard's challenge, within a third of its token's; none if that is not served any more.
+    pub async fn pass(&self, leaderboard: &Key, request: Request) -> Option<Reply> {
+        let answer = self.place(leaderboard)?.pass(request);
+        answer.await.ok()
     }
 
     /// Why the queue of a Leaderboard's challenge is not read; none while it is, or need not be.

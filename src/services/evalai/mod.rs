@@ -29,8 +29,7 @@ pub use labels::{Labels, Misfit};
 pub use queue::Timing;
 pub use row::Row;
 pub use status::{Outcome, Progress, Status};
-pub use task::Arrived;
 pub use types::{
-    Arrival, Changed, DesiredUpdate, Ended, ImageAnswer, InboxTrouble, Key, Origin, Payload, Publisher, Run, Settled,
-    Subject, SubmissionState, SweepRow, Swept, Target, Usage, WriteGuard,
+    Changed, DesiredUpdate, Ended, ImageAnswer, InboxTrouble, Key, Payload, Publisher, Run, Subject, SubmissionState,
+    SweepRow, Swept, Target, Usage, WriteGuard,
 };

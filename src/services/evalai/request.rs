@@ -65,7 +65,7 @@ pub enum Request {
     /// One message of a challenge's queue, by the queue's name.
     Receive(String),
     /// The row of a message's submission.
-    MessageRow(String, i64),
+    MessageRow(i64),
     /// Deletes a message, by what was received with it.
     DeleteMessage(String, String),
 }
@@ -94,7 +94,7 @@ impl Request {
             | Self::Splits(_)
             | Self::DatasetSplit(..)
             | Self::Receive(_)
-            | Self::MessageRow(..)
+            | Self::MessageRow(_)
             | Self::DeleteMessage(..) => None,
         }
     }
@@ -119,7 +119,7 @@ impl Request {
             Self::Splits(_) => "get_splits",
             Self::DatasetSplit(..) => "get_dataset_split",
             Self::Receive(_) => "receive_message",
-            Self::MessageRow(..) => "get_message_row",
+            Self::MessageRow(_) => "get_message_row",
             Self::DeleteMessage(..) => "delete_message",
         }
     }
@@ -142,7 +142,7 @@ impl Request {
             Self::Splits(_) => "splits",
             Self::DatasetSplit(..) => "dataset split",
             Self::Receive(_) => "message",
-            Self::MessageRow(..) => "row of a message",
+            Self::MessageRow(_) => "row of a message",
             Self::DeleteMessage(..) => "deletion of a message",
         }
     }

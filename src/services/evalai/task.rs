@@ -2,19 +2,20 @@
 //!
 //! Started by `hub`, one for each server, namespace and token. Holds the queue's lock only for moments, never while it waits.
 
+use std::collections::HashMap;
 use std::sync::{Arc, Mutex, MutexGuard};
 use std::time::Duration;
 
 use futures::stream::{FuturesUnordered, StreamExt};
 use jiff::Timestamp;
-use tokio::sync::{Notify, mpsc, watch};
+use tokio::sync::{Notify, mpsc, oneshot, watch};
 use tokio::time::Instant;
 
 use super::answer::{Answer, Silence};
 use super::client::Client;
 use super::queue::{Next, Now, Queue, Ticket};
-use super::request::Reply;
-use super::types::{Arrival, Changed, Settled, SweepRow, WriteGuard};
+use super::request::{Reply, Request};
+use super::types::{Changed, SweepRow, WriteGuard};
 use crate::lock::lock;
 use crate::services::token::Token;
 
@@ -29,6 +30,8 @@ pub(super) struct Shared {
     pub notify: Notify,
     /// The queue's time counts from here.
     start: Instant,
+    /// Who waits for the answers to requests that the queue makes for others, by their number.
+    waiters: Mutex<HashMap<u64, oneshot::Sender<Reply>>>,
 }
 
 /// Where changes go.
@@ -36,25 +39,6 @@ pub(super) struct Shared {
 pub(super) struct Outlets {
     pub changed: mpsc::UnboundedSender<Changed>,
     pub sweep: mpsc::UnboundedSender<SweepRow>,
-    pub arrived: mpsc::UnboundedSender<Arrived>,
-}
-
-/// A message of a challenge's queue that is to be taken in. One that is dropped without [`Arrived::settle`] comes back.
-pub struct Arrived {
-    pub arrival: Arrival,
-    serial: u64,
-    shared: Arc<Shared>,
-}
-
-impl Arrived {
-    /// Hands back what becomes of it.
-    pub fn settle(self, settled: Settled) {
-        let shared = &self.shared;
-        shared
-            .queue()
-            .settle_message(&self.arrival.queue, self.serial, settled, shared.now());
-        shared.notify.notify_one();
-    }
 }
 
 impl Shared {
@@ -64,7 +48,20 @@ impl Shared {
             token,
             notify: Notify::new(),
             start,
+            waiters: Mutex::default(),
         }
+    }
+
+    /// Makes a request for another. No answer comes if the task ends before.
+    pub fn pass(&self, request: Request) -> oneshot::Receiver<Reply> {
+        let (waiter, answer) = oneshot::channel();
+        let mut waiters = lock(&self.waiters);
+        let number = self.queue().pass(request, self.now());
+        waiters.retain(|_, waiter| !waiter.is_closed());
+        waiters.insert(number, waiter);
+        drop(waiters);
+        self.notify.notify_one();
+        answer
     }
 
     /// The moment on the queue's clock.
@@ -78,10 +75,10 @@ impl Shared {
     }
 
     /// Reports what has changed.
-    pub fn publish(self: &Arc<Self>, outlets: &Outlets) {
-        let (changes, sweep, arrivals) = {
+    pub fn publish(&self, outlets: &Outlets) {
+        let (changes, sweep, answers) = {
             let mut queue = self.queue();
-            (queue.take_changes(), queue.take_sweep(), queue.take_arrivals())
+            (queue.take_changes(), queue.take_sweep(), queue.take_answers())
         };
         // A listener that is gone has no use for it.
         for change in changes {
@@ -90,13 +87,10 @@ impl Shared {
         for row in sweep {
             let _ = outlets.sweep.send(row);
         }
-        for (serial, arrival) in arrivals {
-            let shared = self.clone();
-            let _ = outlets.arrived.send(Arrived {
-                arrival,
-                serial,
-                shared,
-            });
+        for (number, answer) in answers {
+            if let Some(waiter) = lock(&self.waiters).remove(&number) {
+                let _ = waiter.send(answer);
+            }
         }
     }
 }
@@ -159,6 +153,7 @@ pub(super) async fn run(task: Task) -> bool {
             take(&shared, &outlets, &ticket, reply);
         }
     };
+    lock(&shared.waiters).clear();
     let all = tokio::time::timeout(DRAIN, answers).await.is_ok();
     all && !shared.queue().is_unsure(shared.now())
 }
@@ -177,7 +172,7 @@ async fn send(shared: &Shared, client: &Client, guard: &dyn WriteGuard, ticket: 
     (ticket, Some(reply))
 }
 
-fn take(shared: &Arc<Shared>, outlets: &Outlets, ticket: &Ticket, reply: Option<Reply>) {
+fn take(shared: &Shared, outlets: &Outlets, ticket: &Ticket, reply: Option<Reply>) {
     match reply {
         Some(reply) => shared.queue().answered(ticket, reply, shared.now()),
         None => shared.queue().not_sent(ticket),

@@ -255,41 +255,6 @@ pub struct SweepRow {
     pub time: Timestamp,
 }
 
-/// A message of a challenge's queue in EvalAI, which shows neither when it was sent nor an id of it.
-#[derive(Clone, Debug, PartialEq, Eq)]
-pub struct Arrival {
-    /// Root of the server, as in [`Target::api_server`].
-    pub server: String,
-    /// Name of the queue.
-    pub queue: String,
-    /// Its text.
-    pub body: String,
-    /// What EvalAI shows of its submission.
-    pub origin: Origin,
-}
-
-/// What EvalAI shows of a message's submission.
-#[derive(Clone, Copy, Debug, PartialEq, Eq)]
-pub enum Origin {
-    /// When its row asked to be run: its re-run or resume, else its submission.
-    Wanted(Timestamp),
-    /// It does not exist.
-    Missing,
-    /// This token may not read it, though its user reads the queue as a host of the challenge: its row is another challenge's by now.
-    Foreign,
-    /// Nothing that helps: the message names none, or EvalAI refuses to show it for another reason.
-    Hidden,
-}
-
-/// What becomes of a message.
-#[derive(Clone, Copy, Debug, PartialEq, Eq)]
-pub enum Settled {
-    /// It is deleted.
-    Delete,
-    /// It stays, and comes back.
-    Leave,
-}
-
 /// Why a challenge's queue in EvalAI is not read.
 #[derive(Clone, Debug, PartialEq, Eq)]
 pub struct InboxTrouble {

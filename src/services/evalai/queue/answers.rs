@@ -34,12 +34,12 @@ impl Queue {
             self.note(&answer, &now);
             self.note_silence(&answer, &now);
         }
+        if let Some(number) = ticket.number {
+            return self.passed(number, ticket, reply, &now);
+        }
         match (&ticket.request, reply) {
             (Request::Get(subject), Reply::Row(answer)) => self.took_row(subject, ticket.requested, answer, &now),
             (Request::Image(subject, _), Reply::Image(answer)) => self.took_image(subject, answer, &now),
-            (Request::Receive(queue) | Request::MessageRow(queue, _) | Request::DeleteMessage(queue, _), reply) => {
-                self.took_of_inbox(queue, reply, &now);
-            }
             (request, Reply::Written(answer)) => self.wrote(request, answer, &now),
             (request, reply) => self.took_of_challenge(request, ticket.requested, reply, &now),
         }

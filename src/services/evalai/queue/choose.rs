@@ -73,7 +73,8 @@ enum What<'a> {
     Sub(&'a Key, Step),
     List(i64, Purpose),
     Check(i64),
-    Inbox(&'a str),
+    /// What others wait for.
+    Passing,
 }
 
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
@@ -109,6 +110,7 @@ impl Queue {
             let waits = later.iter().map(|offer| offer.ready).chain(affordable);
             return Next::Wait(waits.chain(again).chain(opens).min());
         };
+        let mut number = None;
         let started = match best.what {
             What::Sub(key, step) => {
                 let key = key.clone();
@@ -116,10 +118,10 @@ impl Queue {
             }
             What::List(id, purpose) => self.start_list(id, purpose).map(|list| (list, None)),
             What::Check(id) => self.start_check(id).map(|check| (check, None)),
-            What::Inbox(name) => {
-                let name = name.to_owned();
-                self.inboxes.start(&name, now.at).map(|request| (request, None))
-            }
+            What::Passing => self.passing.start(now.at).map(|(started, other)| {
+                number = Some(started);
+                (other, None)
+            }),
         };
         let Some((request, leave_by)) = started else {
             return Next::Wait(Some(now.at + RECHECK));
@@ -131,6 +133,7 @@ impl Queue {
             request,
             requested: now.at,
             leave_by,
+            number,
         })
     }
 
@@ -168,11 +171,11 @@ impl Queue {
             offers.extend(self.offers_of_challenge(*id, challenge, now));
         }
         // Only a leader makes objects of messages.
-        let inboxes = self.inboxes.offers(now.at).filter(|_| may_write);
-        offers.extend(inboxes.map(|(name, due)| Offer {
-            rank: rank(question(due, now), 0, None, due),
-            ready: due,
-            what: What::Inbox(name),
+        let passing = self.passing.next(now.at).filter(|_| may_write);
+        offers.extend(passing.map(|(since, ready)| Offer {
+            rank: rank(question(since, now), 0, None, since),
+            ready,
+            what: What::Passing,
         }));
         offers
     }

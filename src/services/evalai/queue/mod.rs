@@ -11,8 +11,8 @@
 
 mod answers;
 mod choose;
-mod inbox;
 mod lists;
+mod passing;
 mod poll;
 mod purse;
 mod silence;
@@ -28,7 +28,7 @@ use std::time::Duration;
 
 use jiff::{SignedDuration, Timestamp};
 
-use self::inbox::Inboxes;
+use self::passing::Passing;
 use self::poll::{Challenge, Poll};
 pub use self::purse::{Purse, Share};
 use self::silence::Silent;
@@ -108,6 +108,8 @@ pub struct Ticket {
     pub requested: Duration,
     /// A write that is not sent by then is not sent: its read is too old.
     pub leave_by: Option<Duration>,
+    /// Number of a request that another waits for.
+    pub number: Option<u64>,
 }
 
 /// A submission's place on the wire, kept while its object comes and goes.
@@ -150,7 +152,7 @@ pub struct Queue {
     silent: Option<Silent>,
     changes: BTreeSet<Changed>,
     sweep: Vec<SweepRow>,
-    inboxes: Inboxes,
+    passing: Passing,
 }
 
 impl Queue {
@@ -171,7 +173,7 @@ impl Queue {
             silent: None,
             changes: BTreeSet::new(),
             sweep: Vec::new(),
-            inboxes: Inboxes::new(requests_per_minute, now.at),
+            passing: Passing::new(requests_per_minute, now.at),
         }
     }
 
@@ -438,7 +440,8 @@ impl Queue {
             challenge.sweep = of().map(|target| target.sweep).min().zip(since);
             challenge.check.wanted = of().flat_map(|target| target.phases.iter().copied()).collect();
         }
-        self.arrange_inboxes(&now);
+        let limit = self.share.budget(|budget| budget.limit());
+        self.passing.set_limit(limit, now.at);
     }
 }
 

@@ -3,10 +3,10 @@
 mod bursts;
 mod cancels;
 mod faults;
-mod inbox;
 mod life;
 mod order;
 mod outage;
+mod passing;
 mod simulation;
 
 use jiff::SignedDuration;
