@@ -20,7 +20,7 @@ use super::run::console;
 use super::tree::{Tree, TreeError};
 use super::upload::Memory;
 use crate::backoff::Backoff;
-use crate::services::logs::{BETWEEN_BATCHES, LogClient, LogEvent, LogsError, OVERHEAD, cut};
+use crate::services::logs::{BETWEEN_BATCHES, LogClient, LogEvent, LogsError, Miss, OVERHEAD, cut};
 use leaderboard_api::RunId;
 use leaderboard_runner::protocol::Pair;
 
@@ -265,18 +265,19 @@ impl Shipper {
             self.made.insert(stream.to_owned());
         }
         let result = self.client.put(stream, events).await;
-        if !matches!(result, Err(LogsError::Refused { .. } | LogsError::Throttled { .. })) {
+        let miss = result.as_ref().err().map(|error| error.miss);
+        if miss.is_none_or(|miss| miss == Miss::Unanswered) {
             let cost = Spent {
                 requests: 1,
                 bytes: billed(events),
             };
             self.note.sent.add(stream, cost);
         }
-        match &result {
-            Err(LogsError::Refused { missing: true, .. }) => {
+        match miss {
+            Some(Miss::NoStream) => {
                 self.made.remove(stream);
             }
-            Err(LogsError::Unanswered { .. }) => {
+            Some(Miss::Unanswered) => {
                 self.doubt = Some(Doubt {
                     path: path.to_owned(),
                     last: last.clone(),
@@ -296,7 +297,7 @@ impl Shipper {
         let stream = self.streams.get(&doubt.path).cloned().unwrap_or_default();
         let arrived = match self.client.last(&stream).await {
             Ok(last) => last.as_ref() == Some(&doubt.last),
-            Err(LogsError::Refused { missing: true, .. }) => false,
+            Err(error) if error.miss == Miss::NoStream => false,
             Err(error) => return Err(error),
         };
         if arrived {

@@ -36,47 +36,43 @@ pub struct LogEvent {
     pub text: String,
 }
 
-/// What CloudWatch did not take.
+/// A request that CloudWatch did not carry out.
 #[derive(thiserror::Error, Debug)]
-pub enum LogsError {
-    /// It refused them.
-    #[error("{op} {group}/{stream} in CloudWatch Logs: {why}. {HINT}")]
-    Refused {
-        /// What was done.
-        op: &'static str,
-        /// The group.
-        group: String,
-        /// The stream.
-        stream: String,
-        /// Its message.
-        why: String,
-        /// Whether the stream does not exist.
-        missing: bool,
-    },
+#[error("{op} {group}/{stream} in CloudWatch Logs: {}", .miss.after(.why))]
+pub struct LogsError {
+    /// What was done.
+    op: &'static str,
+    /// The group.
+    group: String,
+    /// The stream.
+    stream: String,
+    /// Its message, or the client's.
+    why: String,
+    /// What that means for the events.
+    pub miss: Miss,
+}
+
+/// What a failed request means for its events.
+#[derive(Clone, Copy, Debug, PartialEq, Eq)]
+pub enum Miss {
+    /// They are refused.
+    Refused,
+    /// The stream does not exist.
+    NoStream,
     /// It takes no more requests for now: nothing of this one is stored.
-    #[error("{op} {group}/{stream} in CloudWatch Logs: too many requests ({why}). It is tried again.")]
-    Throttled {
-        /// What was done.
-        op: &'static str,
-        /// The group.
-        group: String,
-        /// The stream.
-        stream: String,
-        /// Its message.
-        why: String,
-    },
-    /// It did not answer: the events may be there or not.
-    #[error("{op} {group}/{stream} in CloudWatch Logs: no answer ({why}). {HINT}")]
-    Unanswered {
-        /// What was done.
-        op: &'static str,
-        /// The group.
-        group: String,
-        /// The stream.
-        stream: String,
-        /// The client's message.
-        why: String,
-    },
+    Throttled,
+    /// No answer came: they may be there or not.
+    Unanswered,
+}
+
+impl Miss {
+    fn after(self, why: &str) -> String {
+        match self {
+            Self::Refused | Self::NoStream => format!("{why}. {HINT}"),
+            Self::Throttled => format!("too many requests ({why}). It is tried again."),
+            Self::Unanswered => format!("no answer ({why}). {HINT}"),
+        }
+    }
 }
 
 const HINT: &str = "Check that logGroup of the leaderboard exists (the controller makes it where logGroup.retentionDays \
@@ -86,7 +82,7 @@ const HINT: &str = "Check that logGroup of the leaderboard exists (the controlle
 impl LogsError {
     /// Whether the same request may succeed in a moment.
     pub fn is_transient(&self) -> bool {
-        !matches!(self, Self::Refused { .. })
+        matches!(self.miss, Miss::Throttled | Miss::Unanswered)
     }
 }
 
@@ -121,7 +117,7 @@ impl LogClient {
                     .build()
             })
             .collect();
-        let built = built.map_err(|error| self.refused(OP, stream, error.to_string(), false))?;
+        let built = built.map_err(|error| self.error(OP, stream, error.to_string(), Miss::Refused))?;
         let request = self.client.put_log_events().log_group_name(&self.group);
         let request = request.log_stream_name(stream).set_log_events(Some(built));
         let answer = request.send().await.map_err(|error| self.failed(OP, stream, &error))?;
@@ -164,49 +160,23 @@ impl LogClient {
         E: ProvideErrorMetadata + std::error::Error + 'static,
     {
         let answered = error.raw_response().is_some_and(|raw| raw.status().as_u16() < 500);
-        let why = match (error.code(), error.message()) {
-            (Some(code), Some(message)) => format!("{code}: {message}"),
-            (Some(code), None) => code.to_owned(),
-            (None, _) => short(error).to_owned(),
+        let miss = match error.code() {
+            _ if fault::of(error) == Fault::Throttled => Miss::Throttled,
+            Some("ResourceNotFoundException") if answered => Miss::NoStream,
+            _ if answered => Miss::Refused,
+            _ => Miss::Unanswered,
         };
-        if fault::of(error) == Fault::Throttled {
-            return LogsError::Throttled {
-                op,
-                group: self.group.clone(),
-                stream: stream.to_owned(),
-                why,
-            };
-        }
-        if answered {
-            let missing = error.code() == Some("ResourceNotFoundException");
-            return self.refused(op, stream, why, missing);
-        }
-        LogsError::Unanswered {
+        self.error(op, stream, fault::sentence(error), miss)
+    }
+
+    fn error(&self, op: &'static str, stream: &str, why: String, miss: Miss) -> LogsError {
+        LogsError {
             op,
             group: self.group.clone(),
             stream: stream.to_owned(),
             why,
+            miss,
         }
-    }
-
-    fn refused(&self, op: &'static str, stream: &str, why: String, missing: bool) -> LogsError {
-        LogsError::Refused {
-            op,
-            group: self.group.clone(),
-            stream: stream.to_owned(),
-            why,
-            missing,
-        }
-    }
-}
-
-fn short<E, R>(error: &SdkError<E, R>) -> &'static str {
-    match error {
-        SdkError::TimeoutError(_) => "it took too long",
-        SdkError::DispatchFailure(_) => "no connection, or no credentials",
-        SdkError::ConstructionFailure(_) => "the request could not be made",
-        SdkError::ResponseError(_) => "the answer could not be read",
-        _ => "an answer without a reason",
     }
 }
 

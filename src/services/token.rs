@@ -12,6 +12,7 @@ use serde_json::{Map, Value};
 use sha2::{Digest, Sha256};
 
 use super::aws::Aws;
+use super::fault;
 
 /// How long before its end a token's renewal is asked for.
 const WARN_BEFORE: SignedDuration = SignedDuration::from_hours(30 * 24);
@@ -102,23 +103,8 @@ impl fmt::Debug for TokenSource {
 async fn secret_text(aws: &Aws, id: &str, region: Option<&str>, endpoint: Option<&str>) -> Result<String, String> {
     let request = aws.secrets(region, endpoint).get_secret_value().secret_id(id).send();
     let answer = aws.meter().aws("secretsmanager", "GetSecretValue", request).await;
-    let answer = answer.map_err(|error| reason(&error))?;
+    let answer = answer.map_err(|error| fault::sentence(&error))?;
     Ok(answer.secret_string().unwrap_or_default().to_owned())
-}
-
-/// The service's own message where it gave one: its answers hold no secret, unlike a `Debug` of the whole.
-fn reason<R>(
-    error: &aws_sdk_secretsmanager::error::SdkError<
-        aws_sdk_secretsmanager::operation::get_secret_value::GetSecretValueError,
-        R,
-    >,
-) -> String {
-    use aws_sdk_secretsmanager::error::ProvideErrorMetadata;
-    match (error.code(), error.message()) {
-        (Some(code), Some(message)) => format!("{code}: {message}"),
-        (Some(code), None) => code.to_owned(),
-        _ => error.to_string(),
-    }
 }
 
 /// The text under a key of the entry's JSON object.

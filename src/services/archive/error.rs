@@ -1,8 +1,7 @@
 //! What goes wrong with S3, in words for the person who runs the bucket.
 
-use std::error::Error as _;
-
 use aws_sdk_s3::error::{ProvideErrorMetadata, SdkError};
+use leaderboard_api::client_errors;
 
 use super::parts::PartsError;
 
@@ -125,12 +124,7 @@ impl Cause {
     where
         E: std::error::Error + 'static,
     {
-        let mut text = error.to_string();
-        let mut source = error.source();
-        while let Some(inner) = source {
-            text = format!("{text}: {inner}");
-            source = inner.source();
-        }
+        let text = client_errors::chain(error);
         if text.contains("credentials") {
             Self::Denied(text)
         } else {
