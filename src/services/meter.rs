@@ -1,12 +1,11 @@
 //! Counts what is asked of the services around the cluster: which service, what, with which outcome, how long it took.
 //!
-//! Every client here reports its calls to one; what becomes of them is up to the process. All labels are fixed, so that neither a secret
-//! nor the name of an object can get into a metric.
+//! Every client here reports its calls to one. All labels are fixed, so that neither a secret nor the name of an object can get into a
+//! metric.
 
-use std::fmt;
 use std::future::Future;
 use std::sync::Arc;
-use std::time::{Duration, Instant};
+use std::time::Instant;
 
 use aws_sdk_sqs::config::http::HttpResponse;
 use aws_sdk_sqs::error::{ProvideErrorMetadata, SdkError};
@@ -14,60 +13,14 @@ use aws_sdk_sqs::error::{ProvideErrorMetadata, SdkError};
 use super::fault;
 use crate::observability::metrics::Metrics;
 
-/// A call that is over.
-#[derive(Clone, Copy, Debug, PartialEq, Eq)]
-pub struct Call {
-    /// `evalai`, `s3`, `dynamodb` and so on.
-    pub service: &'static str,
-    /// What was asked, as the service calls it.
-    pub op: &'static str,
-    /// `ok`, the kind of a failure, or `abandoned`.
-    pub outcome: &'static str,
-    /// From the first byte sent, retries included.
-    pub took: Duration,
-}
-
-type Listener = dyn Fn(&Call) + Send + Sync;
-
-/// A listener to calls. Clones have the same one; the default has none.
-#[derive(Clone, Default)]
-pub struct Meter(Option<Arc<Listener>>);
-
-impl fmt::Debug for Meter {
-    fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
-        f.write_str(if self.0.is_some() { "Meter(…)" } else { "Meter" })
-    }
-}
+/// The metrics that calls are counted in. Clones have the same; the default has none.
+#[derive(Clone, Debug, Default)]
+pub struct Meter(Option<Arc<Metrics>>);
 
 impl Meter {
-    /// Reports every call to `listener`.
-    pub fn new(listener: impl Fn(&Call) + Send + Sync + 'static) -> Self {
-        Self(Some(Arc::new(listener)))
-    }
-
     /// Counts every call in the metrics of the process.
     pub fn for_metrics(metrics: &Arc<Metrics>) -> Self {
-        let metrics = Arc::clone(metrics);
-        Self::new(
-            move |Call {
-                      service,
-                      op,
-                      outcome,
-                      took,
-                  }| {
-                let (evalai, shared) = (&metrics.evalai, &metrics.shared);
-                if *service == "evalai" {
-                    evalai.requests.of([*op, outcome]).inc();
-                    evalai.duration.of([*op]).observe(took.as_secs_f64());
-                } else {
-                    shared.cloud_calls.of([*service, op, outcome]).inc();
-                    shared
-                        .cloud_call_duration
-                        .of([*service, op])
-                        .observe(took.as_secs_f64());
-                }
-            },
-        )
+        Self(Some(Arc::clone(metrics)))
     }
 
     /// A call begins. One that is dropped without an end, by a limit of time or a stop, was abandoned.
@@ -133,31 +86,36 @@ impl Running {
 
 impl Drop for Running {
     fn drop(&mut self) {
-        let Some(listener) = &self.meter.0 else { return };
-        listener(&Call {
-            service: self.service,
-            op: self.op,
-            outcome: self.outcome,
-            took: self.began.elapsed(),
-        });
+        let Some(metrics) = &self.meter.0 else { return };
+        let (service, op, took) = (self.service, self.op, self.began.elapsed().as_secs_f64());
+        if service == "evalai" {
+            metrics.evalai.requests.of([op, self.outcome]).inc();
+            metrics.evalai.duration.of([op]).observe(took);
+        } else {
+            metrics.shared.cloud_calls.of([service, op, self.outcome]).inc();
+            metrics.shared.cloud_call_duration.of([service, op]).observe(took);
+        }
     }
 }
 
 #[cfg(test)]
 mod tests {
-    use std::sync::Mutex;
-
     use super::*;
+    use crate::observability::metrics::Program;
 
     #[test]
-    fn every_call_is_reported_once_also_one_that_was_abandoned() {
-        let reported = Arc::new(Mutex::new(Vec::new()));
-        let listener = Arc::clone(&reported);
-        let meter = Meter::new(move |call| listener.lock().unwrap().push((call.service, call.op, call.outcome)));
+    fn every_call_is_counted_once_also_one_that_was_abandoned() {
+        let metrics = Arc::new(Metrics::new(Program::Controller));
+        let meter = Meter::for_metrics(&metrics);
         meter.begin("s3", "GetObject").end("ok");
         drop(meter.clone().begin("evalai", "get_submission"));
         Meter::default().begin("s3", "GetObject").end("ok");
-        let all = [("s3", "GetObject", "ok"), ("evalai", "get_submission", "abandoned")];
-        assert_eq!(*reported.lock().unwrap(), all);
+        let text = metrics.text().unwrap();
+        for line in [
+            "leaderboard_cloud_calls_total{service=\"s3\",op=\"GetObject\",outcome=\"ok\"} 1",
+            "leaderboard_evalai_requests_total{op=\"get_submission\",outcome=\"abandoned\"} 1",
+        ] {
+            assert!(text.lines().any(|found| found == line), "{line} is missing in\n{text}");
+        }
     }
 }
