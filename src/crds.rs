@@ -11,25 +11,17 @@ use leaderboard_api::{Leaderboard, Submission};
 
 const HEADER: &str = "# Generated from crates/api by `make crds`.\n";
 
-/// Why the definitions could not be printed or written.
+/// A definition that is none, or cannot be printed; a mistake in `crates/api`.
 #[derive(thiserror::Error, Debug)]
-pub enum CrdError {
-    /// A definition that is not JSON, or not a definition any more; a mistake in `crates/api`.
-    #[error("the definition of {kind} cannot be built: {source}")]
-    Build {
-        /// Kind of the definition.
-        kind: &'static str,
-        /// What serde reports.
-        source: serde_json::Error,
-    },
-    /// A definition that is not YAML; a mistake in `crates/api`.
-    #[error("the definition of {kind} cannot be printed: {source}")]
-    Print {
-        /// Kind of the definition.
-        kind: &'static str,
-        /// What the printer reports.
-        source: serde_saphyr::ser::Error,
-    },
+#[error("the definition of {kind} cannot be made: {why}")]
+pub struct CrdError {
+    kind: &'static str,
+    why: String,
+}
+
+fn failed(kind: &'static str, why: &impl ToString) -> CrdError {
+    let why = why.to_string();
+    CrdError { kind, why }
 }
 
 /// One definition and the file it lies in.
@@ -44,10 +36,7 @@ pub struct Definition {
 impl Definition {
     /// As the API server takes it.
     pub fn object(&self) -> Result<CustomResourceDefinition, CrdError> {
-        serde_json::from_value(self.value.clone()).map_err(|source| CrdError::Build {
-            kind: self.kind,
-            source,
-        })
+        serde_json::from_value(self.value.clone()).map_err(|error| failed(self.kind, &error))
     }
 
     /// As JSON.
@@ -57,10 +46,7 @@ impl Definition {
 
     /// The text of its file.
     pub fn yaml(&self) -> Result<String, CrdError> {
-        let text = serde_saphyr::to_string(&self.value).map_err(|source| CrdError::Print {
-            kind: self.kind,
-            source,
-        })?;
+        let text = serde_saphyr::to_string(&self.value).map_err(|error| failed(self.kind, &error))?;
         Ok(format!("{HEADER}{text}"))
     }
 }
@@ -85,62 +71,55 @@ fn definition(
     file: &'static str,
     derived: &CustomResourceDefinition,
 ) -> Result<Definition, CrdError> {
-    let mut value = serde_json::to_value(derived).map_err(|source| CrdError::Build { kind, source })?;
-    whole_numbers(&mut value);
-    whole_lists(&mut value);
+    let mut value = serde_json::to_value(derived).map_err(|error| failed(kind, &error))?;
+    each(&mut value, &|value: &mut Value| {
+        whole_number(value);
+        whole_list(value);
+    });
     if let Some(versions) = value.pointer_mut("/spec/versions").and_then(Value::as_array_mut) {
         for status in versions
             .iter_mut()
             .filter_map(|version| version.pointer_mut("/schema/openAPIV3Schema/properties/status"))
         {
-            without_rules(status);
+            each(status, &without_rules);
         }
     }
     Ok(Definition { kind, file, value })
 }
 
+/// Changes a value, then all that is in it.
+fn each(value: &mut Value, change: &impl Fn(&mut Value)) {
+    change(value);
+    match value {
+        Value::Array(list) => list.iter_mut().for_each(|inner| each(inner, change)),
+        Value::Object(object) => object.values_mut().for_each(|inner| each(inner, change)),
+        _ => {}
+    }
+}
+
 /// The status is the operator's own: a rule there could only keep it from telling what it saw.
 fn without_rules(value: &mut Value) {
-    match value {
-        Value::Array(list) => list.iter_mut().for_each(without_rules),
-        Value::Object(object) => {
-            object.remove("x-kubernetes-validations");
-            object.values_mut().for_each(without_rules);
-        }
-        _ => {}
+    if let Some(object) = value.as_object_mut() {
+        object.remove("x-kubernetes-validations");
     }
 }
 
 /// Lists without a key are replaced as a whole by who applies them. The types show which ones have a key.
-fn whole_lists(value: &mut Value) {
-    match value {
-        Value::Array(list) => list.iter_mut().for_each(whole_lists),
-        Value::Object(object) => {
-            if object.get("type").is_some_and(|type_| type_ == "array") {
-                object
-                    .entry("x-kubernetes-list-type")
-                    .or_insert_with(|| "atomic".into());
-            }
-            object.values_mut().for_each(whole_lists);
-        }
-        _ => {}
+fn whole_list(value: &mut Value) {
+    if value["type"] == "array" && value["x-kubernetes-list-type"].is_null() {
+        value["x-kubernetes-list-type"] = "atomic".into();
     }
 }
 
 /// Writes `1.0` as `1`: bounds are kept as floating-point numbers, but people read them.
-fn whole_numbers(value: &mut Value) {
-    match value {
-        Value::Number(number) if number.is_f64() => {
-            let whole = number.as_f64().map(|float| format!("{float:.0}"));
-            let whole: Option<i64> = whole.and_then(|text| text.parse().ok());
-            #[allow(clippy::cast_precision_loss, reason = "compared with the number it came from")]
-            if let Some(whole) = whole.filter(|whole| number.as_f64() == Some(*whole as f64)) {
-                *value = whole.into();
-            }
-        }
-        Value::Array(list) => list.iter_mut().for_each(whole_numbers),
-        Value::Object(object) => object.values_mut().for_each(whole_numbers),
-        _ => {}
+fn whole_number(value: &mut Value) {
+    let Some(float) = value.as_f64().filter(|_| value.is_f64()) else {
+        return;
+    };
+    let whole: Option<i64> = format!("{float:.0}").parse().ok();
+    #[allow(clippy::cast_precision_loss, reason = "compared with the number it came from")]
+    if let Some(whole) = whole.filter(|whole| value.as_f64() == Some(*whole as f64)) {
+        *value = whole.into();
     }
 }
 
@@ -243,7 +222,7 @@ mod tests {
     #[test]
     fn whole_numbers_lose_their_point_and_others_keep_it() {
         let mut value = serde_json::json!({"a": [1.0, -3.0, 0.5], "b": {"c": 1e30, "d": 7, "e": "1.0"}});
-        whole_numbers(&mut value);
+        each(&mut value, &whole_number);
         assert_eq!(
             value,
             serde_json::json!({"a": [1, -3, 0.5], "b": {"c": 1e30, "d": 7, "e": "1.0"}})

@@ -2,10 +2,8 @@
 
 use std::fs::{self, File};
 use std::io::{ErrorKind, Read as _, Write as _};
-use std::panic::resume_unwind;
 use std::path::{Path, PathBuf};
 use std::process::ExitCode;
-use std::thread;
 
 use clap::{Args, ValueEnum};
 use leaderboard_results::{Files, Format, Merged, PairProgress, Plan, Refusal, Slice, Verify, offline};
@@ -281,17 +279,10 @@ fn write_all(out: &Path, merged: &str, files: &Files) -> Result<(), Failure> {
     ];
     texts.extend(files.metadata_json.as_deref().map(|text| ("metadata.json", text)));
     let places: Vec<OutputFile> = texts.iter().map(|(name, _)| OutputFile::of(out, name)).collect();
-    // Side by side, as each waits for the disk.
-    let staged = thread::scope(|scope| {
-        let mut writers = Vec::with_capacity(places.len());
-        for (place, (_, text)) in places.iter().zip(&texts) {
-            writers.push(scope.spawn(move || place.stage(text)));
-        }
-        let ended = writers
-            .into_iter()
-            .map(|writer| writer.join().unwrap_or_else(|panic| resume_unwind(panic)));
-        ended.fold(Ok(()), Result::and)
-    });
+    let staged = places
+        .iter()
+        .zip(&texts)
+        .try_for_each(|(place, (_, text))| place.stage(text));
     let done = staged.and_then(|()| places.iter().try_for_each(OutputFile::take));
     if done.is_err() {
         for place in &places {
