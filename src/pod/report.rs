@@ -48,14 +48,8 @@ impl Owner {
         serde_json::to_vec(self).unwrap_or_default()
     }
 
-    /// Reads a stored mark; `None` for one of an unknown version, which no Pod of this version wrote. Version 0 was the bare
-    /// text.
+    /// Reads a stored mark; `None` for one of an unknown version, which no Pod of this version wrote.
     pub fn parse(bytes: &[u8]) -> Option<Self> {
-        let bytes = bytes.trim_ascii();
-        if !bytes.starts_with(b"{") {
-            let owner = std::str::from_utf8(bytes).ok()?.to_owned();
-            return Some(Self { schema: 0, owner }).filter(|owner| is_read(owner.schema, OWNER_SCHEMA));
-        }
         let owner: Self = serde_json::from_slice(bytes).ok()?;
         is_read(owner.schema, OWNER_SCHEMA).then_some(owner)
     }

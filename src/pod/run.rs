@@ -60,8 +60,7 @@ pub fn results_format(version: LeaderboardVersion) -> Format {
 #[derive(Serialize, Deserialize, Clone, Debug, PartialEq)]
 #[serde(rename_all = "camelCase")]
 pub struct Run {
-    /// [`SCHEMA`]; what had no number yet is version 0.
-    #[serde(default)]
+    /// [`SCHEMA`].
     pub schema: u32,
     /// Namespace of the Submission.
     pub namespace: String,

@@ -12,6 +12,7 @@ use axum::response::{IntoResponse, Response};
 use fastrand::Rng;
 use futures::StreamExt;
 use leaderboard_api::LeaderboardVersion;
+use leaderboard_operator::pod::report::Owner;
 use tokio::sync::watch;
 use tokio::task::JoinHandle;
 use tokio::time::timeout;
@@ -57,7 +58,7 @@ async fn answer(sink: Arc<Sink>, request: Request) -> Response {
     sink.bytes.fetch_add(size, Ordering::Relaxed);
     sink.largest.fetch_max(size, Ordering::Relaxed);
     match method {
-        Method::GET if is_owner => "pod-1".into_response(),
+        Method::GET if is_owner => Owner::new("pod-1").to_json().into_response(),
         Method::GET => (StatusCode::NOT_FOUND, NONE).into_response(),
         Method::POST if query.contains("uploadId=") => {
             sink.joined.send_modify(|joined| *joined += 1);

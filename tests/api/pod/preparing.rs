@@ -76,7 +76,10 @@ async fn somebody_elses_prefix_is_left_alone() {
 #[tokio::test]
 async fn a_fence_taken_before_the_first_pod_came_is_no_foreign_prefix() {
     let pod = Pod::new().await;
-    pod.archive.put(OWNER_KEY, b"nobody".to_vec()).await.unwrap();
+    pod.archive
+        .put(OWNER_KEY, Owner::new("nobody").to_json())
+        .await
+        .unwrap();
     let told = pod.archive.put(FAILURE_LOG_KEY, b"why it failed".to_vec()).await;
     told.unwrap();
     pod.prepare().await.unwrap();
@@ -138,7 +141,7 @@ async fn a_restarted_node_finds_its_volume_as_it_was_and_takes_no_fence_back() {
         .put("agent/agent1/agent_results.json", b"older".to_vec())
         .await
         .unwrap();
-    pod.archive.put(OWNER_KEY, b"pod-2".to_vec()).await.unwrap();
+    pod.archive.put(OWNER_KEY, Owner::new("pod-2").to_json()).await.unwrap();
     pod.prepare().await.unwrap();
     assert_eq!(
         fs::read_to_string(pod.path("agent/agent1/agent_results.json")).unwrap(),

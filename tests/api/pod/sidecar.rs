@@ -130,7 +130,7 @@ async fn a_pod_that_lost_the_fence_stores_nothing_more_and_stops_its_containers(
     pod.prepare().await.unwrap();
     let logcopy = pod.logcopy();
     pod.reported(|report| report.round >= 1).await;
-    pod.archive.put(OWNER_KEY, b"pod-2".to_vec()).await.unwrap();
+    pod.archive.put(OWNER_KEY, Owner::new("pod-2").to_json()).await.unwrap();
     pod.until_has(StatusFile::Cancel).await;
     pod.until_has(StatusFile::Stored).await;
     let before = pod.keys().await;
