@@ -12,7 +12,7 @@ use leaderboard_api::{Leaderboard, State, Submission, SubmissionStatus, conditio
 use serde::Serialize;
 
 use super::phases::{Phases, Typical, seconds, typical};
-use super::rows::{Ended, Failed, Runs, Waits, end, state};
+use super::rows::{Ended, Failed, Runs, Waits, end};
 
 /// The longest lists. A view of all of them at their longest is under half a megabyte.
 const LEADERBOARDS: usize = 50;
@@ -169,7 +169,7 @@ impl<'a> Sorted<'a> {
     fn of(submissions: &'a [Arc<Submission>]) -> Self {
         let mut sorted = Self::default();
         for submission in submissions.iter().map(Arc::as_ref) {
-            match state(submission) {
+            match submission.status.as_ref().and_then(SubmissionStatus::known_state) {
                 None | Some(State::Pending) => sorted.waiting.push(submission),
                 Some(State::Running | State::Resumed) => sorted.running.push(submission),
                 Some(state) => sorted.ended.push((submission, state)),
@@ -278,8 +278,9 @@ fn failures<'a>(ended: impl Iterator<Item = &'a Submission>, now: Timestamp) -> 
     let limit = SignedDuration::from_hours(RECENT_HOURS);
     let recent = ended.take_while(|one| end(one).is_some_and(|at| now.duration_since(at) <= limit));
     let failed: Vec<_> = recent
-        .filter(|one| state(one) == Some(State::Failed))
-        .filter_map(|one| Some((one, one.status.as_ref()?.failure.as_ref()?)))
+        .filter_map(|one| one.status.as_ref().map(|status| (one, status)))
+        .filter(|(_, status)| status.known_state() == Some(State::Failed))
+        .filter_map(|(one, status)| Some((one, status.failure.as_ref()?)))
         .collect();
     let mut counts: BTreeMap<(&'static str, &str), usize> = BTreeMap::new();
     for (_, failure) in &failed {

@@ -6,8 +6,7 @@ use jiff::Timestamp;
 use kube::ResourceExt;
 use leaderboard_api::text::{one_line, sentence};
 use leaderboard_api::{
-    Attempt, EndReason, Failure, PairState, PairStatus, State, Submission, SubmissionStatus, TeamStatus, conditions,
-    reasons,
+    Attempt, EndReason, Failure, PairState, PairStatus, State, Submission, SubmissionStatus, conditions, reasons,
 };
 use serde::Serialize;
 
@@ -101,12 +100,6 @@ pub(super) struct Failed {
     pub time: Option<i64>,
 }
 
-/// The state of a submission; none before the operator has processed it.
-pub(super) fn state(submission: &Submission) -> Option<State> {
-    let status = submission.status.as_ref()?;
-    status.attempt.map(|_| status.state_of_conditions())
-}
-
 /// When it ended.
 pub(super) fn end(submission: &Submission) -> Option<Timestamp> {
     let status = submission.status.as_ref()?;
@@ -123,7 +116,7 @@ impl Who {
             name: submission.name_any(),
             leaderboard: submission.spec.leaderboard_name.clone(),
             track: track.or(submission.spec.track.as_ref()).map(|track| name(track)),
-            team: team(submission),
+            team: submission.team_name().as_deref().map(name),
             is_check: submission.spec.check,
         }
     }
@@ -135,14 +128,6 @@ fn name(text: &str) -> String {
 
 fn message(text: &str) -> String {
     one_line(&sentence(text), MESSAGE)
-}
-
-/// Name of the team, else its id.
-fn team(submission: &Submission) -> Option<String> {
-    let given = submission.spec.team.clone().map(TeamStatus::from);
-    let accepted = submission.status.as_ref().and_then(|status| status.team.as_ref());
-    let team = accepted.or(given.as_ref())?;
-    team.name.as_deref().or(team.id.as_deref()).map(name)
 }
 
 /// What the status shows, or nothing before there is one.
@@ -240,13 +225,8 @@ impl Ended {
 
 /// The systems that have not got the end yet, and need it.
 fn open(status: &SubmissionStatus) -> Vec<&'static str> {
-    let systems = [
-        (conditions::ARCHIVED, "S3"),
-        (conditions::PUBLISHED, "EvalAI"),
-        (conditions::RECORDED, "DynamoDB"),
-    ];
     let is_open = |type_: &str| status.condition(type_).is_some() && !status.is_delivered(type_);
-    let open = systems.into_iter().filter(|(type_, _)| is_open(type_));
+    let open = conditions::SYSTEMS.into_iter().filter(|(type_, _)| is_open(type_));
     open.map(|(_, system)| system).collect()
 }
 

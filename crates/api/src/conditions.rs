@@ -36,6 +36,9 @@ pub const ISOLATED: &str = "Isolated";
 /// A Leaderboard that is being deleted waits for its submissions.
 pub const TERMINATING: &str = "Terminating";
 
+/// The other systems that get an end, as people call them, each with its condition.
+pub const SYSTEMS: [(&str, &str); 3] = [(ARCHIVED, "S3"), (PUBLISHED, "EvalAI"), (RECORDED, "DynamoDB")];
+
 /// Characters of a condition's message, which may hold a stranger's text.
 pub const MAX_MESSAGE: usize = 32_768;
 

@@ -39,6 +39,11 @@ impl SubmissionStatus {
         self.attempt.is_some_and(|present| attempt > present) && self.state_of_conditions() != State::Finished
     }
 
+    /// The state; none before the operator has processed the submission.
+    pub fn known_state(&self) -> Option<State> {
+        self.attempt.map(|_| self.state_of_conditions())
+    }
+
     /// The state that the conditions show.
     pub fn state_of_conditions(&self) -> State {
         let running = self.condition(RUNNING);

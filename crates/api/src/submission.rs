@@ -8,7 +8,7 @@ use serde::{Deserialize, Serialize};
 
 use super::attempt::Attempt;
 use super::submission_status::SubmissionStatus;
-use super::team::Team;
+use super::team::{Team, TeamStatus};
 
 /// One participant's image on one track of a Leaderboard.
 #[derive(CustomResource, KubeSchema, Serialize, Deserialize, Clone, Debug, PartialEq)]
@@ -102,6 +102,14 @@ impl Submission {
         let accepted = accepted.and_then(|team| team.id.as_deref().or(team.name.as_deref()));
         let given = self.spec.team.as_ref();
         accepted.or_else(|| given.and_then(|team| team.id.as_deref().or(team.name.as_deref())))
+    }
+
+    /// Name of the team, else its id.
+    pub fn team_name(&self) -> Option<String> {
+        let given = self.spec.team.clone().map(TeamStatus::from);
+        let accepted = self.status.as_ref().and_then(|status| status.team.as_ref());
+        let team = accepted.or(given.as_ref())?;
+        team.name.clone().or_else(|| team.id.clone())
     }
 }
 

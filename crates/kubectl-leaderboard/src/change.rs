@@ -6,9 +6,9 @@ use kube::ResourceExt;
 use serde_json::{Value, json};
 
 use super::board::{self, Observed};
-use super::facts::{command, has_ended, is_attempt_requested, is_run, shown, state};
-use super::text::{Frame, when};
-use leaderboard_api::{Attempt, Deadlines, State, Submission, reasons};
+use super::facts::{command, has_ended, is_attempt_requested, is_run, shown};
+use super::text::{Frame, when, wrap};
+use leaderboard_api::{Attempt, Deadlines, State, Submission, SubmissionStatus, reasons};
 
 /// What a person asks for.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
@@ -51,7 +51,9 @@ fn cancel(submission: &Submission, leaderboard: Observed<'_>, frame: Frame) -> R
     let name = submission.name_any();
     let status = submission.status.as_ref();
     if has_ended(submission) {
-        let shown = status.and_then(state).map_or("ended", State::as_str);
+        let shown = status
+            .and_then(SubmissionStatus::known_state)
+            .map_or("ended", State::as_str);
         let at = status.and_then(|s| s.times.finished.as_ref());
         let at = at
             .map(|at| format!(" since {}", when(at.0, frame.now)))
@@ -113,10 +115,9 @@ fn how_it_stops(submission: &Submission, leaderboard: Observed<'_>) -> String {
 
 /// In few words, since there may be many.
 fn resume_many(submission: &Submission, frame: Frame) -> Result<Change, String> {
-    let mut page = frame.page();
     let attempt = next_attempt(submission)?;
-    page.paragraph(&format!("Requested attempt {attempt} of {}.", submission.name_any()));
-    Ok(resumption(submission, attempt, page.into_lines()))
+    let text = format!("Requested attempt {attempt} of {}.", submission.name_any());
+    Ok(resumption(submission, attempt, wrap(&text, frame.width)))
 }
 
 fn restart(submission: &Submission, frame: Frame) -> Result<Change, String> {
@@ -132,11 +133,10 @@ fn restart(submission: &Submission, frame: Frame) -> Result<Change, String> {
         ));
     }
     let attempt = submission.spec.attempt.next();
-    let mut page = frame.page();
-    page.paragraph(&format!(
+    let text = format!(
         "Requested attempt {attempt} of {name}: its run stores its results, stops, and goes on when its turn comes."
-    ));
-    Ok(resumption(submission, attempt, page.into_lines()))
+    );
+    Ok(resumption(submission, attempt, wrap(&text, frame.width)))
 }
 
 fn resume(submission: &Submission, leaderboard: Observed<'_>, frame: Frame) -> Result<Change, String> {
@@ -210,7 +210,7 @@ fn not_resumable(submission: &Submission) -> Option<String> {
     }
     let name = submission.name_any();
     let see = command("why", submission);
-    let found = submission.status.as_ref().and_then(state);
+    let found = submission.status.as_ref().and_then(SubmissionStatus::known_state);
     match found.filter(|_| has_ended(submission)) {
         Some(State::Failed | State::Cancelled) => None,
         Some(State::Finished) => Some(format!(

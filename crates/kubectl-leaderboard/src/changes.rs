@@ -12,7 +12,7 @@ use crate::commands::{frame, note_interruption, nothing};
 use crate::error::{self, Error};
 use crate::output::{self, note, print};
 use crate::{Cancel, facts, resume, submit};
-use leaderboard_api::{Attempt, State, Submission, SubmissionStatus};
+use leaderboard_api::{Attempt, Leaderboard, State, Submission, SubmissionStatus};
 
 /// How often a change is tried again after a conflict with somebody else's.
 const TRIES: usize = 4;
@@ -40,7 +40,8 @@ pub async fn resume(cluster: &Cluster, wanted: &resume::Resume) -> Result<ExitCo
     }
     print(&resume::lines(&chosen, frame));
     print(&[String::new()]);
-    if !wanted.yes && !output::is_confirmed(&resume::question(verb, chosen.len())) {
+    // Where nobody can be asked, the command is the answer.
+    if !wanted.yes && !output::ask(&resume::question(verb, chosen.len())).unwrap_or(true) {
         print(&["Nothing was changed.".to_owned()]);
         return Ok(ExitCode::SUCCESS);
     }
@@ -112,7 +113,9 @@ pub async fn cancel(cluster: &Cluster, target: &Cancel) -> Result<ExitCode, Erro
 pub async fn submit(cluster: &Cluster, wanted: &submit::Submit) -> Result<ExitCode, Error> {
     let leaderboard = cluster.leaderboard(&wanted.leaderboard).await?;
     if matches!(leaderboard, Fetched::Missing) {
-        return Err(cluster.unknown_leaderboard(&wanted.leaderboard).await?);
+        return Err(cluster
+            .unknown::<Leaderboard>("Leaderboard", &wanted.leaderboard)
+            .await?);
     }
     submit::fits(&wanted.leaderboard, &wanted.track, leaderboard.observed()).map_err(Error::Unfit)?;
     let created = cluster.create(&submit::object(wanted)).await?;

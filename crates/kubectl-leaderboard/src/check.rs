@@ -9,7 +9,7 @@ use clap::Args;
 use kube::ResourceExt;
 use leaderboard_api::conditions::{self, Condition};
 use leaderboard_api::text::sentence;
-use leaderboard_api::{Leaderboard, State, Submission, SubmissionStatus, names, reasons};
+use leaderboard_api::{Leaderboard, State, Submission, SubmissionStatus, reasons};
 use serde_json::{Value, json};
 
 use crate::board::Observed;
@@ -24,8 +24,6 @@ use crate::why;
 
 /// Start of a check's name. The API server takes no other, so that its prefix in the bucket is never a team's.
 const NAME_PREFIX: &str = "check-";
-/// Characters of the Leaderboard's name in the name of a check: with prefix and the API server's five letters at most 52.
-const LONGEST: usize = 40;
 
 /// What is to be checked, and how long to wait.
 #[derive(Args, Debug)]
@@ -50,7 +48,7 @@ pub struct Check {
 pub async fn check(cluster: &Cluster, wanted: &Check) -> Result<ExitCode, Error> {
     let leaderboard = match cluster.leaderboard(&wanted.name).await? {
         Fetched::Found(leaderboard) => leaderboard,
-        Fetched::Missing => return Err(cluster.unknown_leaderboard(&wanted.name).await?),
+        Fetched::Missing => return Err(cluster.unknown::<Leaderboard>("Leaderboard", &wanted.name).await?),
         Fetched::Forbidden => return Err(Error::Forbidden("Leaderboards cannot be read".to_owned())),
     };
     let object = object(&leaderboard, wanted).map_err(Error::Unfit)?;
@@ -95,16 +93,8 @@ pub(super) fn object(leaderboard: &Leaderboard, wanted: &Check) -> Result<Value,
             wanted.name
         )
     })?;
-    let short: String = wanted.name.chars().take(LONGEST).collect();
-    Ok(json!({
-        "apiVersion": format!("{}/{}", leaderboard_api::GROUP, leaderboard_api::VERSION),
-        "kind": "Submission",
-        "metadata": {
-            "generateName": format!("{NAME_PREFIX}{}-", short.trim_end_matches('-')),
-            "labels": {names::LABEL_LEADERBOARD: wanted.name},
-        },
-        "spec": {"leaderboardName": wanted.name, "track": track, "image": image, "check": true},
-    }))
+    let spec = json!({"leaderboardName": wanted.name, "track": track, "image": image, "check": true});
+    Ok(submit::manifest(NAME_PREFIX, &wanted.name, &spec))
 }
 
 /// What is known of a check: its own `why`, and all conditions of its Leaderboard.

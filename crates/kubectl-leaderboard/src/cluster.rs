@@ -101,19 +101,19 @@ impl Cluster {
     pub async fn submission(&self, name: &str) -> Result<Submission, Error> {
         match self.in_time(self.api().get_opt(name)).await?? {
             Some(found) => Ok(found),
-            None => Err(self.unknown(name).await?),
+            None => Err(self.unknown::<Submission>("submission", name).await?),
         }
     }
 
     /// All submissions of a scope.
     pub async fn submissions(&self, scope: &Scope) -> Result<Vec<Submission>, Error> {
-        list(self, &self.api_of(scope), scope.selector.as_deref()).await
+        list(self, &self.api_of(scope), labels(scope.selector.as_deref())).await
     }
 
     /// Namespaces with submissions, and how many; none if this person may not list them.
     pub async fn elsewhere(&self) -> Vec<(String, usize)> {
         let api: Api<PartialObjectMeta<Submission>> = Api::all(self.client.clone());
-        let all = list(self, &api, None).await.unwrap_or_default();
+        let all = list(self, &api, ListParams::default()).await.unwrap_or_default();
         let mut counts: BTreeMap<String, usize> = BTreeMap::new();
         for one in all {
             *counts.entry(one.namespace().unwrap_or_default()).or_default() += 1;
@@ -123,18 +123,18 @@ impl Cluster {
 
     /// All Pods that the operator has made.
     pub async fn pods(&self) -> Result<Vec<Pod>, Error> {
-        list(self, &self.api::<Pod>(), Some(LABEL_SUBMISSION)).await
+        list(self, &self.api::<Pod>(), labels(Some(LABEL_SUBMISSION))).await
     }
 
     /// All events.
     pub async fn events(&self) -> Result<Vec<Event>, Error> {
-        list(self, &self.api::<Event>(), None).await
+        list(self, &self.api::<Event>(), ListParams::default()).await
     }
 
     /// The newest Pod of a submission.
     pub async fn pod(&self, submission: &str) -> Result<Option<Pod>, Error> {
         let selector = format!("{LABEL_SUBMISSION}={submission}");
-        let pods = list(self, &self.api::<Pod>(), Some(&selector)).await?;
+        let pods = list(self, &self.api::<Pod>(), labels(Some(&selector))).await?;
         Ok(pods
             .into_iter()
             .max_by_key(|pod| pod.creation_timestamp().map(|time| time.0)))
@@ -184,7 +184,7 @@ impl Cluster {
 
     /// All Leaderboards of a scope; none if this person has no right to read them.
     pub async fn leaderboards(&self, scope: &Scope) -> Result<Option<Vec<Leaderboard>>, Error> {
-        match list(self, &self.api_of(scope), None).await {
+        match list(self, &self.api_of(scope), ListParams::default()).await {
             Ok(found) => Ok(Some(found)),
             Err(Error::Forbidden(_)) => Ok(None),
             Err(error) => Err(error),
@@ -247,57 +247,27 @@ impl Cluster {
         Api::namespaced(self.client.clone(), &self.namespace)
     }
 
-    /// The error for an unknown name of a submission, with the names that the person may have meant.
-    async fn unknown(&self, name: &str) -> Result<Error, Error> {
-        let next = self.where_else::<Submission>("submissions", name).await?;
-        Ok(Error::Unknown {
-            kind: "submission",
-            name: name.to_owned(),
-            namespace: self.namespace.clone(),
-            next,
-        })
-    }
-
-    /// The same of a Leaderboard.
-    pub async fn unknown_leaderboard(&self, name: &str) -> Result<Error, Error> {
-        let next = self.where_else::<Leaderboard>("leaderboards", name).await?;
-        Ok(Error::Unknown {
-            kind: "Leaderboard",
-            name: name.to_owned(),
-            namespace: self.namespace.clone(),
-            next,
-        })
-    }
-
-    /// Where to look for an object that the namespace does not have.
-    async fn where_else<K>(&self, kind: &str, name: &str) -> Result<String, Error>
+    /// The error for a name that the namespace does not have, with where else to look.
+    pub async fn unknown<K>(&self, kind: &'static str, name: &str) -> Result<Error, Error>
     where
-        K: kube::Resource<Scope = kube::core::NamespaceResourceScope> + Clone + std::fmt::Debug,
-        K::DynamicType: Default,
+        K: kube::Resource<Scope = kube::core::NamespaceResourceScope, DynamicType = ()> + Clone + std::fmt::Debug,
     {
-        let known: Vec<String> = match list(self, &self.api::<PartialObjectMeta<K>>(), None).await {
+        let (here, anywhere): (Api<PartialObjectMeta<K>>, _) = (self.api(), Api::all(self.client.clone()));
+        let known: Vec<String> = match list(self, &here, ListParams::default()).await {
             Ok(found) => found.iter().map(ResourceExt::name_any).collect(),
             // The right to read an object by its name does not include the right to list them.
             Err(Error::Forbidden(_)) => Vec::new(),
             Err(error) => return Err(error),
         };
-        let elsewhere = self.namespaces_of::<K>(name).await;
-        Ok(near::next(kind, name, &self.namespace, &known, &elsewhere))
-    }
-
-    /// Namespaces that have an object of this name; none if this person may not look.
-    async fn namespaces_of<K>(&self, name: &str) -> Vec<String>
-    where
-        K: kube::Resource<Scope = kube::core::NamespaceResourceScope> + Clone + std::fmt::Debug,
-        K::DynamicType: Default,
-    {
-        let api: Api<PartialObjectMeta<K>> = Api::all(self.client.clone());
-        let params = ListParams::default().fields(&format!("metadata.name={name}"));
-        let found = match self.in_time(api.list(&params)).await {
-            Ok(Ok(found)) => found.items,
-            _ => Vec::new(),
-        };
-        found.iter().filter_map(ResourceExt::namespace).collect()
+        let named = ListParams::default().fields(&format!("metadata.name={name}"));
+        let found: Vec<PartialObjectMeta<K>> = list(self, &anywhere, named).await.unwrap_or_default();
+        let elsewhere: Vec<String> = found.iter().filter_map(ResourceExt::namespace).collect();
+        Ok(Error::Unknown {
+            kind,
+            name: name.to_owned(),
+            namespace: self.namespace.clone(),
+            next: near::next(&K::plural(&()), name, &self.namespace, &known, &elsewhere),
+        })
     }
 
     async fn in_time<T>(&self, request: impl Future<Output = T>) -> Result<T, Error> {
@@ -334,16 +304,17 @@ async fn config(target: &Target) -> Result<Config, Error> {
     Config::infer().await.map_err(|error| of_kubeconfig(&error))
 }
 
+fn labels(selector: Option<&str>) -> ListParams {
+    selector.map_or_else(ListParams::default, |selector| ListParams::default().labels(selector))
+}
+
 /// All objects of a kind, in pages.
-async fn list<K>(cluster: &Cluster, api: &Api<K>, selector: Option<&str>) -> Result<Vec<K>, Error>
+async fn list<K>(cluster: &Cluster, api: &Api<K>, params: ListParams) -> Result<Vec<K>, Error>
 where
     K: Clone + DeserializeOwned + std::fmt::Debug,
 {
     let mut found = Vec::new();
-    let mut params = ListParams {
-        label_selector: selector.map(str::to_owned),
-        ..ListParams::default().limit(PAGE)
-    };
+    let mut params = params.limit(PAGE);
     loop {
         let page = cluster.in_time(api.list(&params)).await??;
         found.extend(page.items);

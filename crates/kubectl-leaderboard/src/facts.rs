@@ -7,16 +7,11 @@ use k8s_openapi::apimachinery::pkg::apis::meta::v1::Time;
 use kube::ResourceExt;
 
 use super::text::{Frame, when};
-use leaderboard_api::{Attempt, FailureClass, State, Submission, SubmissionStatus, TeamStatus, conditions};
+use leaderboard_api::{Attempt, FailureClass, State, Submission, SubmissionStatus, conditions};
 
-/// The state of a submission; none before the operator has processed it.
-pub(super) fn state(status: &SubmissionStatus) -> Option<State> {
-    status.attempt.map(|_| status.state_of_conditions())
-}
-
-/// The same as people read it.
+/// The state as people read it.
 pub(super) fn shown(submission: &Submission) -> &'static str {
-    let known = submission.status.as_ref().and_then(state);
+    let known = submission.status.as_ref().and_then(SubmissionStatus::known_state);
     known.map_or("new", State::as_str)
 }
 
@@ -29,7 +24,7 @@ pub(super) fn since(submission: &Submission) -> Option<Timestamp> {
     };
     let time = |time: &Option<Time>| time.as_ref().map(|t| t.0);
     let times = &status.times;
-    let found = match state(status)? {
+    let found = match status.known_state()? {
         State::Finished | State::Failed | State::Cancelled => {
             time(&times.finished).or_else(|| moved(conditions::FINISHED, "True"))
         }
@@ -47,7 +42,10 @@ pub(super) fn since(submission: &Submission) -> Option<Timestamp> {
 pub(super) fn headline(submission: &Submission, now: Timestamp) -> String {
     let name = submission.name_any();
     let since = since(submission).map(|at| when(at, now));
-    match (submission.status.as_ref().and_then(state), since) {
+    match (
+        submission.status.as_ref().and_then(SubmissionStatus::known_state),
+        since,
+    ) {
         (Some(state), Some(since)) => format!("{name} is {} since {since}.", state.as_str()),
         (Some(state), None) => format!("{name} is {}.", state.as_str()),
         (None, _) => {
@@ -77,14 +75,6 @@ pub(super) fn transition(submission: &Submission, attempt: Attempt, frame: Frame
     Some((state, page.into_lines()))
 }
 
-/// Name of the team, else its id.
-pub(super) fn team(submission: &Submission) -> Option<String> {
-    let given = submission.spec.team.clone().map(TeamStatus::from);
-    let accepted = submission.status.as_ref().and_then(|status| status.team.as_ref());
-    let team = accepted.or(given.as_ref())?;
-    team.name.clone().or_else(|| team.id.clone())
-}
-
 /// Track, Leaderboard, team and submission in EvalAI.
 pub(super) fn track(submission: &Submission) -> String {
     let spec = &submission.spec;
@@ -93,7 +83,7 @@ pub(super) fn track(submission: &Submission) -> String {
         Some(track) => format!("{track} of Leaderboard {}", spec.leaderboard_name),
         None => format!("not known yet; Leaderboard {}", spec.leaderboard_name),
     };
-    if let Some(team) = team(submission) {
+    if let Some(team) = submission.team_name() {
         text = format!("{text}, by {team}");
     }
     if let Some(evalai) = spec.evalai {

@@ -15,7 +15,7 @@ use crate::cluster::Cluster;
 use crate::commands::frame;
 use crate::error::Error;
 use crate::output::{ask, note, print, print_labelled};
-use crate::text::{Frame, log_line};
+use crate::text::{Frame, log_line, wrap};
 use crate::{bucket, facts, foreign};
 
 /// Which logs.
@@ -280,11 +280,10 @@ pub(super) fn in_bucket(
         ));
     };
     let storage = status.and_then(|status| status.plan.as_ref()).map(|plan| &plan.storage);
-    let mut page = frame.page();
-    page.paragraph(&format!(
+    let text = format!(
         "The Pod of {name} is gone. With the program aws on the PATH, this command shows its logs. Without it:"
-    ));
-    let mut lines = page.into_lines();
+    );
+    let mut lines = wrap(&text, frame.width);
     lines.extend(
         keys.iter()
             .map(|(_, key)| bucket::print(&format!("{results}/{key}"), storage)),

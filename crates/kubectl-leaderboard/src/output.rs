@@ -239,11 +239,6 @@ pub(super) fn labelled(stream: usize, label: &str, line: &str, is_coloured: bool
     join(&[&label, line])
 }
 
-/// Asks a person at a terminal; elsewhere there is nobody to ask, and the command is the answer.
-pub fn is_confirmed(question: &str) -> bool {
-    ask(question).unwrap_or(true)
-}
-
 /// Asks a person at a terminal; none elsewhere, where no person could answer.
 pub fn ask(question: &str) -> Option<bool> {
     if !std::io::stdin().is_terminal() || !std::io::stdout().is_terminal() {

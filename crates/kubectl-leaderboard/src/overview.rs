@@ -48,33 +48,26 @@ impl Place<'_> {
 
 /// What is printed where there is no submission. `elsewhere` are the namespaces that have some, with their number.
 pub fn nothing(place: Place<'_>, selector: Option<&str>, elsewhere: &[(String, usize)], frame: Frame) -> Vec<String> {
-    let (mut page, namespace) = (frame.page(), place.namespace);
-    if let Some(selector) = selector {
-        let of = if place.is_all {
-            "any namespace".to_owned()
-        } else {
-            format!("namespace {namespace}")
-        };
-        page.paragraph(&format!("No submission of {of} has the labels {selector}."));
-        return page.into_lines();
-    }
-    if place.is_all {
-        page.paragraph("No namespace has a submission. Check that the context is that of the right cluster.");
-        return page.into_lines();
-    }
+    let namespace = place.namespace;
     let others: Vec<String> = elsewhere
         .iter()
         .map(|(name, count)| format!("{name} ({count})"))
         .collect();
-    page.paragraph(&if others.is_empty() {
-        format!("Namespace {namespace} has no submissions. `kubectl get submissions -A` lists those of all namespaces.")
-    } else {
-        format!(
+    let text = match selector {
+        Some(selector) if place.is_all => format!("No submission of any namespace has the labels {selector}."),
+        Some(selector) => format!("No submission of namespace {namespace} has the labels {selector}."),
+        None if place.is_all => {
+            "No namespace has a submission. Check that the context is that of the right cluster.".to_owned()
+        }
+        None if others.is_empty() => format!(
+            "Namespace {namespace} has no submissions. `kubectl get submissions -A` lists those of all namespaces."
+        ),
+        None => format!(
             "Namespace {namespace} has no submissions. There are some in {}: use -n NAMESPACE, or -A.",
             others.join(", ")
-        )
-    });
-    page.into_lines()
+        ),
+    };
+    wrap(&text, frame.width)
 }
 
 /// The lines of a namespace, or of all. No Leaderboards: this person has no right to read them.
@@ -170,13 +163,13 @@ fn row(place: Place<'_>, submission: &Submission, now: Timestamp) -> Option<Row>
     let age = since.map_or(0, |at| now.duration_since(at).as_secs());
     let position = status.waiting.as_ref().map(|w| i64::from(w.position));
     Some(Row {
-        order: match facts::state(status) {
+        order: match status.known_state() {
             Some(State::Running | State::Resumed) => (0, age),
             None | Some(State::Pending) => (1, position.unwrap_or(0)),
             Some(State::Finished | State::Failed | State::Cancelled) => (2, age),
         },
         name: clean(&place.name_of(submission)),
-        state: facts::state(status).map_or("(new)", State::as_str),
+        state: status.known_state().map_or("(new)", State::as_str),
         since: since.map(|_| span(age)).unwrap_or_default(),
         why: join(&[deleting, &others.unwrap_or_default(), &doubt, &own.unwrap_or_default()]),
     })
@@ -192,7 +185,7 @@ fn own_reason(submission: &Submission, status: &SubmissionStatus) -> Option<Stri
             "Attempt {wanted} is requested; the operator has not processed it yet."
         ));
     }
-    match facts::state(status) {
+    match status.known_state() {
         None => Some("The operator has not processed it yet.".to_owned()),
         Some(State::Pending) => Some(match &status.waiting {
             Some(waiting) => {
@@ -231,7 +224,7 @@ fn other_systems(status: &SubmissionStatus, now: Timestamp) -> Option<String> {
             _ => true,
         }
     };
-    let systems = [(conditions::PUBLISHED, "EvalAI"), (conditions::RECORDED, "DynamoDB")];
+    let [_, systems @ ..] = conditions::SYSTEMS;
     systems.iter().find_map(|(type_, system)| {
         let condition = is_false(status, type_).filter(late)?;
         Some(format!("{system}: {}.", condition.reason))

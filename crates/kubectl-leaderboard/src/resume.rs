@@ -3,12 +3,12 @@
 use clap::{ArgGroup, Args};
 use jiff::Timestamp;
 use kube::ResourceExt;
-use leaderboard_api::{FailureClass, State, Submission};
+use leaderboard_api::{FailureClass, State, Submission, SubmissionStatus};
 
 use crate::change::Request;
 use crate::facts;
 use crate::table::table;
-use crate::text::{Frame, span};
+use crate::text::{Frame, span, wrap};
 
 /// Which submissions.
 #[derive(Args, Debug)]
@@ -79,7 +79,7 @@ impl Resume {
 
     fn is_failure(&self, one: &Submission) -> bool {
         let status = one.status.as_ref();
-        let is_failed = status.and_then(facts::state) == Some(State::Failed);
+        let is_failed = status.and_then(SubmissionStatus::known_state) == Some(State::Failed);
         let failure = status.and_then(|status| status.failure.as_ref()).filter(|_| is_failed);
         failure.is_some_and(|failure| {
             let is_class = !self.infrastructure || failure.class == FailureClass::Infrastructure;
@@ -103,12 +103,11 @@ impl Resume {
         } else {
             format!("has failed{cause}{reason}")
         };
-        let mut page = frame.page();
-        page.paragraph(&format!(
+        let text = format!(
             "None of {} {what}. `kubectl leaderboard status -n {namespace}` lists all.",
             counted(number)
-        ));
-        page.into_lines()
+        );
+        wrap(&text, frame.width)
     }
 }
 
@@ -140,8 +139,11 @@ fn row(one: &Submission, now: Timestamp) -> Vec<String> {
     let since = facts::since(one).map(|at| span(now.duration_since(at).as_secs()));
     vec![
         one.name_any(),
-        facts::team(one).unwrap_or_default(),
-        status.and_then(facts::state).map_or("", State::as_str).to_owned(),
+        one.team_name().unwrap_or_default(),
+        status
+            .and_then(SubmissionStatus::known_state)
+            .map_or("", State::as_str)
+            .to_owned(),
         status
             .and_then(|status| status.reason.as_deref())
             .unwrap_or_default()
@@ -166,12 +168,11 @@ pub fn summary(requested: usize, chosen: usize, namespace: &str, frame: Frame) -
         1 => " One was refused; its reason is above.".to_owned(),
         refused => format!(" {refused} were refused; the reasons are above."),
     };
-    let mut page = frame.page();
-    page.paragraph(&format!(
+    let text = format!(
         "Requested for {requested} of {}.{refused} To follow them: `kubectl leaderboard status -n {namespace}`.",
         counted(chosen)
-    ));
-    page.into_lines()
+    );
+    wrap(&text, frame.width)
 }
 
 /// `1 submission`, `38 submissions`.

@@ -147,12 +147,7 @@ fn times(submission: &Submission, times: &Times, now: Timestamp) -> String {
 }
 
 fn systems(status: &SubmissionStatus) -> String {
-    let systems = [
-        (conditions::ARCHIVED, "S3"),
-        (conditions::PUBLISHED, "EvalAI"),
-        (conditions::RECORDED, "DynamoDB"),
-    ];
-    let texts = systems.into_iter().filter_map(|(type_, system)| {
+    let texts = conditions::SYSTEMS.into_iter().filter_map(|(type_, system)| {
         let condition = conditions::get(&status.conditions, type_)?;
         Some(format!("{system} {}", condition.reason))
     });
@@ -187,7 +182,7 @@ fn order(submission: &Submission, now: Timestamp) -> (u8, i64, String) {
         .waiting
         .as_ref()
         .map_or(i64::MAX, |waiting| waiting.position.into());
-    let (class, within) = match facts::state(status) {
+    let (class, within) = match status.known_state() {
         Some(State::Running | State::Resumed) => (0, -since),
         None | Some(State::Pending) => (1, place),
         Some(_) => (2, since),
@@ -203,7 +198,7 @@ fn row(submission: &Submission, is_qualified: bool, is_wide: bool, now: Timestam
     let since = since.map(|at| span(now.duration_since(at).as_secs()));
     let mut row = vec![
         submission.name_any(),
-        facts::state(status).map_or("(new)", State::as_str).to_owned(),
+        status.known_state().map_or("(new)", State::as_str).to_owned(),
         text(status.reason.as_deref()),
         text(status.progress.as_ref().map(|progress| progress.text.as_str())),
         text(status.score.as_ref().map(|score| score.text.as_str())),
@@ -218,7 +213,7 @@ fn row(submission: &Submission, is_qualified: bool, is_wide: bool, now: Timestam
         row.extend([
             submission.spec.leaderboard_name.clone(),
             text(status.track.as_deref().or(submission.spec.track.as_deref())),
-            facts::team(submission).unwrap_or_default(),
+            submission.team_name().unwrap_or_default(),
             status.attempt.map(|attempt| attempt.to_string()).unwrap_or_default(),
             crashes.to_string(),
             text(status.node_name.as_deref()),

@@ -69,34 +69,36 @@ pub fn lines(created: &Submission, leaderboard: Observed<'_>, frame: Frame) -> V
     page.into_lines()
 }
 
-/// Characters of the Leaderboard's name in the name of a submission: with the API server's five letters at most 52.
-const LONGEST: usize = 46;
+/// The most characters of a name but for the API server's five letters.
+const LONGEST: usize = 47;
 
 /// The object to create.
 pub fn object(wanted: &Submit) -> Value {
-    let short: String = wanted.leaderboard.chars().take(LONGEST).collect();
-    let metadata = match &wanted.name {
-        Some(name) => json!({"name": name}),
-        None => json!({"generateName": format!("{}-", short.trim_end_matches('-'))}),
-    };
     let mut spec = json!({
         "leaderboardName": wanted.leaderboard, "track": wanted.track, "image": wanted.image, "priority": wanted.priority,
     });
-    if wanted.team_id.is_some() || wanted.team.is_some() {
-        let mut team = json!({});
-        for (key, value) in [("id", &wanted.team_id), ("name", &wanted.team)] {
-            if let Some(value) = value {
-                team[key] = json!(value);
-            }
+    for (key, value) in [("id", &wanted.team_id), ("name", &wanted.team)] {
+        if let Some(value) = value {
+            spec["team"][key] = json!(value);
         }
-        spec["team"] = team;
     }
-    let mut object = json!({
+    let mut object = manifest("", &wanted.leaderboard, &spec);
+    if let Some(name) = &wanted.name {
+        (object["metadata"]["name"], object["metadata"]["generateName"]) = (json!(name), Value::Null);
+    }
+    object
+}
+
+/// A Submission whose name begins like this, and goes on with its Leaderboard's.
+pub(super) fn manifest(prefix: &str, leaderboard: &str, spec: &Value) -> Value {
+    let short: String = leaderboard.chars().take(LONGEST - 1 - prefix.len()).collect();
+    json!({
         "apiVersion": format!("{}/{}", leaderboard_api::GROUP, leaderboard_api::VERSION),
         "kind": "Submission",
-        "metadata": metadata,
+        "metadata": {
+            "generateName": format!("{prefix}{}-", short.trim_end_matches('-')),
+            "labels": {names::LABEL_LEADERBOARD: leaderboard},
+        },
         "spec": spec,
-    });
-    object["metadata"]["labels"] = json!({names::LABEL_LEADERBOARD: wanted.leaderboard});
-    object
+    })
 }

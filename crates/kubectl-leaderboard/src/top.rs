@@ -6,7 +6,6 @@ use kube::ResourceExt;
 use leaderboard_api::{Leaderboard, State, Submission, SubmissionStatus};
 use serde_json::{Value, json};
 
-use super::facts;
 use super::table::table;
 use super::text::Frame;
 
@@ -32,7 +31,7 @@ fn uses(submissions: &[Submission]) -> Vec<(Key, Use)> {
         let team = if one.spec.check {
             "(check)".to_owned()
         } else {
-            facts::team(one).unwrap_or_else(|| "(none)".to_owned())
+            one.team_name().unwrap_or_else(|| "(none)".to_owned())
         };
         let key = (
             one.namespace().unwrap_or_default(),
@@ -41,7 +40,7 @@ fn uses(submissions: &[Submission]) -> Vec<(Key, Use)> {
         );
         let each = uses.entry(key).or_default();
         let status = one.status.as_ref();
-        match status.and_then(facts::state) {
+        match status.and_then(SubmissionStatus::known_state) {
             Some(State::Running | State::Resumed) => each.running += 1,
             Some(State::Pending) if status.is_some_and(SubmissionStatus::has_slot) => each.running += 1,
             None | Some(State::Pending) => each.waiting += 1,

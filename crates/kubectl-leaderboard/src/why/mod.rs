@@ -12,7 +12,7 @@ use serde_json::{Value, json};
 use self::next::{next_steps, of_pair, verb};
 use super::board::{self, Observed};
 use super::bucket;
-use super::facts::{class, command, has_ended, headline, is_attempt_requested, state, track};
+use super::facts::{class, command, has_ended, headline, is_attempt_requested, track};
 use super::text::{Frame, Page, join, span, when};
 use leaderboard_api::conditions::{self, Condition};
 use leaderboard_api::names::FAILURE_LOG_KEY;
@@ -36,7 +36,7 @@ pub fn value(submission: &Submission, leaderboard: Observed<'_>) -> Value {
     json!({
         "name": submission.name_any(),
         "namespace": submission.namespace(),
-        "state": state(status),
+        "state": status.known_state(),
         "reason": status.reason,
         "meaning": status.reason.as_deref().map(meaning),
         "message": status.message,
@@ -59,7 +59,7 @@ pub fn explain(submission: &Submission, leaderboard: Observed<'_>, frame: Frame)
     };
     explanation.headline();
     explanation.page.gap();
-    explanation.belongs_to();
+    explanation.page.row("Track", &track(submission));
     explanation.reason();
     explanation.failure();
     explanation.line();
@@ -83,10 +83,6 @@ impl Explanation<'_> {
         for problem in board::problems(&self.submission.spec.leaderboard_name, self.leaderboard) {
             self.page.paragraph(&problem.text);
         }
-    }
-
-    fn belongs_to(&mut self) {
-        self.page.row("Track", &track(self.submission));
     }
 
     fn reason(&mut self) {
@@ -196,13 +192,8 @@ impl Explanation<'_> {
 
     /// Which other systems have the result, and whether the scores can be trusted.
     fn systems(&mut self) {
-        let systems = [
-            (conditions::ARCHIVED, "S3"),
-            (conditions::PUBLISHED, "EvalAI"),
-            (conditions::RECORDED, "DynamoDB"),
-            (conditions::LOGGED, "CloudWatch"),
-        ];
-        for (type_, system) in systems {
+        let logs = (conditions::LOGGED, "CloudWatch");
+        for (type_, system) in conditions::SYSTEMS.into_iter().chain([logs]) {
             if let Some(condition) = conditions::get(&self.status.conditions, type_) {
                 self.page.row(system, &system_text(condition, system, self.now));
             }

@@ -3,7 +3,7 @@
 use leaderboard_api::{Failure, FailureClass, Submission, SubmissionStatus, conditions, reasons};
 
 use crate::board::{self, Observed};
-use crate::facts::{has_ended, state};
+use crate::facts::has_ended;
 
 /// A text of the table of reasons about the pair that failed.
 pub(super) fn of_pair(text: &str, pair: Option<i32>) -> String {
@@ -32,7 +32,7 @@ pub(super) fn next_steps(submission: &Submission, status: &SubmissionStatus, lea
             steps.push(next);
         }
     }
-    if state(status).is_none() && problems.is_empty() {
+    if status.attempt.is_none() && problems.is_empty() {
         steps.push("Nothing. If it lasts for a minute, check that the operator runs.".to_owned());
     }
     steps
