@@ -6,7 +6,6 @@ pub mod aws;
 pub mod endpoints;
 pub mod evalai;
 pub mod fault;
-pub mod held_text;
 pub mod log_groups;
 pub mod logs;
 pub mod meter;

@@ -35,6 +35,7 @@ use crate::controller::submissions::memory::Memory;
 use crate::controller::submissions::observe::causes::{Causes, OF_JOBS, OF_PODS, Objects};
 use crate::controller::submissions::observe::node;
 use crate::controller::submissions::observe::workers::Workers;
+use crate::controller::submissions::payloads;
 use crate::controller::submissions::phases::Phase;
 use crate::kubernetes::objects::Event;
 use crate::kubernetes::preflight::{self, await_kinds};
@@ -45,7 +46,7 @@ use crate::observability::tasks::TaskFailed;
 use crate::page::Page;
 use crate::services::ObjectKey;
 use crate::services::aws::Aws;
-use crate::services::evalai::{Changed, Hub, Options, SweepRow, Timeouts, Timing};
+use crate::services::evalai::{Changed, Hub, Options, PayloadReader, SweepRow, Timeouts, Timing};
 use crate::services::meter::Meter;
 use crate::services::table;
 use backoff::BackoffMap;
@@ -199,7 +200,8 @@ impl Parts {
         rows: mpsc::UnboundedSender<ObjectKey>,
     ) -> ExternalSystems {
         let telemetry = &self.telemetry;
-        let hub = hub(fence, evalai, self.sweep(), telemetry);
+        let payloads = payloads::reader(self.aws.clone());
+        let hub = hub(fence, evalai, self.sweep(), payloads, telemetry);
         let inbox = inbox::read(self.inbox(), hub.clone(), self.settings.operator.clone());
         telemetry.tasks.stay("inbox", inbox);
         let fence = fence.clone();
@@ -374,12 +376,14 @@ fn hub(
     fence: &leader::Fence,
     changed: mpsc::UnboundedSender<Changed>,
     sweep: mpsc::UnboundedSender<SweepRow>,
+    payloads: PayloadReader,
     telemetry: &Observability,
 ) -> Hub {
     let not_before = fence.evalai_not_before().unwrap_or_else(Instant::now);
     let writes = fence.clone();
     Hub::new(Options {
         write_guard: Arc::new(move || writes.may_write()),
+        payloads,
         not_before,
         changed,
         sweep,

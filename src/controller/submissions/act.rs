@@ -147,8 +147,6 @@ impl Actor<'_> {
             Action::ReadOtherResults(question) => workers.other_results.want(submission, *question),
             Action::TakeOwnership => workers.archive.want_fence(submission, status),
             Action::KeepLog { places } => workers.archive.want_log(submission, status, log_demand(places, status)),
-            Action::ReadTexts { of } => workers.archive.want_texts(submission, status, of),
-            Action::DropTexts => workers.archive.drop_texts(submission, status),
             Action::LookUpNode(name) => workers.lookups.want(submission, &name),
             Action::AskEvalai => {
                 uses.memory.asks_evalai(submission);
@@ -156,8 +154,7 @@ impl Actor<'_> {
             }
             Action::FollowEvalai => uses.external.follow(self.view, status),
             Action::UpdateEvalai(update) => {
-                uses.external
-                    .update_evalai(uses.memory, &workers.archive, self.view, status, update);
+                uses.external.update_evalai(&workers.archive, self.view, status, update);
             }
             Action::ForgetEvalai => uses.external.hub.forget(&key_of(submission)),
             Action::Forget => {

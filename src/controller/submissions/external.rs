@@ -7,8 +7,7 @@ use std::sync::{Arc, Mutex};
 use kube::ResourceExt;
 
 use super::archive::ArchiveWorkers;
-use super::decide::{EvalaiUpdate, TableUpdate};
-use super::memory::Memory;
+use super::decide::{EvalaiUpdate, TableUpdate, patience};
 use super::result_texts;
 use super::view::{EvalaiEnd, EvalaiInfo, EvalaiView, RecordView, Standing, View};
 use crate::allowed::Allowed;
@@ -16,7 +15,8 @@ use crate::controller::objects::{key_of, log_span_of, uid};
 use crate::lock::lock;
 use crate::services::ObjectKey;
 use crate::services::evalai::{
-    self, DesiredUpdate, Ended, Hub, ImageAnswer, Outcome, Publisher, Run, Status, Subject, SubmissionState, Target,
+    self, DesiredUpdate, Ended, Hub, ImageAnswer, Outcome, Patience, Publisher, Run, Status, Subject, SubmissionState,
+    Target,
 };
 use crate::services::table::Recorder;
 use leaderboard_api::{Ingested, JobNumber, Leaderboard, Submission, SubmissionStatus, names};
@@ -120,10 +120,9 @@ impl ExternalSystems {
         log_refused(followed);
     }
 
-    /// Updates EvalAI with what the view shows. `memory` notes a partial result, `archive` has the log of a failure.
+    /// Updates EvalAI with what the view shows. `archive` has the log of a failure.
     pub fn update_evalai(
         &self,
-        memory: &Memory,
         archive: &ArchiveWorkers,
         view: &View,
         status: &SubmissionStatus,
@@ -133,18 +132,19 @@ impl ExternalSystems {
         let Some(publisher) = Publisher::of(subject) else {
             return;
         };
-        let with_end = |outcome| Some(final_update(archive, view, status, outcome));
+        let with_end = |outcome| final_update(archive, view, status, outcome);
         let desired = match update {
-            EvalaiUpdate::Queued => Some(DesiredUpdate::Queued),
-            EvalaiUpdate::Running => Some(DesiredUpdate::Running),
-            EvalaiUpdate::Partial { is_shown } => partial_update(memory, view, is_shown),
+            EvalaiUpdate::Queued => DesiredUpdate::Queued,
+            EvalaiUpdate::Running => DesiredUpdate::Running,
+            EvalaiUpdate::Partial { is_shown } => {
+                let outline = result_texts::outline(view, status, is_shown, Patience::ENDLESS);
+                DesiredUpdate::Partial(Arc::new(outline))
+            }
             EvalaiUpdate::Finished => with_end(Outcome::Finished),
             EvalaiUpdate::Failed => with_end(Outcome::Failed),
             EvalaiUpdate::Cancelled => with_end(Outcome::Cancelled),
         };
-        if let Some(desired) = desired {
-            log_refused(self.hub.update(&publisher, desired));
-        }
+        log_refused(self.hub.update(&publisher, desired));
     }
 
     /// Writes the row, or lets the next write carry it.
@@ -195,21 +195,14 @@ fn run_of(submission: &Submission) -> Run {
     }
 }
 
-fn partial_update(memory: &Memory, view: &View, is_shown: bool) -> Option<DesiredUpdate> {
-    let report = view.report.ours()?;
-    let payload = result_texts::partial_payload(view, is_shown)?;
-    memory.sent_partial(&view.submission, view.submission.present_attempt(), report.done);
-    Some(DesiredUpdate::Partial(Arc::new(payload)))
-}
-
 fn final_update(archive: &ArchiveWorkers, view: &View, status: &SubmissionStatus, outcome: Outcome) -> DesiredUpdate {
-    let mut payload = result_texts::payload(view);
-    payload.stderr = result_texts::stderr(status);
+    let mut outline = result_texts::outline(view, status, false, patience(view, status));
+    outline.stderr = result_texts::stderr(status);
     if outcome == Outcome::Failed {
         let tail = archive.tail(&view.submission, status);
-        result_texts::add_log(&mut payload, tail, result_texts::log_readers(view));
+        result_texts::add_log(&mut outline, tail, result_texts::log_readers(view));
     }
-    DesiredUpdate::Final(outcome, Arc::new(payload))
+    DesiredUpdate::Final(outcome, Arc::new(outline))
 }
 
 /// Whether it is run only with an image that EvalAI names.
@@ -265,18 +258,16 @@ fn map_view(seen: &SubmissionState, submission: &Submission) -> EvalaiView {
         cancelled: ended.is_some(),
         cancelled_as_of: None,
         overtaken: ended.is_some() && seen.overtaken,
-        end: seen
-            .end
-            .as_ref()
-            .filter(|_| present)
-            .map(|end| map_end(end, seen.needs_texts)),
+        end: seen.end.as_ref().filter(|_| present).map(map_end),
+        unread: seen.unread.clone().filter(|_| present),
+        partial_done: seen.partial_done.filter(|_| present),
         shows_partial: false,
         team_id: seen.row.as_ref().and_then(|row| row.team_id).map(|id| id.to_string()),
         error: seen.last_error.clone(),
     }
 }
 
-fn map_end(end: &Ended, is_due: bool) -> EvalaiEnd {
+fn map_end(end: &Ended) -> EvalaiEnd {
     match end {
         // It was there before our own end, which then is a cancel: nothing else of ours leaves it as it is.
         Ended::Agreed {
@@ -289,7 +280,6 @@ fn map_end(end: &Ended, is_due: bool) -> EvalaiEnd {
         Ended::Published { at, .. } | Ended::Agreed { at, .. } => EvalaiEnd::Published { at: *at },
         Ended::Refused(message) => EvalaiEnd::Refused {
             message: message.clone(),
-            is_due,
         },
     }
 }

@@ -14,8 +14,7 @@ use tokio::sync::mpsc;
 use super::*;
 use crate::controller::fixtures::{Cluster, Surroundings, leaderboard, surroundings, with_job};
 use crate::controller::submissions::view::{
-    ObservedFence, ObservedJob, ObservedLog, ObservedNode, ObservedReport, ObservedRoutes, ObservedTexts,
-    ObservedTraces, Turn,
+    ObservedFence, ObservedJob, ObservedLog, ObservedNode, ObservedReport, ObservedRoutes, ObservedTraces, Turn,
 };
 use leaderboard_api::conditions::{self, Truth};
 use leaderboard_api::{Attempt, State, reasons};
@@ -110,12 +109,10 @@ async fn bench(state: State) -> Bench {
         report: ObservedReport::NotRead,
         report_stage: None,
         report_waited: std::time::Duration::ZERO,
-        texts: ObservedTexts::NotRead,
         fence: ObservedFence::NotRequested,
         log: ObservedLog::NotRequested,
         evalai: None,
         record: Some(RecordView::default()),
-        partial_sent: None,
         evalai_writes_from: None,
     };
     Bench {
@@ -282,7 +279,7 @@ fn an_end_that_evalai_showed_already_is_published_at_one_moment_whatever_is_read
 
 #[test]
 fn what_had_finished_in_evalai_before_is_its_own_end() {
-    let of = |end: Ended| map_end(&end, false);
+    let of = |end: Ended| map_end(&end);
     let at = Timestamp::UNIX_EPOCH;
     let agreed = |status| Ended::Agreed { status, at };
     let kept = EvalaiEnd::Ended {

@@ -1,4 +1,4 @@
-//! What the leader remembers between two reconciles of one object: the status it last wrote, and the partial result it last sent.
+//! What the leader remembers between two reconciles of one object: above all the status it last wrote.
 //!
 //! Needed because a cache may lag behind our own writes: a reconcile must never decide on a status older than its own.
 
@@ -26,7 +26,6 @@ pub struct Memory {
 #[derive(Default)]
 struct Entry {
     written: Option<Written>,
-    partial: Option<(Attempt, u32)>,
     /// The Job that was created last, and when.
     job: Option<(String, Instant)>,
     /// The Job that the API server refuses to make, and why.
@@ -111,17 +110,6 @@ impl Memory {
             at
         });
         at.checked_duration_since(now).filter(|left| !left.is_zero())
-    }
-
-    /// Routes of the last partial result of the present attempt.
-    pub fn partial_sent(&self, submission: &Submission) -> Option<u32> {
-        let (attempt, done) = lock(&self.entries).get(uid(submission))?.partial?;
-        (Some(attempt) == submission.status.as_ref()?.attempt).then_some(done)
-    }
-
-    /// Remembers a partial result.
-    pub fn sent_partial(&self, submission: &Submission, attempt: Attempt, done: u32) {
-        lock(&self.entries).entry(uid(submission).into()).or_default().partial = Some((attempt, done));
     }
 
     /// Remembers a Job that was created.

@@ -14,6 +14,7 @@ pub mod job_spec;
 pub mod memory;
 pub mod observe;
 pub mod other_results;
+pub mod payloads;
 pub mod phases;
 mod pod_layout;
 pub mod pod_overlay;

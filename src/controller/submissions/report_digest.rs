@@ -2,19 +2,16 @@
 
 use leaderboard_results::{Format, metrics};
 use serde_json::{Map, Value};
-use sha2::{Digest, Sha256};
 
+use super::payloads::left_out;
 use crate::pod::report::{Logs, Report, ReportError, ReportPair};
 use crate::pod::run::Stop;
+use crate::services::archive::ContentId;
 use leaderboard_api::text::one_line;
 use leaderboard_api::{Attempt, Progress, Score};
 
 /// Longest text of a report that is kept, in characters.
 const LONGEST: usize = 500;
-
-/// Tells one report from another by its bytes.
-#[derive(Clone, Copy, Debug, Default, PartialEq, Eq)]
-pub struct ReportId([u8; 16]);
 
 /// A report that was found below a run's prefix.
 #[derive(Clone, Debug, PartialEq)]
@@ -27,7 +24,7 @@ pub struct StoredReport {
 /// What is kept of a report. Its texts are read again when they are published.
 #[derive(Clone, Debug, Default, PartialEq)]
 pub struct ReportDigest {
-    pub id: ReportId,
+    pub id: ContentId,
     pub attempt: Attempt,
     /// UID of the Pod that wrote it.
     pub pod_uid: String,
@@ -51,14 +48,8 @@ pub struct ReportDigest {
     pub agents_fill_disk: bool,
     /// The metrics of a final report, for the table.
     pub metrics: Option<Box<Map<String, Value>>>,
-}
-
-impl ReportId {
-    pub(super) fn of(bytes: &[u8]) -> Self {
-        let mut id = [0; 16];
-        id.copy_from_slice(&Sha256::digest(bytes)[..16]);
-        Self(id)
-    }
+    /// Why EvalAI is not sent one of its texts.
+    pub left_out: Option<Box<str>>,
 }
 
 impl StoredReport {
@@ -66,7 +57,7 @@ impl StoredReport {
     pub(super) fn read(bytes: &[u8]) -> Result<Self, ReportError> {
         let report = Report::parse(bytes)?;
         Ok(Self {
-            digest: ReportDigest::of(&report, ReportId::of(bytes)),
+            digest: ReportDigest::of(&report, ContentId::of(bytes)),
             submission_uid: cut(&report.submission_uid),
         })
     }
@@ -74,10 +65,10 @@ impl StoredReport {
 
 impl ReportDigest {
     /// Reads a report as hostile text. None: it is of another object.
-    pub(super) fn read(bytes: &[u8], uid: &str) -> Result<Option<(Self, Report)>, ReportError> {
+    pub(super) fn read(bytes: &[u8], uid: &str) -> Result<Option<Self>, ReportError> {
         let report = Report::parse(bytes)?;
         let is_of = report.submission_uid == uid;
-        Ok(is_of.then(|| (Self::of(&report, ReportId::of(bytes)), report)))
+        Ok(is_of.then(|| Self::of(&report, ContentId::of(bytes))))
     }
 
     /// Whether all routes are done, and nothing more comes.
@@ -103,7 +94,7 @@ impl ReportDigest {
         Some(Score::new(self.score?, completion, penalty, is_final))
     }
 
-    pub fn of(report: &Report, id: ReportId) -> Self {
+    pub fn of(report: &Report, id: ContentId) -> Self {
         Self {
             id,
             attempt: report.attempt,
@@ -126,6 +117,7 @@ impl ReportDigest {
             }),
             agents_fill_disk: report.agents_fill_disk,
             metrics: report.is_final.then(|| accuracies(&report.results)).flatten(),
+            left_out: left_out(report).map(Into::into),
         }
     }
 }
@@ -151,7 +143,7 @@ fn cut(text: &str) -> String {
 #[cfg(test)]
 impl From<&Report> for ReportDigest {
     fn from(report: &Report) -> Self {
-        Self::of(report, ReportId::of(&serde_json::to_vec(report).unwrap()))
+        Self::of(report, ContentId::of(&serde_json::to_vec(report).unwrap()))
     }
 }
 
@@ -191,7 +183,7 @@ mod tests {
     fn a_live_report_of_a_real_size_is_kept_in_less_than_a_kilobyte() {
         let bytes = report(false);
         assert!(bytes.len() > 80_000);
-        let (digest, _) = ReportDigest::read(&bytes, "u").unwrap().unwrap();
+        let digest = ReportDigest::read(&bytes, "u").unwrap().unwrap();
         assert!(size(&digest) < 1024, "{} bytes", size(&digest));
         assert_eq!((digest.metrics, digest.why), (None, None));
         assert_eq!((digest.done, digest.pairs.len(), digest.score), (20, 2, Some(43.125)));
@@ -199,7 +191,7 @@ mod tests {
 
     #[test]
     fn a_final_report_keeps_the_metrics_of_the_table_alone() {
-        let (digest, _) = ReportDigest::read(&report(true), "u").unwrap().unwrap();
+        let digest = ReportDigest::read(&report(true), "u").unwrap().unwrap();
         let metrics = digest.metrics.unwrap();
         assert_eq!(serde_json::to_string(&metrics).unwrap(), r#"{"Driving score":43.125}"#);
         assert_eq!(digest.why.unwrap().chars().count(), LONGEST);

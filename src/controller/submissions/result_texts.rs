@@ -1,50 +1,36 @@
-//! The texts of a result: what EvalAI shows, and the row of the table. Pure: what S3 holds was read by its worker (`archive`).
+//! The texts of a result: what EvalAI shows, and the row of the table. Pure: `payloads` reads what S3 holds of the first.
 
 use leaderboard_results::{metrics, number_text};
 use serde_json::Value;
 
 use super::failure_log::Tail;
 use super::report_digest::ReportDigest;
-use super::view::{ObservedTexts, Texts, View};
+use super::view::View;
 use crate::pod::run::results_format;
-use crate::services::evalai::Payload;
+use crate::services::evalai::{Outline, Patience, StoredResult};
 use crate::services::table::Row;
-use leaderboard_api::{FailureClass, LeaderboardVersion, LogTail, State, SubmissionStatus};
+use leaderboard_api::{FailureClass, LeaderboardVersion, LogTail, State, SubmissionStatus, effective};
 
-/// The texts of the report that is in the view, if they were read.
-fn texts(view: &View) -> Option<&Texts> {
-    let report = view.report.ours()?;
-    match &view.texts {
-        ObservedTexts::Read(texts) if texts.of == report.id => Some(texts),
-        _ => None,
-    }
-}
-
-/// The payload of a final result: without results of its own where none are stored.
-pub(super) fn payload(view: &View) -> Payload {
-    let texts = texts(view);
-    Payload {
+/// What the result in the view is sent with: nothing of a bucket where none is stored. `so_far`: with the metrics over the routes so
+/// far, else with the original's zeros.
+pub(super) fn outline(view: &View, status: &SubmissionStatus, so_far: bool, patience: Patience) -> Outline {
+    let stored = view
+        .report
+        .ours()
+        .zip(status.plan.as_ref())
+        .map(|(report, plan)| StoredResult {
+            storage: plan.storage.clone(),
+            prefix: effective::key_prefix(&plan.storage, &plan.run_id),
+            report: report.id,
+            done: report.done,
+            so_far,
+            patience,
+        });
+    Outline {
         phase: phase(view),
-        result: texts.map_or_else(|| "[]".to_owned(), |texts| texts.result.clone()),
-        stdout: texts.map(|texts| texts.stdout.clone()).unwrap_or_default(),
-        metadata: texts.map(|texts| texts.metadata.clone()).unwrap_or_default(),
-        ..Payload::default()
+        stored,
+        ..Outline::default()
     }
-}
-
-/// The payload of a partial result. `is_shown` means that its phase's leaderboard shows it.
-pub(super) fn partial_payload(view: &View, is_shown: bool) -> Option<Payload> {
-    let result = partial_results(texts(view)?, is_shown).to_owned();
-    Some(Payload {
-        result,
-        ..payload(view)
-    })
-}
-
-/// The metrics over the routes so far where people see them, else the original's zeros.
-fn partial_results(texts: &Texts, is_shown: bool) -> &str {
-    let so_far = texts.partial.as_ref().filter(|_| is_shown);
-    so_far.unwrap_or(&texts.result)
 }
 
 /// Phase whose leaderboard gets the result.
@@ -74,7 +60,7 @@ pub(super) fn log_readers(view: &View) -> LogTail {
 
 /// Puts the log of a failure where those who may read it find it. Participants get no log but their own program's: the
 /// others' are the host's.
-pub(super) fn add_log(payload: &mut Payload, tail: Option<Tail>, readers: LogTail) {
+pub(super) fn add_log(payload: &mut Outline, tail: Option<Tail>, readers: LogTail) {
     let Some(tail) = tail else { return };
     if readers == LogTail::Participants && tail.is_agents() {
         payload.stderr = format!("{}\n\n{}", payload.stderr, tail.for_participants());
@@ -245,9 +231,9 @@ mod tests {
                 key: Some("agent/agent1/leaderboard.log".into()),
                 text: "route 7".into(),
             };
-            let mut payload = Payload {
+            let mut payload = Outline {
                 stderr: "AgentCrashed (participant): it crashed.".into(),
-                ..Payload::default()
+                ..Outline::default()
             };
             add_log(&mut payload, Some(tail), readers);
             assert!(
@@ -259,7 +245,6 @@ mod tests {
                 !payload.stderr.contains("leaderboard.log"),
                 "no file that only hosts can read"
             );
-            assert!(!payload.stdout.contains("route") && !payload.metadata.contains("route"));
             payload.stderr
         };
         for container in ["agent-1", "simulator-1", "contents"] {
@@ -273,23 +258,6 @@ mod tests {
                 "{container}"
             );
         }
-    }
-
-    #[test]
-    fn a_partial_result_has_the_metrics_so_far_where_a_report_has_them() {
-        let mut texts = Texts {
-            result: "zeros".into(),
-            partial: Some("so far".into()),
-            ..Texts::default()
-        };
-        assert_eq!(partial_results(&texts, true), "so far");
-        assert_eq!(
-            partial_results(&texts, false),
-            "zeros",
-            "nobody is to see them before the end"
-        );
-        texts.partial = None;
-        assert_eq!(partial_results(&texts, true), "zeros", "of an older operator's Pod");
     }
 
     #[test]

@@ -8,10 +8,9 @@ use leaderboard_runner::verdict::Verdict;
 
 pub use super::foreign_runs::ObservedTraces;
 pub use super::other_results::ObservedRoutes;
-use super::report_digest::{ReportDigest, ReportId};
+use super::report_digest::ReportDigest;
 pub use crate::controller::slots::turns::Turn;
 use crate::pod::run::Stop;
-use crate::services::held_text::HeldText;
 use leaderboard_api::{Attempt, JobNumber, Leaderboard, SharedText, Submission, names};
 
 /// Everything a decision may depend on.
@@ -44,7 +43,6 @@ pub struct View {
     pub report_stage: Option<Stage>,
     /// How long the present report has been asked for.
     pub report_waited: Duration,
-    pub texts: ObservedTexts,
     pub fence: ObservedFence,
     pub log: ObservedLog,
     /// None for a submission that is not EvalAI's.
@@ -55,8 +53,6 @@ pub struct View {
     pub written_ago: Option<Duration>,
     /// None if the Leaderboard has no table.
     pub record: Option<RecordView>,
-    /// Routes in the last partial result that was sent to EvalAI, in this attempt.
-    pub partial_sent: Option<u32>,
     /// Until when nothing is written to EvalAI, because the controller before may still have requests under way.
     pub evalai_writes_from: Option<Timestamp>,
 }
@@ -308,49 +304,6 @@ impl ObservedReport {
     }
 }
 
-/// The texts of a result, as they are published.
-#[derive(Clone, Debug, Default, PartialEq)]
-pub struct Texts {
-    /// The report that names them.
-    pub of: ReportId,
-    /// The metrics as EvalAI takes them.
-    pub result: String,
-    /// The same over the routes so far, while the run goes on.
-    pub partial: Option<String>,
-    pub stdout: HeldText,
-    pub metadata: HeldText,
-    /// Why `stdout` and `metadata` are not there.
-    pub problem: Option<TextProblem>,
-    /// Why one of them will never be there.
-    pub left_out: Option<String>,
-}
-
-/// Why there is no text of a result.
-#[derive(Clone, Debug, PartialEq, Eq)]
-pub enum TextProblem {
-    /// It may come.
-    Unread(String),
-    /// What is stored is not what the report names: the Pod ended between the two. It will hardly change.
-    Unfit(String),
-}
-
-impl TextProblem {
-    pub fn why(&self) -> &str {
-        match self {
-            Self::Unread(why) | Self::Unfit(why) => why,
-        }
-    }
-}
-
-/// The texts of a report, as far as they were read.
-#[derive(Clone, Debug, PartialEq)]
-pub enum ObservedTexts {
-    NotRead,
-    /// Not even the report that names them was there.
-    Unread(String),
-    Read(Arc<Texts>),
-}
-
 /// Whether our own mark is in `logcopy/owner`, so that a lost Pod stores nothing more.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 pub enum ObservedFence {
@@ -390,6 +343,10 @@ pub struct EvalaiView {
     pub overtaken: bool,
     /// What became of the final result of this attempt.
     pub end: Option<EvalaiEnd>,
+    /// Why what the bucket holds of that result cannot be read.
+    pub unread: Option<String>,
+    /// Routes of the last partial result of this attempt that EvalAI has answered.
+    pub partial_done: Option<u32>,
     /// Whether the leaderboards of its phase show partial results; no as long as that is not known.
     pub shows_partial: bool,
     /// Team of its row, as last read.
@@ -435,8 +392,8 @@ pub enum EvalaiEnd {
     Published { at: Timestamp },
     /// EvalAI had ended it before: cancelled, archived, ignored, or it is gone.
     Ended { status: String },
-    /// EvalAI does not take it, and why. `is_due`: it is to be sent again, with its texts.
-    Refused { message: String, is_due: bool },
+    /// EvalAI does not take it, and why.
+    Refused { message: String },
 }
 
 /// What is known of the row in DynamoDB.

@@ -17,10 +17,10 @@ use super::http::{ClientError, Timeouts};
 use super::labels::Labels;
 use super::queue::{Now, Purse, Queue, Timing};
 use super::request::{Reply, Request};
-use super::task::{Outlets, Shared, Task, now, run};
+use super::task::{Outlets, Payloads, Shared, Task, now, run};
 use super::types::{
-    Changed, DesiredUpdate, InboxTrouble, Key, Load, Publisher, Subject, SubmissionState, SweepRow, Target, Usage,
-    WriteGuard,
+    Changed, DesiredUpdate, InboxTrouble, Key, Load, PayloadReader, Publisher, Subject, SubmissionState, SweepRow,
+    Target, Usage, WriteGuard,
 };
 use crate::lock::lock;
 use crate::observability::tasks::Tasks;
@@ -29,6 +29,8 @@ use crate::services::meter::Meter;
 /// What a hub needs.
 pub struct Options {
     pub write_guard: Arc<dyn WriteGuard>,
+    /// Reads what a bucket holds of a result.
+    pub payloads: PayloadReader,
     /// No write before: after a takeover, what the process before has sent may still be worked on.
     pub not_before: Instant,
     /// Receives what has changed.
@@ -49,6 +51,7 @@ impl Options {
     pub fn unheard(tasks: &Tasks, write_guard: impl WriteGuard) -> Self {
         Self {
             write_guard: Arc::new(write_guard),
+            payloads: Arc::new(|outline| Box::pin(async move { Ok(super::Payload::bare(&outline)) })),
             not_before: Instant::now(),
             changed: mpsc::unbounded_channel().0,
             sweep: mpsc::unbounded_channel().0,
@@ -71,6 +74,7 @@ struct Inner {
     /// `not_before` as wall-clock time.
     writes_from: Timestamp,
     outlets: Outlets,
+    payloads: Payloads,
     closing: watch::Sender<bool>,
     state: Mutex<State>,
 }
@@ -197,6 +201,7 @@ impl Hub {
         };
         Self(Arc::new(Inner {
             writes_from: wall(options.not_before),
+            payloads: Payloads::new(options.payloads.clone()),
             options,
             start: Instant::now(),
             outlets,
@@ -422,6 +427,7 @@ impl Hub {
             shared: shared.clone(),
             client: client.counted_by(inner.options.meter.clone()),
             guard: inner.options.write_guard.clone(),
+            payloads: inner.payloads.clone(),
             outlets: inner.outlets.clone(),
             closing: inner.closing.subscribe(),
             is_unused: Box::new(move || weak.upgrade().is_none_or(|hub| hub.state().remove_unused(&account))),

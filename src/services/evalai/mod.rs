@@ -30,6 +30,6 @@ pub use queue::Timing;
 pub use row::Row;
 pub use status::{Outcome, Progress, Status};
 pub use types::{
-    Changed, DesiredUpdate, Ended, ImageAnswer, InboxTrouble, Key, Payload, Publisher, Run, Subject, SubmissionState,
-    SweepRow, Swept, Target, Usage, WriteGuard,
+    Changed, DesiredUpdate, Ended, ImageAnswer, InboxTrouble, Key, Outline, Patience, Payload, PayloadProblem,
+    PayloadReader, Publisher, Run, StoredResult, Subject, SubmissionState, SweepRow, Swept, Target, Usage, WriteGuard,
 };

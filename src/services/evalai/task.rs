@@ -8,14 +8,14 @@ use std::time::Duration;
 
 use futures::stream::{FuturesUnordered, StreamExt};
 use jiff::Timestamp;
-use tokio::sync::{Notify, mpsc, oneshot, watch};
+use tokio::sync::{Notify, Semaphore, mpsc, oneshot, watch};
 use tokio::time::Instant;
 
 use super::answer::{Answer, Silence};
 use super::client::Client;
-use super::queue::{Next, Now, Queue, Ticket};
+use super::queue::{Next, Now, PAYLOADS, Place, Queue, Ticket};
 use super::request::{Reply, Request};
-use super::types::{Changed, SweepRow, WriteGuard};
+use super::types::{Changed, Key, Outline, Payload, PayloadProblem, PayloadReader, SweepRow, WriteGuard};
 use crate::lock::lock;
 use crate::services::token::Token;
 
@@ -103,11 +103,34 @@ pub(super) fn now(start: Instant) -> Now {
     }
 }
 
+/// Reads payloads, each once there is a place for it: all queues have as many as one may hold.
+#[derive(Clone)]
+pub(super) struct Payloads {
+    places: Arc<Semaphore>,
+    reader: PayloadReader,
+}
+
+impl Payloads {
+    pub fn new(reader: PayloadReader) -> Self {
+        Self {
+            places: Arc::new(Semaphore::new(PAYLOADS)),
+            reader,
+        }
+    }
+
+    async fn read(&self, key: Key, outline: Arc<Outline>) -> (Key, Result<(Payload, Place), PayloadProblem>) {
+        let place = self.places.clone().acquire_owned().await.ok();
+        let payload = (self.reader)(outline).await;
+        (key, payload.map(|payload| (payload, place)))
+    }
+}
+
 /// What a task works with.
 pub(super) struct Task {
     pub shared: Arc<Shared>,
     pub client: Client,
     pub guard: Arc<dyn WriteGuard>,
+    pub payloads: Payloads,
     pub outlets: Outlets,
     pub closing: watch::Receiver<bool>,
     /// Asked when nothing is on its way: true, once, if nobody uses the token any more. Then it is not handed out again.
@@ -121,16 +144,18 @@ pub(super) async fn run(task: Task) -> bool {
         shared,
         client,
         guard,
+        payloads,
         outlets,
         mut closing,
         is_unused,
     } = task;
-    let mut in_flight = FuturesUnordered::new();
+    let (mut in_flight, mut reads) = (FuturesUnordered::new(), FuturesUnordered::new());
     while !*closing.borrow() {
         let wait = loop {
             let next = shared.queue().next(shared.now(), guard.may_write());
             match next {
                 Next::Send(ticket) => in_flight.push(send(&shared, &client, &*guard, ticket)),
+                Next::Read(key, outline) => reads.push(payloads.read(key, outline)),
                 Next::Wait(until) => break until,
             }
         };
@@ -143,6 +168,9 @@ pub(super) async fn run(task: Task) -> bool {
         let until = wait.map_or_else(|| Instant::now() + Duration::from_hours(1), |at| shared.start + at);
         tokio::select! {
             Some((ticket, reply)) = in_flight.next(), if !in_flight.is_empty() => take(&shared, &outlets, &ticket, reply),
+            Some((key, payload)) = reads.next(), if !reads.is_empty() => {
+                shared.queue().took_payload(&key, payload, shared.now());
+            }
             () = shared.notify.notified() => {}
             () = tokio::time::sleep_until(until) => {}
             _ = closing.changed() => {}

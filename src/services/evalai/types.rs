@@ -5,15 +5,16 @@
 use std::sync::Arc;
 use std::time::Duration;
 
+use futures::future::BoxFuture;
 use jiff::Timestamp;
 
 use super::row::Row;
 use super::status::{Outcome, Progress, Status};
 use crate::observability::about::LogSpan;
 pub use crate::services::ObjectKey as Key;
-use crate::services::held_text::HeldText;
+use crate::services::archive::ContentId;
 use crate::services::token::Token;
-use leaderboard_api::Attempt;
+use leaderboard_api::{Attempt, Storage};
 
 /// The challenge of a Leaderboard and how it is asked.
 #[derive(Clone, Debug, PartialEq)]
@@ -110,45 +111,100 @@ pub enum DesiredUpdate {
     /// An agent runs.
     Running,
     /// Results so far.
-    Partial(Arc<Payload>),
+    Partial(Arc<Outline>),
     /// The end.
-    Final(Outcome, Arc<Payload>),
+    Final(Outcome, Arc<Outline>),
+}
+
+/// What a result or an end is sent with, but for what the bucket holds: that is read right before.
+#[derive(Clone, Debug, Default, PartialEq, Eq)]
+pub struct Outline {
+    /// Phase whose leaderboard gets the results.
+    pub phase: i64,
+    /// Shown to the participant.
+    pub stderr: String,
+    /// Shown to the hosts; only with an end.
+    pub environment_log: String,
+    /// Where results and other texts are; none where nothing is stored.
+    pub stored: Option<StoredResult>,
+}
+
+/// The results and texts that one report names.
+#[derive(Clone, Debug, PartialEq, Eq)]
+pub struct StoredResult {
+    pub storage: Storage,
+    /// Key prefix of the run, with the final slash.
+    pub prefix: String,
+    /// The report that was decided on.
+    pub report: ContentId,
+    /// Routes that it counts.
+    pub done: u32,
+    /// The metrics over the routes so far are wanted, where it has them.
+    pub so_far: bool,
+    pub patience: Patience,
+}
+
+/// Until when what cannot be read is waited for. After that it is left out.
+#[derive(Clone, Copy, Debug, PartialEq, Eq)]
+pub struct Patience {
+    /// Texts that are of another round than the report: they hardly change.
+    pub unfit: Timestamp,
+    /// Texts that the bucket does not give out.
+    pub unread: Timestamp,
+    /// The report itself.
+    pub report: Timestamp,
+}
+
+impl Patience {
+    /// Nothing is left out.
+    pub const ENDLESS: Self = Self {
+        unfit: Timestamp::MAX,
+        unread: Timestamp::MAX,
+        report: Timestamp::MAX,
+    };
 }
 
 /// Texts of an evaluation.
-#[derive(Clone, Debug, Default, PartialEq, Eq, Hash)]
+#[derive(Clone, Debug, Default, PartialEq, Eq)]
 pub struct Payload {
     /// Phase whose leaderboard gets the results.
     pub phase: i64,
     /// JSON text of the list of results; not sent with `failed` and `cancelled`.
     pub result: String,
     /// Shown to the participant.
-    pub stdout: HeldText,
+    pub stdout: String,
     /// Shown to the participant.
     pub stderr: String,
     /// JSON text, shown to the hosts.
-    pub metadata: HeldText,
+    pub metadata: String,
     /// Shown to the hosts; only with an end.
     pub environment_log: String,
 }
 
 impl Payload {
-    /// The same without the texts that take up much memory.
-    #[must_use]
-    pub fn without_texts(&self) -> Self {
+    /// Without results and texts of its own.
+    pub fn bare(outline: &Outline) -> Self {
         Self {
-            phase: self.phase,
-            result: self.result.clone(),
-            stderr: self.stderr.clone(),
-            environment_log: self.environment_log.clone(),
+            phase: outline.phase,
+            result: "[]".to_owned(),
+            stderr: outline.stderr.clone(),
+            environment_log: outline.environment_log.clone(),
             ..Self::default()
         }
     }
-
-    pub fn has_texts(&self) -> bool {
-        !self.stdout.is_empty() || !self.metadata.is_empty()
-    }
 }
+
+/// Why a payload cannot be read, in one sentence.
+#[derive(Clone, Debug, PartialEq, Eq)]
+pub enum PayloadProblem {
+    /// The bucket does not give it out.
+    Unread(String),
+    /// What is stored is not what the report names, or another report: the Pod ended between the two, or goes on.
+    Unfit(String),
+}
+
+/// Reads what an outline lacks.
+pub type PayloadReader = Arc<dyn Fn(Arc<Outline>) -> BoxFuture<'static, Result<Payload, PayloadProblem>> + Send + Sync>;
 
 /// What is known of a submission in EvalAI. Memory only.
 #[derive(Clone, Debug, Default, PartialEq)]
@@ -172,10 +228,12 @@ pub struct SubmissionState {
     pub overtaken: bool,
     /// What became of the update to an end.
     pub end: Option<Ended>,
-    /// The end that EvalAI refused is due again, and is to be sent with its texts: they were not kept meanwhile.
-    pub needs_texts: bool,
     /// When partial results were last taken.
     pub partial_at: Option<Timestamp>,
+    /// Routes of the partial results that were last answered.
+    pub partial_done: Option<u32>,
+    /// Why what the bucket holds of an end cannot be read.
+    pub unread: Option<String>,
     /// The last error; none after the next success.
     pub last_error: Option<String>,
     /// Nothing is written until then, because a write was not answered.

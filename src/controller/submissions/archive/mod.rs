@@ -1,13 +1,12 @@
 //! The controller's way to S3 and to the nodes' logs: one worker for each bucket, which does what reconciles ask for and wakes
 //! the object with the answer. No reconcile waits for either.
 //!
-//! Four kinds of work: the report of a run, the texts of a result, the fence against a lost Pod, the log of a failure. Each has
+//! Three kinds of work: the report of a run, the fence against a lost Pod, the log of a failure. Each has
 //! limits of its own, so that a bucket which hangs keeps nothing else waiting. What is due when is decided by `state`.
 
 mod request;
 mod run;
 mod state;
-mod text_budget;
 mod work;
 
 use std::sync::{Arc, Mutex};
@@ -23,8 +22,7 @@ use tokio::time::Instant;
 use tracing::Instrument;
 
 use super::failure_log::{LogDemand, Tail};
-use super::report_digest::ReportId;
-use super::view::{ObservedFence, ObservedLog, ObservedTexts, ReportDemand};
+use super::view::{ObservedFence, ObservedLog, ReportDemand};
 use crate::controller::objects::{Wake, uid};
 use crate::lock::lock;
 use crate::observability::tasks::Tasks;
@@ -33,7 +31,6 @@ use crate::services::aws::Aws;
 use leaderboard_api::{RunPlan, Storage, Submission, SubmissionStatus, effective};
 use request::{Done, Target, Uid, Work};
 use state::{SeenReport, State};
-use text_budget::TextBudget;
 
 /// A worker whose bucket nobody uses ends after this long: the next submission of a quiet Leaderboard finds it ready.
 const LINGERS: Duration = Duration::from_mins(1);
@@ -46,7 +43,6 @@ struct Shared {
     client: Client,
     wake: Wake<Submission>,
     tasks: Tasks,
-    texts: TextBudget,
     /// A worker ends under this lock, and is asked for more under it.
     buckets: Mutex<Vec<Arc<Bucket>>>,
 }
@@ -78,7 +74,6 @@ impl Bucket {
 /// What a run's worker remembers of it.
 pub struct Observed {
     pub report: SeenReport,
-    pub texts: ObservedTexts,
     pub fence: ObservedFence,
     pub log: ObservedLog,
 }
@@ -91,7 +86,6 @@ impl ArchiveWorkers {
             client,
             wake,
             tasks,
-            texts: TextBudget::new(),
             buckets: Mutex::default(),
         }))
     }
@@ -108,7 +102,6 @@ impl ArchiveWorkers {
         let state = guard.as_deref().unwrap_or(&nothing);
         Observed {
             report: state.report(uid, job, pod, now),
-            texts: state.texts(uid),
             fence: state.fence(uid, job, now),
             log: state.log(uid, job, is_over, now),
         }
@@ -126,22 +119,6 @@ impl ArchiveWorkers {
             self.ask(submission, status, ended, |state, uid, target, now| {
                 state.demand(uid, target, demand, now);
             });
-        }
-    }
-
-    /// Asks for the texts of a report.
-    pub fn want_texts(&self, submission: &Submission, status: &SubmissionStatus, of: ReportId) {
-        let ended = status.times.finished.as_ref().map(|at| at.0);
-        self.ask(submission, status, ended, |state, uid, target, now| {
-            state.want_texts(uid, target, of, now);
-        });
-    }
-
-    /// Drops the texts of a report: they are with EvalAI's side, or nobody wants them.
-    pub fn drop_texts(&self, submission: &Submission, status: &SubmissionStatus) {
-        if let Some(bucket) = self.known_bucket(status) {
-            lock(&bucket.state).drop_texts(uid(submission));
-            bucket.notify.notify_one();
         }
     }
 
@@ -238,7 +215,6 @@ struct ArchiveWorker {
     shared: Arc<Shared>,
     bucket: Arc<Bucket>,
     archive: Archive,
-    texts: TextBudget,
 }
 
 impl ArchiveWorker {
@@ -250,7 +226,6 @@ impl ArchiveWorker {
         });
         let worker = Self {
             archive: Archive::of_storage(&shared.aws, storage),
-            texts: shared.texts.of_another(),
             shared: Arc::clone(shared),
             bucket: Arc::clone(&bucket),
         };
@@ -296,7 +271,7 @@ impl ArchiveWorker {
 
     async fn done(&self, work: Work) -> (Work, Done) {
         let archive = self.archive.at_prefix(&*work.target.prefix);
-        let done = work::carry_out(&self.shared.client, &archive, &self.texts, &work);
+        let done = work::carry_out(&self.shared.client, &archive, &work);
         let done = done.instrument(work.span()).await;
         (work, done)
     }

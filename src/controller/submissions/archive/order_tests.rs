@@ -34,12 +34,10 @@ fn of_ends_that_wait_the_oldest_is_read_first() {
         stage: Stage::JobEnded,
         period: Duration::from_secs(10),
     };
-    let (mut reports, mut texts) = (State::default(), State::default());
+    let mut reports = State::default();
     for (name, seconds) in [("new", 1), ("oldest", 30), ("old", 20)] {
         let (uid, target) = (Uid::from(name), ended(Duration::from_secs(seconds), now));
         reports.demand(&uid, &target, Some(demand.clone()), now);
-        texts.want_texts(&uid, &target, ReportId::default(), now);
     }
     assert_eq!(order(reports, now), ["oldest", "old", "new"]);
-    assert_eq!(order(texts, now), ["oldest", "old", "new"]);
 }

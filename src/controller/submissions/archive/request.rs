@@ -8,7 +8,7 @@ use tracing::Span;
 
 use crate::controller::submissions::failure_log::{LogAnswer, LogDemand, Tail};
 use crate::controller::submissions::report_digest::ReportDigest;
-use crate::controller::submissions::view::{ReportDemand, Stage, TextProblem, Texts};
+use crate::controller::submissions::view::ReportDemand;
 use crate::observability::about;
 use leaderboard_api::{Attempt, JobNumber};
 
@@ -20,13 +20,12 @@ pub(super) enum Kind {
     Fence,
     Ended,
     Log,
-    Texts,
     Live,
 }
 
-pub(super) const KINDS: [Kind; 5] = [Kind::Fence, Kind::Ended, Kind::Log, Kind::Texts, Kind::Live];
+pub(super) const KINDS: [Kind; 4] = [Kind::Fence, Kind::Ended, Kind::Log, Kind::Live];
 /// How much of each kind is under way at once.
-pub(super) const LIMITS: [usize; 5] = [16, 32, 8, 4, 32];
+pub(super) const LIMITS: [usize; 4] = [16, 32, 8, 32];
 
 /// Where a run's files are, and which object they belong to.
 #[derive(Clone, Debug, PartialEq)]
@@ -65,9 +64,6 @@ pub(super) enum What {
         sent: Sent,
         etag: Option<String>,
     },
-    Texts {
-        sent: Option<Sent>,
-    },
     Fence {
         job: JobNumber,
         mark: String,
@@ -101,13 +97,6 @@ pub(super) struct Sent {
     pub memory: u64,
 }
 
-impl Sent {
-    /// Whether the run went on when it was sent.
-    pub(super) fn is_live(&self) -> bool {
-        self.demand.stage == Stage::Live
-    }
-}
-
 /// What a read of the report brought.
 #[derive(Clone, Debug, PartialEq)]
 pub(super) enum Answer {
@@ -128,16 +117,6 @@ pub(super) enum Answer {
 #[derive(Clone, Debug, PartialEq)]
 pub(super) enum Done {
     Report(Answer),
-    Texts {
-        report: Answer,
-        texts: Result<Texts, String>,
-    },
     Fence(Result<(), String>),
     Log(LogAnswer),
-}
-
-impl TextProblem {
-    pub(super) fn unfit(key: &str, problem: &str) -> Self {
-        Self::Unfit(format!("{key} {problem}"))
-    }
 }

@@ -6,8 +6,8 @@ use tokio::time::Instant;
 
 use super::request::{Answer, KINDS, Sent, Target};
 use crate::controller::submissions::failure_log::{LogDemand, Tail};
-use crate::controller::submissions::report_digest::{ReportDigest, ReportId};
-use crate::controller::submissions::view::{ObservedLog, ObservedReport, ObservedTexts, ReportDemand, Stage, Texts};
+use crate::controller::submissions::report_digest::ReportDigest;
+use crate::controller::submissions::view::{ObservedLog, ObservedReport, ReportDemand, Stage};
 use leaderboard_api::{Attempt, JobNumber};
 
 pub(super) struct Run {
@@ -15,7 +15,6 @@ pub(super) struct Run {
     pub due: [Option<Instant>; KINDS.len()],
     pub report: Option<ReportRun>,
     /// Boxed, as most runs have none of these most of the time.
-    pub texts: Option<Box<TextsRun>>,
     pub fence: Option<Box<FenceRun>>,
     pub log: Option<Box<LogRun>>,
 }
@@ -39,13 +38,6 @@ pub(super) enum Content {
     Report(Arc<ReportDigest>),
 }
 
-pub(super) struct TextsRun {
-    pub wanted: ReportId,
-    pub is_under_way: bool,
-    pub tried: Option<Instant>,
-    pub got: ObservedTexts,
-}
-
 pub(super) struct FenceRun {
     pub job: JobNumber,
     pub mark: String,
@@ -67,22 +59,6 @@ pub(super) struct LogRun {
 pub(super) fn answers(sent: &ReportDemand, wanted: &ReportDemand) -> bool {
     let is_of_pod = sent.pod == wanted.pod || sent.stage == Stage::JobEnded;
     sent.job == wanted.job && is_of_pod && sent.stage >= wanted.stage
-}
-
-impl TextsRun {
-    /// Returns whether there is something new to decide on. Another text for the same is not: it would be asked for again at once.
-    pub fn take(&mut self, texts: Result<Texts, String>) -> bool {
-        let got = texts.map_or_else(ObservedTexts::Unread, |texts| ObservedTexts::Read(Arc::new(texts)));
-        let is_same = match (&self.got, &got) {
-            (ObservedTexts::Unread(_), ObservedTexts::Unread(_)) => true,
-            (ObservedTexts::Read(old), ObservedTexts::Read(new)) => {
-                old.of == new.of && old.problem.is_some() == new.problem.is_some()
-            }
-            _ => false,
-        };
-        self.got = got;
-        !is_same
-    }
 }
 
 impl ReportRun {

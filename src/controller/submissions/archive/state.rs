@@ -10,12 +10,9 @@ use std::time::Duration;
 use tokio::time::Instant;
 
 use super::request::{Done, KINDS, Kind, LIMITS, Target, Uid, What, Work};
-use super::run::{FenceRun, LogRun, ReportRun, Run, TextsRun, answers};
+use super::run::{FenceRun, LogRun, ReportRun, Run, answers};
 use crate::controller::submissions::failure_log::{LogAnswer, LogDemand, Tail};
-use crate::controller::submissions::report_digest::ReportId;
-use crate::controller::submissions::view::{
-    ObservedFence, ObservedLog, ObservedReport, ObservedTexts, ReportDemand, Stage,
-};
+use crate::controller::submissions::view::{ObservedFence, ObservedLog, ObservedReport, ReportDemand, Stage};
 use leaderboard_api::JobNumber;
 
 /// Time between two reads of reports in one bucket: at most 100 a second.
@@ -24,7 +21,7 @@ const SPACING: Duration = Duration::from_millis(10);
 const LIVE_A_SECOND: f64 = 100.0;
 /// When a read that failed is made again while a decision waits for it.
 const READ_AGAIN: Duration = Duration::from_secs(10);
-/// The same of texts, of the fence and of a log.
+/// The same of the fence and of a log.
 const TRY_AGAIN: Duration = Duration::from_secs(3);
 /// How long the fence is tried. After that `decide` goes on without it, and a late mark would stop the next Pod.
 pub(super) const FENCE_TRIES: Duration = Duration::from_mins(1);
@@ -113,50 +110,6 @@ impl State {
             stage: known.of.as_ref().filter(is_of).map(|sent| sent.stage),
             waited: now.saturating_duration_since(known.since),
         }
-    }
-
-    /// Asks for the texts of a report.
-    pub fn want_texts(&mut self, uid: &Uid, target: &Arc<Target>, id: ReportId, now: Instant) {
-        let run = self.run(uid, target);
-        let known = run.texts.get_or_insert_with(|| {
-            Box::new(TextsRun {
-                wanted: id,
-                is_under_way: false,
-                tried: None,
-                got: ObservedTexts::NotRead,
-            })
-        });
-        let is_new = known.wanted != id;
-        known.wanted = id;
-        let is_there = matches!(&known.got, ObservedTexts::Read(texts) if texts.of == id && texts.problem.is_none());
-        if is_there || known.is_under_way {
-            return;
-        }
-        let again = known
-            .tried
-            .filter(|_| !is_new)
-            .map_or_else(|| target.due(now), |tried| now.max(tried + TRY_AGAIN));
-        self.plan(uid, Kind::Texts, Some(again));
-    }
-
-    /// Drops texts that nobody needs any more; those that are just being read are kept.
-    pub fn drop_texts(&mut self, uid: &str) {
-        let Some((uid, run)) = self.runs.get_key_value(uid) else {
-            return;
-        };
-        if run.texts.as_ref().is_some_and(|texts| !texts.is_under_way) {
-            let uid = uid.clone();
-            self.plan(&uid, Kind::Texts, None);
-            if let Some(run) = self.runs.get_mut(&uid) {
-                run.texts = None;
-            }
-            self.tidy(&uid);
-        }
-    }
-
-    pub fn texts(&self, uid: &str) -> ObservedTexts {
-        let texts = self.runs.get(uid).and_then(|run| run.texts.as_ref());
-        texts.map_or(ObservedTexts::NotRead, |texts| texts.got.clone())
     }
 
     /// Asks for our own mark in the place of a lost Pod's.
@@ -305,23 +258,6 @@ impl State {
                 self.plan_read(&work.uid, now);
                 is_new
             }
-            (What::Texts { sent }, Done::Texts { report, texts }) => {
-                let Some(run) = self.runs.get_mut(&work.uid) else {
-                    return false;
-                };
-                let mut is_new = false;
-                if let (Some(known), Some(sent)) = (run.report.as_mut(), sent)
-                    && known.memory == sent.memory
-                {
-                    is_new = known.take(&sent.demand, report);
-                }
-                if let Some(known) = run.texts.as_mut() {
-                    known.is_under_way = false;
-                    known.tried = Some(now);
-                    is_new |= known.take(texts);
-                }
-                is_new
-            }
             (What::Fence { job, .. }, Done::Fence(result)) => self.fence_done(&work.uid, *job, &result, now),
             (What::Log { demand, .. }, Done::Log(answer)) => self.log_done(&work.uid, demand, answer, now),
             _ => false,
@@ -379,12 +315,6 @@ impl State {
                 What::Report {
                     sent: report.sent(),
                     etag: report.etag.clone(),
-                }
-            }
-            Kind::Texts => {
-                run.texts.as_mut()?.is_under_way = true;
-                What::Texts {
-                    sent: run.report.as_ref().map(ReportRun::sent),
                 }
             }
             Kind::Fence => {
@@ -459,7 +389,6 @@ impl State {
                 target: Arc::clone(target),
                 due: [None; KINDS.len()],
                 report: None,
-                texts: None,
                 fence: None,
                 log: None,
             })
@@ -471,7 +400,7 @@ impl State {
 
     /// Drops a run of which nothing is wanted.
     fn tidy(&mut self, uid: &Uid) {
-        let is_idle = |run: &Run| run.texts.is_none() && run.fence.is_none() && run.log.is_none();
+        let is_idle = |run: &Run| run.fence.is_none() && run.log.is_none();
         if self
             .runs
             .get(uid)

@@ -3,7 +3,7 @@
 use super::*;
 use crate::controller::submissions::archive::request::Answer;
 use crate::controller::submissions::report_digest::ReportDigest;
-use crate::controller::submissions::view::{LogAt, LogPlace, Texts};
+use crate::controller::submissions::view::{LogAt, LogPlace};
 use leaderboard_api::Attempt;
 
 struct Bench {
@@ -334,23 +334,6 @@ fn what_is_dropped_or_goes_on_again_is_not_answered_by_what_was_asked_before() {
 }
 
 #[test]
-fn texts_that_cannot_be_read_wake_their_submission_once() {
-    let mut bench = Bench::new();
-    let id = ReportId::of(b"1");
-    let want = |bench: &mut Bench| bench.state.want_texts(&uid("u"), &bench.target.clone(), id, bench.now);
-    for (number, is_new) in [(1, true), (2, false), (3, false)] {
-        want(&mut bench);
-        let work = bench.begin();
-        let done = Done::Texts {
-            report: Answer::Failed("away".into()),
-            texts: Err(format!("request {number} timed out")),
-        };
-        assert_eq!(bench.state.done(&work, done, bench.now), is_new);
-        bench.wait(TRY_AGAIN);
-    }
-}
-
-#[test]
 fn a_fence_is_tried_until_it_is_held_or_its_time_is_over() {
     let mut bench = Bench::new();
     assert_eq!(bench.fence(), ObservedFence::NotRequested);
@@ -419,55 +402,6 @@ fn a_log_that_was_found_is_stored_at_the_end_and_given_up_after_some_tries() {
     );
     assert_eq!(bench.state.tail("u", again(1)), None);
     assert!(bench.is_idle());
-}
-
-#[test]
-fn texts_are_read_once_for_a_report_and_again_when_they_could_not_be_read() {
-    let mut bench = Bench::new();
-    let [first, second] = [ReportId::of(b"1"), ReportId::of(b"2")];
-    let want = |bench: &mut Bench, id| bench.state.want_texts(&uid("u"), &bench.target.clone(), id, bench.now);
-    let read = |bench: &mut Bench, texts| {
-        let work = bench.begin();
-        let done = Done::Texts {
-            report: found(4),
-            texts,
-        };
-        assert!(bench.state.done(&work, done, bench.now));
-    };
-    want(&mut bench, first);
-    read(&mut bench, Err("away".into()));
-    assert_eq!(bench.state.texts("u"), ObservedTexts::Unread("away".into()));
-    want(&mut bench, first);
-    assert!(bench.is_idle());
-    bench.wait(TRY_AGAIN);
-    let of = |of| Ok(Texts { of, ..Texts::default() });
-    read(&mut bench, of(first));
-    want(&mut bench, first);
-    bench.wait(TRY_AGAIN);
-    assert!(bench.is_idle(), "they are there");
-    want(&mut bench, second);
-    read(&mut bench, of(second));
-}
-
-#[test]
-fn texts_bring_the_report_that_names_them() {
-    let mut bench = Bench::new();
-    bench.demand(Stage::Live);
-    bench.read(found(1));
-    bench
-        .state
-        .want_texts(&uid("u"), &bench.target.clone(), ReportId::of(b"1"), bench.now);
-    let work = bench.begin();
-    let texts = Ok(Texts::default());
-    bench.state.done(
-        &work,
-        Done::Texts {
-            report: found(2),
-            texts,
-        },
-        bench.now,
-    );
-    assert_eq!((bench.done(), bench.stage()), (Some(2), Some(Stage::Live)));
 }
 
 #[test]

@@ -11,7 +11,7 @@ use tokio::time::timeout;
 
 use super::*;
 use crate::controller::fixtures::{Cluster, Surroundings, leaderboard, surroundings, with_job};
-use crate::controller::submissions::view::{ObservedReport, Stage, TextProblem};
+use crate::controller::submissions::view::{ObservedReport, Stage};
 use leaderboard_api::{Attempt, JobNumber};
 
 /// Longer than a read takes on a busy machine.
@@ -160,66 +160,6 @@ async fn a_report_of_before_a_restore_may_be_of_a_later_attempt() {
 }
 
 #[tokio::test]
-async fn texts_count_only_with_the_digest_that_the_report_names() {
-    let mut bench = bench().await;
-    bench.stores("logcopy/report.json", report("all is well"));
-    for (stored, problem) in [
-        (None, Some("evalai/stdout.txt is missing although the report names it")),
-        (
-            Some("of a later round"),
-            Some("evalai/stdout.txt is of another round than the report"),
-        ),
-        (Some("all is well"), None),
-    ] {
-        if let Some(stored) = stored {
-            bench.stores("evalai/stdout.txt", stored);
-        }
-        bench
-            .workers()
-            .want_texts(&bench.submission, &bench.status(), ReportId::default());
-        let ObservedTexts::Read(texts) = bench.answer().await.texts else {
-            panic!("no texts")
-        };
-        assert_eq!(texts.problem, problem.map(|why| TextProblem::Unfit(why.into())));
-        assert_eq!(
-            (texts.result.as_str(), &*texts.metadata),
-            ("[1]", ""),
-            "the numbers are the report's"
-        );
-        assert_eq!(&*texts.stdout, if problem.is_none() { "all is well" } else { "" });
-        bench.workers().forget("uid-of-sub");
-    }
-}
-
-#[tokio::test]
-async fn a_text_that_is_too_large_is_left_out_at_once_and_reported() {
-    let mut bench = bench().await;
-    let mut named: serde_json::Value = serde_json::from_str(&report("all is well")).unwrap();
-    // It is not even asked for: the bucket of this test has none.
-    named["files"]["evalai/metadata.json"] = json!({"size": (4 << 20) + 1, "sha256": ""});
-    bench.stores("logcopy/report.json", named.to_string());
-    bench.stores("evalai/stdout.txt", "all is well");
-    let workers = bench.workers();
-    workers.want_texts(&bench.submission, &bench.status(), ReportId::default());
-    let ObservedTexts::Read(texts) = bench.answer().await.texts else {
-        panic!("no texts")
-    };
-    assert_eq!(
-        (texts.problem.as_ref(), &*texts.stdout, &*texts.metadata),
-        (None, "all is well", "")
-    );
-    assert_eq!(
-        texts.left_out.as_deref(),
-        Some(
-            "evalai/metadata.json was left out: it has 4194305 bytes, and EvalAI is sent texts of up to 4 MiB. It is in the \
-             bucket."
-        )
-    );
-    bench.workers().drop_texts(&bench.submission, &bench.status());
-    assert_eq!(bench.seen().texts, ObservedTexts::NotRead);
-}
-
-#[tokio::test]
 async fn leaderboards_that_keep_their_objects_differently_share_a_bucket_and_no_worker() {
     let bench = bench().await;
     let mut other = bench.status();
@@ -244,9 +184,9 @@ async fn a_worker_ends_when_nobody_uses_its_bucket_and_begins_anew_with_the_next
     let (workers, status) = (&around.context.workers.archive, submission.status.clone().unwrap());
     let runs = || workers.0.tasks.names().contains(&"archive one-bucket".to_owned());
     for _ in 0..2 {
-        workers.want_texts(&submission, &status, ReportId::default());
+        workers.want_fence(&submission, &status);
         tokio::time::sleep(2 * LINGERS).await;
-        assert!(runs(), "its texts are needed");
+        assert!(runs(), "its mark is needed");
         workers.forget("uid-of-sub");
         tokio::time::sleep(LINGERS / 2).await;
         assert!(runs(), "the next submission may come");

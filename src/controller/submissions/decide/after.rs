@@ -10,7 +10,7 @@ use super::plan_builder::{PlanBuilder, after, seconds};
 use super::reading::{self, Reading};
 use super::record::{self, is_superseded, record_end};
 use super::{accept, log, observe, retention, stop};
-use crate::controller::submissions::view::{EvalaiEnd, ObservedJob, ObservedTexts};
+use crate::controller::submissions::view::{EvalaiEnd, EvalaiView, ObservedJob};
 use leaderboard_api::conditions::{self, Truth};
 use leaderboard_api::text::sentence;
 use leaderboard_api::{Ingested, JOB_SECONDS, State, reasons};
@@ -185,16 +185,12 @@ fn publish(draft: &mut PlanBuilder<'_>, log_left: Option<Duration>) -> Delivery 
     match view.end {
         Some(EvalaiEnd::Published { at }) => Delivery::Answered(at),
         Some(EvalaiEnd::Ended { status }) => amend(draft, &status),
-        Some(EvalaiEnd::Refused { message, is_due }) => {
+        Some(EvalaiEnd::Refused { message }) => {
             refused(draft, &message);
-            if is_due {
-                // Why it cannot be read is not what its end waits for.
-                let _ = send_result(draft, log_left);
-            }
             Delivery::Refused
         }
         None => {
-            send_end(draft, view.error, is_overtaken, log_left);
+            send_end(draft, view, is_overtaken, log_left);
             Delivery::Waiting
         }
     }
@@ -215,7 +211,7 @@ fn note_late_cancel(draft: &mut PlanBuilder<'_>) {
 
 /// Sends the end with all that belongs to it, once that is there. Returns why it cannot be read.
 fn send_result(draft: &mut PlanBuilder<'_>, log_left: Option<Duration>) -> Option<String> {
-    match reading::result_of_end(draft) {
+    match reading::report_of_end(draft) {
         Reading::Waits(why) => return why,
         Reading::Done if log_left.is_some() => {}
         Reading::Done => draft.act(Action::UpdateEvalai(match draft.status.state_of_conditions() {
@@ -228,10 +224,12 @@ fn send_result(draft: &mut PlanBuilder<'_>, log_left: Option<Duration>) -> Optio
 }
 
 /// Sends the end, and shows that EvalAI does not have it yet.
-fn send_end(draft: &mut PlanBuilder<'_>, error: Option<String>, is_overtaken: bool, log_left: Option<Duration>) {
-    let why = send_result(draft, log_left);
+fn send_end(draft: &mut PlanBuilder<'_>, evalai: EvalaiView, is_overtaken: bool, log_left: Option<Duration>) {
+    let why = send_result(draft, log_left).or(evalai.unread);
     let unread = why.map(|why| cannot_be_read(draft, conditions::PUBLISHED, &why));
-    let failed = error.map(|e| format!("The last request failed: {}", sentence(&e)));
+    let failed = evalai
+        .error
+        .map(|e| format!("The last request failed: {}", sentence(&e)));
     let failed = failed.or(unread);
     let (reason, message) = if is_overtaken {
         (
@@ -261,11 +259,8 @@ fn published(draft: &mut PlanBuilder<'_>, team: Option<&str>) {
              {ours}. Set the team back in EvalAI, or correct the table."
         )
     });
-    let left_out = match &draft.view.texts {
-        ObservedTexts::Read(texts) => texts.left_out.clone(),
-        ObservedTexts::NotRead | ObservedTexts::Unread(_) => None,
-    };
-    let shown = message.clone().or(left_out).unwrap_or_default();
+    let left_out = draft.view.report.ours().and_then(|report| report.left_out.as_deref());
+    let shown = message.as_deref().or(left_out).unwrap_or_default().to_owned();
     draft.condition(conditions::PUBLISHED, Truth::True, reasons::PUBLISHED, &shown);
     if let Some(message) = message {
         draft.event(true, reasons::TEAM_DIFFERS, message);

@@ -321,10 +321,10 @@ fn update_evalai(draft: &mut PlanBuilder<'_>) {
     }
     draft.act(Action::UpdateEvalai(EvalaiUpdate::Running));
     let Some(report) = draft.view.report.ours() else { return };
-    let is_new = report.done > 0 && Some(report.done) != draft.view.partial_sent;
-    if is_new && reading::has_texts(draft, report) {
+    let evalai = draft.view.evalai.as_ref();
+    if report.done > 0 && Some(report.done) != evalai.and_then(|evalai| evalai.partial_done) {
         // EvalAI keeps a partial result, and would show it as final of a row that its participant calls finished.
-        let is_shown = draft.view.evalai.as_ref().is_some_and(|evalai| evalai.shows_partial);
+        let is_shown = evalai.is_some_and(|evalai| evalai.shows_partial);
         draft.act(Action::UpdateEvalai(EvalaiUpdate::Partial { is_shown }));
     }
 }

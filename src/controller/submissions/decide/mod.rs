@@ -50,7 +50,7 @@ pub use after::previous_controller;
 pub(super) use image::pinned;
 pub use plan::{Action, EvalaiUpdate, Event, Plan, SlotUse, StatusWrite, TableUpdate, job_name};
 use plan_builder::PlanBuilder;
-pub use reading::awaits_publication;
+pub use reading::{awaits_publication, patience};
 
 /// Decides one reconcile.
 pub fn decide(view: &View) -> Plan {
@@ -66,7 +66,6 @@ pub fn decide(view: &View) -> Plan {
         }
     }
     look_up_node(&mut draft);
-    reading::drop_texts(&mut draft);
     let report = reading::demand(&draft);
     draft.into_plan(report)
 }

@@ -5,7 +5,6 @@ use std::time::Duration;
 use crate::controller::slots::turns::InLine;
 use crate::controller::submissions::foreign_runs;
 use crate::controller::submissions::other_results;
-use crate::controller::submissions::report_digest::ReportId;
 use crate::controller::submissions::view::{LogPlace, ReportDemand};
 use crate::pod::run::Stop;
 use leaderboard_api::{JobNumber, SubmissionStatus, names};
@@ -91,10 +90,6 @@ pub enum Action {
     AnnotateStop { pod: String, stop: Stop },
     /// Keep the tail of the log that explains the failure, from the first of these places that has it.
     KeepLog { places: Vec<LogPlace> },
-    /// Read the texts of this report, so that they can be published.
-    ReadTexts { of: ReportId },
-    /// Give the memory of the texts that were read back.
-    DropTexts,
     /// Ask the API server for this node.
     LookUpNode(String),
     /// Ask EvalAI for the submission.

@@ -1,6 +1,6 @@
 //! What a decision needs of S3, and how long it waits for it. Pure.
 //!
-//! Reports and texts are read next to the reconciles; an answer wakes the object. An end is decided only on a report that was
+//! Reports are read next to the reconciles; an answer wakes the object. An end is decided only on a report that was
 //! asked for after that end was seen: one that was asked for before may lack what was stored last.
 
 use std::time::Duration;
@@ -9,12 +9,10 @@ use jiff::{SignedDuration, Timestamp};
 
 use super::plan::Action;
 use super::plan_builder::{PlanBuilder, left_of};
-use crate::controller::submissions::report_digest::ReportDigest;
-use crate::controller::submissions::view::{
-    ObservedFence, ObservedJob, ObservedReport, ObservedTexts, ReportDemand, Stage, TextProblem,
-};
+use crate::controller::submissions::view::{ObservedFence, ObservedJob, ObservedReport, ReportDemand, Stage, View};
+use crate::services::evalai::Patience;
 use leaderboard_api::conditions::{self, Condition};
-use leaderboard_api::{SubmissionStatus, reasons};
+use leaderboard_api::{State, SubmissionStatus, reasons};
 
 /// How long an answer is waited for before the status shows that.
 const ANSWER: Duration = Duration::from_secs(15);
@@ -128,49 +126,6 @@ pub(super) fn report_of_end(draft: &mut PlanBuilder<'_>) -> Reading {
     }
 }
 
-/// Whether all that an end is published with is there. Asks for it.
-pub(super) fn result_of_end(draft: &mut PlanBuilder<'_>) -> Reading {
-    let reading = report_of_end(draft);
-    let view = draft.view;
-    let (Reading::Done, Some(report)) = (&reading, view.report.ours()) else {
-        return reading;
-    };
-    let (why, waits) = match &view.texts {
-        ObservedTexts::Read(texts) if texts.of == report.id => match &texts.problem {
-            None => return Reading::Done,
-            Some(TextProblem::Unread(why)) => (Some(why.clone()), may_wait(draft, END_WAITS)),
-            Some(TextProblem::Unfit(why)) => (Some(why.clone()), may_wait(draft, UNFIT_WAITS)),
-        },
-        ObservedTexts::Unread(why) => (Some(why.clone()), draft.is_successful() || may_wait(draft, END_WAITS)),
-        ObservedTexts::NotRead | ObservedTexts::Read(_) => (None, draft.is_successful() || may_wait(draft, END_WAITS)),
-    };
-    if !waits {
-        return Reading::Done;
-    }
-    draft.act(Action::ReadTexts { of: report.id });
-    Reading::Waits(why)
-}
-
-/// Whether the texts of a live report are there. Asks for them once: what is missing is left out, the next route has a result of
-/// its own.
-pub(super) fn has_texts(draft: &mut PlanBuilder<'_>, report: &ReportDigest) -> bool {
-    match &draft.view.texts {
-        ObservedTexts::Read(texts) if texts.of == report.id => texts.problem.is_none(),
-        _ => {
-            draft.act(Action::ReadTexts { of: report.id });
-            false
-        }
-    }
-}
-
-/// Texts that are with EvalAI's side, or that nobody needs, give their memory back before others are asked for.
-pub(super) fn drop_texts(draft: &mut PlanBuilder<'_>) {
-    let is_forgotten = draft.does(|action| *action == Action::Forget);
-    if draft.view.texts != ObservedTexts::NotRead && !is_forgotten && !awaits_publication(&draft.status) {
-        draft.act_first(Action::DropTexts);
-    }
-}
-
 /// Whether an end is still to be sent to EvalAI, with the texts that were read.
 pub fn awaits_publication(status: &SubmissionStatus) -> bool {
     let published = status.condition(conditions::PUBLISHED);
@@ -178,15 +133,31 @@ pub fn awaits_publication(status: &SubmissionStatus) -> bool {
     status.has_ended() && published.is_some_and(is_open)
 }
 
+/// Until when an end waits for what cannot be read of its result. What is Finished is nothing without its results.
+pub fn patience(view: &View, status: &SubmissionStatus) -> Patience {
+    let unread = waits_until(view, status, END_WAITS);
+    let is_successful = status.state_of_conditions() == State::Finished;
+    Patience {
+        unfit: waits_until(view, status, UNFIT_WAITS),
+        unread,
+        report: if is_successful { Timestamp::MAX } else { unread },
+    }
+}
+
 /// Whether an end that is published once waits for its result: so long after it was decided, and not until the finalizer gives up.
 fn may_wait(draft: &PlanBuilder<'_>, longest: SignedDuration) -> bool {
-    let end = draft.status.condition(conditions::FINISHED);
+    draft.now() < waits_until(draft.view, &draft.status, longest)
+}
+
+fn waits_until(view: &View, status: &SubmissionStatus, longest: SignedDuration) -> Timestamp {
+    let end = status.condition(conditions::FINISHED);
     let until = |from: Timestamp, time: SignedDuration| from.checked_add(time).unwrap_or(Timestamp::MAX);
-    let patience = until(end.map_or(draft.now(), |c| c.last_transition_time.0), longest);
-    let Some(deleted) = &draft.submission().metadata.deletion_timestamp else {
-        return draft.now() < patience;
+    let patience = until(end.map_or(view.now, |c| c.last_transition_time.0), longest);
+    let Some(deleted) = &view.submission.metadata.deletion_timestamp else {
+        return patience;
     };
-    let seconds = draft.leaderboard().map_or(0, |l| l.deadlines.finalize_seconds);
+    let leaderboard = view.leaderboard.as_ref();
+    let seconds = leaderboard.map_or(0, |leaderboard| leaderboard.spec.deadlines.finalize_seconds);
     let release = until(deleted.0, SignedDuration::from_secs(seconds) - BEFORE_RELEASE);
-    draft.now() < patience.min(release)
+    patience.min(release)
 }

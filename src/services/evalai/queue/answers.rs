@@ -12,11 +12,10 @@ use super::sub::{RETRY_END, Sub};
 use super::{Busy, Now, Queue, Ticket};
 use crate::backoff::Backoff;
 use crate::services::evalai::answer::{About, Answer, Refusal, Silence};
-use crate::services::evalai::payload::digest;
 use crate::services::evalai::request::{Reply, Request, SubmissionRef};
 use crate::services::evalai::row::Row;
 use crate::services::evalai::status::{Outcome, Status};
-use crate::services::evalai::types::{Changed, Ended, ImageAnswer};
+use crate::services::evalai::types::{Changed, Ended, ImageAnswer, Outline};
 
 /// After a refused token nothing is asked for so long, unless it is renewed.
 const TOKEN_PAUSE: Duration = Duration::from_mins(1);
@@ -172,15 +171,16 @@ impl Queue {
     fn wrote(&mut self, request: &Request, answer: Answer<()>, now: &Now) {
         let Some(subject) = request.submission() else { return };
         self.lanes.entry(subject.pk).or_default().busy = None;
+        let sent = self.sent_payload(&subject.key);
         match answer {
-            Answer::Done(()) => self.change(subject, |sub| done(sub, request, now)),
+            Answer::Done(()) => self.change(subject, |sub| done(sub, request, sent.as_ref(), now)),
             Answer::Throttled(_) => {}
-            Answer::Refused(refusal) => self.refused(subject, request, refusal, now),
+            Answer::Refused(refusal) => self.refused(subject, request, sent.as_ref(), refusal, now),
             Answer::Broken(why) => {
                 self.change(subject, |sub| {
                     // Part of it may have been done.
                     (sub.outdated, sub.wrote_at) = (true, now.at);
-                    drop_partial(sub, request);
+                    drop_partial(sub, request, sent.as_ref());
                     sub.write_failed(why, broken_pause(sub.write_failures), now);
                 });
             }
@@ -188,7 +188,14 @@ impl Queue {
         }
     }
 
-    fn refused(&mut self, subject: &SubmissionRef, request: &Request, refusal: Refusal, now: &Now) {
+    fn refused(
+        &mut self,
+        subject: &SubmissionRef,
+        request: &Request,
+        sent: Option<&Arc<Outline>>,
+        refusal: Refusal,
+        now: &Now,
+    ) {
         self.change(subject, |sub| match (refusal.about, request) {
             (About::Token, _) => {}
             (About::Missing, _) => {
@@ -198,7 +205,7 @@ impl Queue {
             }
             (About::Request, Request::Final(..)) => sub.refuse_end(refusal.message, now),
             (About::Request | About::Challenge, _) => {
-                drop_partial(sub, request);
+                drop_partial(sub, request, sent);
                 sub.write_failed(refusal.message, pause(sub.write_failures), now);
             }
         });
@@ -252,7 +259,7 @@ fn broken_pause(failures: u32) -> Duration {
     }
 }
 
-fn done(sub: &mut Sub, request: &Request, now: &Now) {
+fn done(sub: &mut Sub, request: &Request, sent: Option<&Arc<Outline>>, now: &Now) {
     match request {
         Request::Progress(_, progress, _) => {
             sub.wrote(progress.status(), now);
@@ -264,7 +271,7 @@ fn done(sub: &mut Sub, request: &Request, now: &Now) {
         Request::Partial(..) => {
             sub.wrote(Status::PartiallyEvaluated, now);
             sub.view.partial_at = Some(now.wall);
-            drop_partial(sub, request);
+            drop_partial(sub, request, sent);
         }
         Request::Final(_, outcome, _) => {
             let (outcome, at) = (*outcome, now.wall);
@@ -284,10 +291,10 @@ fn done(sub: &mut Sub, request: &Request, now: &Now) {
 }
 
 /// Partial results that were answered are not sent again, whatever the answer: newer ones come.
-fn drop_partial(sub: &mut Sub, request: &Request) {
-    let Request::Partial(_, payload) = request else { return };
-    sub.partial_sent = Some(digest(payload));
-    if sub.partial.as_ref().is_some_and(|wanted| wanted.what == *payload) {
-        sub.partial = None;
-    }
+fn drop_partial(sub: &mut Sub, request: &Request, sent: Option<&Arc<Outline>>) {
+    let Some(sent) = sent.filter(|_| matches!(request, Request::Partial(..))) else {
+        return;
+    };
+    sub.view.partial_done = sent.stored.as_ref().map(|stored| stored.done);
+    sub.partial.take_if(|wanted| wanted.what == *sent);
 }

@@ -20,6 +20,9 @@ const REFRESH_SHARE: u32 = 2;
 /// While writes are not allowed they are checked again so often: no event reports that they are.
 const RECHECK: Duration = Duration::from_secs(1);
 
+/// A payload is read at most so long before the budget allows its write.
+const AHEAD: Duration = Duration::from_secs(10);
+
 /// The order of all requests. What is due and comes first is sent next; all that comes after it waits for the budget.
 #[derive(Clone, Copy, Debug, PartialEq, Eq, PartialOrd, Ord)]
 enum Class {
@@ -71,6 +74,8 @@ fn question(since: Duration, now: &Now) -> Class {
 #[derive(Clone, Copy, Debug)]
 enum What<'a> {
     Sub(&'a Key, Step),
+    /// Not a request: what the next write of a submission is sent with.
+    Payload(&'a Key),
     List(i64, Purpose),
     Check(i64),
     /// What others wait for.
@@ -98,12 +103,16 @@ impl Queue {
     /// The next request, and marks it as sent. Without `may_write` every write is kept back.
     pub fn next(&mut self, now: Now, may_write: bool) -> Next {
         self.open_writes(&now);
+        self.tidy_payloads(&now);
         let (due, later): (Vec<_>, Vec<_>) = self
             .offers(&now, may_write)
             .into_iter()
             .partition(|offer| offer.ready <= now.at);
         let best = due.into_iter().min_by_key(|offer| offer.rank);
-        let affordable = best.map(|best| self.affordable_at(&now, best.rank));
+        let affordable = best.map(|best| match best.what {
+            What::Payload(_) => self.affordable_at(&now, best.rank).saturating_sub(AHEAD),
+            _ => self.affordable_at(&now, best.rank),
+        });
         let Some(best) = best.filter(|_| affordable <= Some(now.at)) else {
             let opens = (!self.open).then_some(self.not_before);
             let again = (!may_write).then(|| now.at + RECHECK);
@@ -118,6 +127,10 @@ impl Queue {
             }
             What::List(id, purpose) => self.start_list(id, purpose).map(|list| (list, None)),
             What::Check(id) => self.start_check(id).map(|check| (check, None)),
+            What::Payload(key) => {
+                let key = key.clone();
+                return self.start_payload(&key).unwrap_or(Next::Wait(Some(now.at + RECHECK)));
+            }
             What::Passing => self.passing.start(now.at).map(|(started, other)| {
                 number = Some(started);
                 (other, None)
@@ -202,43 +215,65 @@ impl Queue {
         let idle = Lane::default();
         let lane = self.lanes.get(&sub.pk).unwrap_or(&idle);
         let failures = sub.failures.max(sub.write_failures);
-        let offer = |class, since, ready: Duration, step| Offer {
+        let offer_of = |class, since, ready: Duration, what| Offer {
             rank: rank(class, failures, sub.end_since().filter(|_| class == Class::End), since),
             ready: ready.max(lane.hold_until),
-            what: What::Sub(key, step),
+            what,
         };
         let write = sub.next_write().filter(|_| may_write && now.at >= self.not_before);
-        // A list that is on its way may answer it.
-        let sweep = self
-            .challenges
-            .get(&sub.challenge)
-            .and_then(|c| c.lists.get(&Purpose::SweepSubmitted));
-        let asked = sub.asked.filter(|_| !sweep.is_some_and(|sweep| sweep.busy));
+        let lacks = write.is_some() && self.lacks_payload(key, sub);
+        // As long as its payload may not be read, the row is read for other reasons alone.
+        let free = if lacks {
+            self.payload_free_at(key, now)
+        } else {
+            Some(now.at)
+        };
+        let later = write.zip(free.filter(|free| *free > now.at));
+        let later = later.map(|((write, since), free)| offer_of(Class::of(write), since, free, What::Payload(key)));
+        let write = write.filter(|_| free.is_some_and(|free| free <= now.at));
         let is_checked = lane.checked.is_some_and(|at| now.at <= at + self.timing.fresh);
         let next = match write {
-            Some((write, since)) if is_checked && sub.may_write(write) => {
-                Some(offer(Class::Write, since, sub.retry_at, Step::Write(write)))
+            Some((write, since)) if !lacks && is_checked && sub.may_write(write) => {
+                let what = What::Sub(key, Step::Write(write));
+                Some(offer_of(Class::Write, since, sub.retry_at, what))
             }
             _ => {
-                let read = sub
-                    .read
-                    .filter(|_| !sub.outdated)
-                    .map_or(Duration::ZERO, |read| read + refresh);
-                let step = write.map_or(Step::Get, |_| Step::GetForWrite);
-                let wants = [
-                    write.map(|(write, since)| (Class::of(write), since, now.at)),
-                    asked.map(|since| (question(since, now), since, now.at)),
-                    sub.live.map(|_| (Class::Rest, read, read)),
-                ];
-                let first = wants.into_iter().flatten().min();
-                first.map(|(class, since, due)| offer(class, since, due.max(sub.retry_at), step))
+                let what = match write {
+                    Some(_) if lacks => What::Payload(key),
+                    Some(_) => What::Sub(key, Step::GetForWrite),
+                    None => What::Sub(key, Step::Get),
+                };
+                let first = self.wants(sub, write, now, refresh);
+                first.map(|(class, since, due)| offer_of(class, since, due.max(sub.retry_at), what))
             }
         };
         let image = sub.wants_image() && sub.asked.is_none();
-        let image = image.then(|| offer(Class::Free, now.at, sub.image_at, Step::Image));
+        let image = image.then(|| offer_of(Class::Free, now.at, sub.image_at, What::Sub(key, Step::Image)));
         let is_free = lane.busy.is_none();
-        let offers = [next, image].into_iter().flatten();
+        let offers = [next, later, image].into_iter().flatten();
         offers.filter(move |_| is_free)
+    }
+
+    /// Why the row of a submission is to be read, since when, and from when on: the first reason in the order.
+    fn wants(
+        &self,
+        sub: &Sub,
+        write: Option<(Write, Duration)>,
+        now: &Now,
+        refresh: Duration,
+    ) -> Option<(Class, Duration, Duration)> {
+        let known = sub.read.filter(|_| !sub.outdated);
+        let read = known.map_or(Duration::ZERO, |read| read + refresh);
+        // A list that is on its way may answer it.
+        let challenge = self.challenges.get(&sub.target.challenge);
+        let sweep = challenge.and_then(|challenge| challenge.lists.get(&Purpose::SweepSubmitted));
+        let asked = sub.asked.filter(|_| !sweep.is_some_and(|sweep| sweep.busy));
+        let wants = [
+            write.map(|(write, since)| (Class::of(write), since, now.at)),
+            asked.map(|since| (question(since, now), since, now.at)),
+            sub.live.map(|_| (Class::Rest, read, read)),
+        ];
+        wants.into_iter().flatten().min()
     }
 
     fn offers_of_challenge(&self, id: i64, challenge: &Challenge, now: &Now) -> Vec<Offer<'static>> {
@@ -250,7 +285,10 @@ impl Queue {
             })
         };
         let list = |purpose| challenge.lists.get(&purpose).copied().unwrap_or_default();
-        let is_live = self.subs.values().any(|sub| sub.challenge == id && sub.live.is_some());
+        let is_live = self
+            .subs
+            .values()
+            .any(|sub| sub.target.challenge == id && sub.live.is_some());
         let cancelled = is_live.then(|| {
             let purpose = Purpose::Cancel;
             offer(list(purpose), Class::Cancelled, What::List(id, purpose))
@@ -285,10 +323,10 @@ impl Queue {
 
     /// A request about a submission, and by when it has to leave.
     fn start_sub(&mut self, key: &Key, step: Step) -> Option<(Request, Option<Duration>)> {
-        let sub = self.subs.get_mut(key)?;
+        let sub = self.subs.get(key)?;
         let subject = SubmissionRef {
             key: key.clone(),
-            challenge: sub.challenge,
+            challenge: sub.target.challenge,
             pk: sub.pk,
             attempt: sub.run.attempt,
             log: sub.run.log.clone(),
@@ -301,8 +339,11 @@ impl Queue {
                 let named = sub.view.row.as_ref().is_some_and(|row| row.names(&sub.run.job));
                 Request::Progress(subject, progress, (!named).then(|| sub.run.job.clone()))
             }
-            Step::Write(Write::Partial) => Request::Partial(subject, sub.partial.as_ref()?.what.clone()),
-            Step::Write(Write::End) => Request::Final(subject, sub.outcome()?, sub.end.as_ref()?.what.1.clone()),
+            Step::Write(Write::Partial) => Request::Partial(subject, self.payload(key, &sub.partial.as_ref()?.what)?),
+            Step::Write(Write::End) => {
+                let payload = self.payload(key, &sub.end.as_ref()?.what.1)?;
+                Request::Final(subject, sub.outcome()?, payload)
+            }
         };
         let lane = self.lanes.entry(sub.pk).or_default();
         let checked = lane.checked.take().filter(|_| request.is_write());

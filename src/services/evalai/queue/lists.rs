@@ -78,7 +78,7 @@ impl Queue {
                 let live = self
                     .subs
                     .values()
-                    .filter(|sub| sub.challenge == id && sub.live.is_some());
+                    .filter(|sub| sub.target.challenge == id && sub.live.is_some());
                 let first = live.filter_map(Sub::submitted_at).min()?;
                 Some(back(first, SignedDuration::from_secs(1)))
             }

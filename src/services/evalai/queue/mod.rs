@@ -13,6 +13,7 @@ mod answers;
 mod choose;
 mod lists;
 mod passing;
+mod payloads;
 mod poll;
 mod purse;
 mod silence;
@@ -29,16 +30,17 @@ use std::time::Duration;
 use jiff::{SignedDuration, Timestamp};
 
 use self::passing::Passing;
+use self::payloads::Held;
+pub use self::payloads::{PAYLOADS, Place};
 use self::poll::{Challenge, Poll};
 pub use self::purse::{Purse, Share};
 use self::silence::Silent;
 use self::sub::{Pending, Sub};
 use super::budget::WINDOW;
 use super::labels::{Labels, compare};
-use super::payload::{check, digest, for_split};
 use super::request::{Purpose, Request};
 use super::status::{Outcome, Progress};
-use super::types::{Changed, DesiredUpdate, Ended, Key, Payload, Subject, SubmissionState, SweepRow, Target, Usage};
+use super::types::{Changed, DesiredUpdate, Ended, Key, Outline, Subject, SubmissionState, SweepRow, Target, Usage};
 
 /// Requests about submissions that may wait for an answer at once; lists come on top, one of a kind.
 const MAX_IN_FLIGHT: usize = 4;
@@ -96,6 +98,8 @@ impl Default for Timing {
 pub enum Next {
     /// Send this, and hand it back with its answer.
     Send(Ticket),
+    /// Read the payload of a submission's next write, and hand it to [`Queue::took_payload`].
+    Read(Key, Arc<Outline>),
     /// Nothing before that moment, unless there is a new update or an answer; none is never.
     Wait(Option<Duration>),
 }
@@ -145,7 +149,7 @@ pub struct Queue {
     pks: BTreeMap<i64, BTreeSet<Key>>,
     lanes: BTreeMap<i64, Lane>,
     challenges: BTreeMap<i64, Challenge>,
-    served: BTreeMap<Key, Target>,
+    served: BTreeMap<Key, Arc<Target>>,
     /// EvalAI's refusal of the token, and until when nothing is asked with it.
     token_refused: Option<(String, Duration)>,
     /// The server does not answer.
@@ -153,6 +157,8 @@ pub struct Queue {
     changes: BTreeSet<Changed>,
     sweep: Vec<SweepRow>,
     passing: Passing,
+    /// The payloads of writes that come soon.
+    held: BTreeMap<Key, Held>,
 }
 
 impl Queue {
@@ -174,21 +180,23 @@ impl Queue {
             changes: BTreeSet::new(),
             sweep: Vec::new(),
             passing: Passing::new(requests_per_minute, now.at),
+            held: BTreeMap::new(),
         }
     }
 
     /// A Leaderboard serves its challenge from now on: sweep and check it.
     pub fn serve(&mut self, leaderboard: &Key, target: &Target, now: Now) -> bool {
-        if self.served.get(leaderboard) == Some(target) {
+        if self.served.get(leaderboard).is_some_and(|known| **known == *target) {
             return false;
         }
+        let target = Arc::new(target.clone());
         self.served.insert(leaderboard.clone(), target.clone());
         self.challenges
             .entry(target.challenge)
             .or_insert_with(|| Challenge::new(target.period));
         self.arrange(now);
-        let ends = self.subs.values_mut().filter(|sub| sub.challenge == target.challenge);
-        ends.for_each(|sub| sub.fit_end(target, &now));
+        let of = (self.subs.values_mut()).filter(|sub| sub.target.leaderboard == *leaderboard);
+        of.for_each(|sub| sub.follow(&target, now.at));
         if let Some(challenge) = self.challenges.get_mut(&target.challenge) {
             for purpose in [Purpose::SweepSubmitted, Purpose::SweepResuming] {
                 challenge.lists.entry(purpose).or_insert_with(|| Poll::due(now.at));
@@ -262,13 +270,12 @@ impl Queue {
         let Some(sub) = self.enter(subject) else {
             return false;
         };
-        let target = &*subject.target;
         let before = sub.view.clone();
         let news = match update {
             DesiredUpdate::Queued => request_progress(sub, Progress::Queued, now),
             DesiredUpdate::Running => request_progress(sub, Progress::Running, now),
-            DesiredUpdate::Partial(payload) => request_partial(sub, target, payload, now),
-            DesiredUpdate::Final(outcome, payload) => request_end(sub, target, outcome, payload, now),
+            DesiredUpdate::Partial(outline) => request_partial(sub, outline, now),
+            DesiredUpdate::Final(outcome, outline) => request_end(sub, outcome, outline, now),
         };
         if sub.view != before {
             self.changes.insert(Changed::Submission(subject.key.clone()));
@@ -292,7 +299,7 @@ impl Queue {
         let pks = &self.pks;
         self.lanes
             .retain(|pk, lane| lane.busy.is_some() || lane.hold_until > now.at || pks.contains_key(pk));
-        self.drop_unused(sub.challenge);
+        self.drop_unused(sub.target.challenge);
         Some(sub)
     }
 
@@ -307,7 +314,7 @@ impl Queue {
     /// A challenge that no Leaderboard serves and no submission is of needs no memory.
     fn drop_unused(&mut self, challenge: i64) {
         let is_served = self.served.values().any(|target| target.challenge == challenge);
-        if !is_served && !self.subs.values().any(|sub| sub.challenge == challenge) {
+        if !is_served && !self.subs.values().any(|sub| sub.target.challenge == challenge) {
             self.challenges.remove(&challenge);
         }
     }
@@ -400,15 +407,17 @@ impl Queue {
     /// The submission's place, at this attempt; none if it is already further.
     fn enter(&mut self, subject: &Subject) -> Option<&mut Sub> {
         let Subject { target, key, pk, run } = subject;
+        // The Leaderboard's own word is newer than that of a reconcile.
+        let target = self.served.get(&target.leaderboard).unwrap_or(target).clone();
         self.challenges
             .entry(target.challenge)
             .or_insert_with(|| Challenge::new(target.period));
         let sub = self.subs.entry(key.clone()).or_insert_with(|| {
             self.pks.entry(*pk).or_default().insert(key.clone());
-            Sub::new(*pk, target.leaderboard.clone(), target.challenge, run.clone())
+            Sub::new(*pk, target.clone(), run.clone())
         });
-        if sub.leaderboard != target.leaderboard {
-            sub.leaderboard = target.leaderboard.clone();
+        if !Arc::ptr_eq(&sub.target, &target) {
+            sub.target = target;
         }
         if run.attempt > sub.run.attempt {
             sub.begin(run.clone());
@@ -464,42 +473,30 @@ fn request_progress(sub: &mut Sub, wanted: Progress, now: Now) -> bool {
     true
 }
 
-fn request_partial(sub: &mut Sub, target: &Target, payload: Arc<Payload>, now: Now) -> bool {
-    let payload = for_split(payload, &target.split);
-    let pending = sub.partial.as_ref().is_some_and(|partial| partial.what == payload);
-    if sub.has_end() || pending || sub.partial_sent == Some(digest(&payload)) {
-        return false;
-    }
-    if let Err(why) = check(&payload, &target.split, &target.labels) {
-        sub.view.last_error = Some(why);
+fn request_partial(sub: &mut Sub, outline: Arc<Outline>, now: Now) -> bool {
+    let pending = sub.partial.as_ref().is_some_and(|partial| partial.what == outline);
+    let done = outline.stored.as_ref().map(|stored| stored.done);
+    if sub.has_end() || pending || sub.view.partial_done >= done {
         return false;
     }
     // The oldest unsent goes first, however often it was replaced.
     let since = sub.partial.as_ref().map_or(now.at, |partial| partial.since);
-    sub.partial = Some(Pending { what: payload, since });
+    sub.partial = Some(Pending { what: outline, since });
     true
 }
 
-fn request_end(sub: &mut Sub, target: &Target, outcome: Outcome, payload: Arc<Payload>, now: Now) -> bool {
-    let closed = sub
-        .view
-        .end
-        .as_ref()
-        .is_some_and(|end| !matches!(end, Ended::Refused(_)));
-    let want = (outcome, for_split(payload, &target.split));
-    let is_again = sub.is_refused(&want);
-    let is_known = is_again && !sub.view.needs_texts;
-    if closed || is_known || sub.end.as_ref().is_some_and(|end| end.what == want) {
+fn request_end(sub: &mut Sub, outcome: Outcome, outline: Arc<Outline>, now: Now) -> bool {
+    let closed = (sub.view.end.as_ref()).is_some_and(|end| !matches!(end, Ended::Refused(_)));
+    let want = (outcome, outline);
+    if closed || sub.end.as_ref().is_some_and(|end| end.what == want) {
         return false;
     }
-    sub.misfit = sub::misfit(&want, target);
+    sub.misfit = None;
     let since = now.at;
     sub.end = Some(Pending { what: want, since });
     sub.run.ended.get_or_insert(now.wall);
     (sub.progress, sub.partial) = (None, None);
-    // The refusal stands until EvalAI has answered again.
-    sub.view.end = sub.view.end.take().filter(|_| is_again);
-    (sub.lacks_texts, sub.view.needs_texts) = (false, false);
+    sub.view.end = None;
     sub.retry_at = sub.retry_at.min(now.at);
     true
 }

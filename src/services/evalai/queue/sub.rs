@@ -10,10 +10,9 @@ use jiff::Timestamp;
 use super::Now;
 use super::poll::pause;
 use crate::services::evalai::guard::{self, Attempt, End, Start, Verdict};
-use crate::services::evalai::payload::{check, for_split};
 use crate::services::evalai::row::Row;
 use crate::services::evalai::status::{Outcome, Progress, Status};
-use crate::services::evalai::types::{Ended, ImageAnswer, Key, Payload, Run, SubmissionState, Target};
+use crate::services::evalai::types::{Ended, ImageAnswer, Outline, Run, SubmissionState, Target};
 
 /// Wait before an unknown status of EvalAI is read again.
 const UNCLEAR_PAUSE: Duration = Duration::from_mins(1);
@@ -38,9 +37,8 @@ pub(super) enum Write {
 #[derive(Debug)]
 pub(super) struct Sub {
     pub pk: i64,
-    /// The Leaderboard whose token its requests carry.
-    pub leaderboard: Key,
-    pub challenge: i64,
+    /// Its Leaderboard's way to EvalAI.
+    pub target: Arc<Target>,
     pub run: Run,
     /// When it was submitted, while its run may be cancelled.
     pub live: Option<Timestamp>,
@@ -48,14 +46,10 @@ pub(super) struct Sub {
     pub asked: Option<Duration>,
     pub image: bool,
     pub progress: Option<Pending<Progress>>,
-    pub partial: Option<Pending<Arc<Payload>>>,
-    pub end: Option<Pending<(Outcome, Arc<Payload>)>>,
-    /// Digest of the partial results that were last answered.
-    pub partial_sent: Option<u64>,
+    pub partial: Option<Pending<Arc<Outline>>>,
+    pub end: Option<Pending<(Outcome, Arc<Outline>)>>,
     /// Why the end's results are not sent, whatever EvalAI shows.
     pub misfit: Option<String>,
-    /// The texts of a refused end were given back: others need their memory.
-    pub lacks_texts: bool,
     /// Request of the last read of the row.
     pub read: Option<Duration>,
     /// The row is known to be outdated.
@@ -78,15 +72,14 @@ pub(super) struct Sub {
 }
 
 impl Sub {
-    pub fn new(pk: i64, leaderboard: Key, challenge: i64, run: Run) -> Self {
+    pub fn new(pk: i64, target: Arc<Target>, run: Run) -> Self {
         let view = SubmissionState {
             attempt: run.attempt,
             ..SubmissionState::default()
         };
         Self {
             pk,
-            leaderboard,
-            challenge,
+            target,
             run,
             live: None,
             asked: None,
@@ -94,9 +87,7 @@ impl Sub {
             progress: None,
             partial: None,
             end: None,
-            partial_sent: None,
             misfit: None,
-            lacks_texts: false,
             read: None,
             outdated: false,
             known_at: None,
@@ -116,7 +107,7 @@ impl Sub {
     pub fn begin(&mut self, run: Run) {
         let live_at = self.live_at.or(self.known_at).filter(|_| !self.has_end());
         let old = std::mem::take(&mut self.view);
-        let fresh = Self::new(self.pk, self.leaderboard.clone(), self.challenge, run);
+        let fresh = Self::new(self.pk, self.target.clone(), run);
         *self = Self {
             read: self.read,
             outdated: self.outdated,
@@ -183,7 +174,7 @@ impl Sub {
     /// The end to write: `cancelled` for a submission that was deleted before its end, whatever it was here.
     pub fn outcome(&self) -> Option<Outcome> {
         match self.end_verdict()? {
-            End::Put if self.problem().is_none() && !self.lacks_texts => Some(self.end.as_ref()?.what.0),
+            End::Put if self.problem().is_none() => Some(self.end.as_ref()?.what.0),
             End::Cancel => Some(Outcome::Cancelled),
             _ => None,
         }
@@ -298,9 +289,6 @@ impl Sub {
             Some(End::Put) if self.retry_at <= now.at => {
                 if let Some(why) = self.problem() {
                     self.refuse_end(why, now);
-                } else if self.lacks_texts {
-                    self.view.needs_texts = true;
-                    self.retry_at = now.at + RETRY_END;
                 }
             }
             Some(End::Put | End::Cancel) | None => {}
@@ -310,15 +298,8 @@ impl Sub {
     /// The end is settled.
     pub fn close(&mut self, end: Ended) {
         self.view.end = Some(end);
-        self.view.last_error = None;
-        (self.lacks_texts, self.view.needs_texts) = (false, false);
+        (self.view.last_error, self.view.unread) = (None, None);
         (self.end, self.live, self.progress, self.partial) = (None, None, None, None);
-    }
-
-    /// Whether an end is the refused one, whose texts were given back.
-    pub fn is_refused(&self, (outcome, payload): &(Outcome, Arc<Payload>)) -> bool {
-        let known = self.end.as_ref().filter(|_| self.lacks_texts);
-        known.is_some_and(|end| end.what.0 == *outcome && *end.what.1 == payload.without_texts())
     }
 
     /// The end can't be written now. It is retried from time to time, after a read that finds a later cancel too: so no list
@@ -326,26 +307,24 @@ impl Sub {
     pub fn refuse_end(&mut self, why: String, now: &Now) {
         self.view.end = Some(Ended::Refused(why.clone()));
         self.live = None;
-        if let Some(end) = self.end.as_mut().filter(|end| end.what.1.has_texts()) {
-            end.what.1 = Arc::new(end.what.1.without_texts());
-            self.lacks_texts = true;
-        }
         self.write_failed(why, RETRY_END, now);
     }
 
-    /// Its Leaderboard has changed: an end that waits, or was refused, is to fit what it has now. What that changes may be what it
-    /// was refused for, so it is tried at once.
-    pub fn fit_end(&mut self, target: &Target, now: &Now) {
-        let Some(end) = &mut self.end else { return };
-        let (outcome, payload) = end.what.clone();
-        if !target.phases.contains(&payload.phase) {
-            return;
+    /// Its Leaderboard has changed. What that changes may be what its end was refused for, so that is tried at once.
+    pub fn follow(&mut self, target: &Arc<Target>, now: Duration) {
+        if self.target != *target {
+            self.target = target.clone();
+            self.misfit = None;
+            self.retry_at = self.retry_at.min(now);
         }
-        let what = (outcome, for_split(payload, &target.split));
-        let misfit = misfit(&what, target);
-        if end.what != what || self.misfit != misfit {
-            (end.what, self.misfit) = (what, misfit);
-            self.retry_at = self.retry_at.min(now.at);
+    }
+
+    /// The outline of what is written next; none of progress.
+    pub fn outline(&self) -> Option<&Arc<Outline>> {
+        match self.next_write()?.0 {
+            Write::End => self.end.as_ref().map(|end| &end.what.1),
+            Write::Partial => self.partial.as_ref().map(|partial| &partial.what),
+            Write::Progress => None,
         }
     }
 
@@ -373,15 +352,18 @@ impl Sub {
 
     /// Why the end is not sent although EvalAI waits for it.
     fn problem(&self) -> Option<String> {
-        self.misfit.clone().or_else(|| self.foreign_phase())
+        let (outcome, outline) = &self.end.as_ref()?.what;
+        let is_bare = *outcome == Outcome::Finished && outline.stored.is_none();
+        let nothing = is_bare.then(|| "there are no stored results".to_owned());
+        self.misfit.clone().or(nothing).or_else(|| self.foreign_phase())
     }
 
     /// EvalAI would put the results on another phase's leaderboard without an error.
     fn foreign_phase(&self) -> Option<String> {
-        let (outcome, payload) = &self.end.as_ref()?.what;
+        let (outcome, outline) = &self.end.as_ref()?.what;
         let phase = self.view.row.as_ref()?.phase?;
-        (*outcome == Outcome::Finished && phase != payload.phase).then(|| {
-            let (pk, ours) = (self.pk, payload.phase);
+        (*outcome == Outcome::Finished && phase != outline.phase).then(|| {
+            let (pk, ours) = (self.pk, outline.phase);
             format!(
                 "EvalAI shows that submission {pk} belongs to phase {phase}, not to phase {ours}; set its phase back to {ours} in EvalAI"
             )
@@ -429,18 +411,17 @@ impl Sub {
         self.view.last_error = Some(why);
     }
 
+    /// What the bucket holds of the end could not be read: the next try is later each time.
+    pub fn payload_failed(&mut self, why: String, now: &Now) {
+        self.retry_at = now.at + pause(self.write_failures);
+        self.write_failures = self.write_failures.saturating_add(1);
+        self.view.unread = Some(why);
+    }
+
     /// A write failed: the next try is that much later.
     pub fn write_failed(&mut self, why: String, pause: Duration, now: &Now) {
         self.retry_at = now.at + pause;
         self.write_failures = self.write_failures.saturating_add(1);
         self.view.last_error = Some(why);
-    }
-}
-
-/// Why an end's results are not what its Leaderboard sends.
-pub(super) fn misfit((outcome, payload): &(Outcome, Arc<Payload>), target: &Target) -> Option<String> {
-    match outcome {
-        Outcome::Finished => check(payload, &target.split, &target.labels).err(),
-        Outcome::Failed | Outcome::Cancelled => None,
     }
 }

@@ -36,12 +36,12 @@ impl Queue {
     /// Takes a submission out, or a Leaderboard with all submissions of it. EvalAI must have given up by `settled` what is written at this
     /// moment.
     pub fn part_with(&mut self, key: &Key, settled: Duration, now: Now) -> Leaving {
-        let leaves = |(own, sub): &(&Key, &Sub)| *own == key || sub.leaderboard == *key;
+        let leaves = |(own, sub): &(&Key, &Sub)| *own == key || sub.target.leaderboard == *key;
         let keys: Vec<Key> = self.subs.iter().filter(leaves).map(|(own, _)| own.clone()).collect();
         let of_subs = keys
             .iter()
             .filter_map(|key| self.subs.get(key))
-            .map(|sub| sub.challenge);
+            .map(|sub| sub.target.challenge);
         let served = self.served.get(key).map(|target| target.challenge);
         let ids: BTreeSet<i64> = of_subs.chain(served).collect();
         let known = ids

@@ -211,7 +211,6 @@ fn a_refused_result_is_shown_once_and_does_not_hold_up_the_row() {
     let mut world = finished();
     world.in_evalai().end = Some(EvalaiEnd::Refused {
         message: "metric x is unknown".into(),
-        is_due: false,
     });
     let plan = world.pass();
     assert_eq!(condition(&plan, PUBLISHED), ("False".into(), reasons::REFUSED.into()));

@@ -13,8 +13,8 @@ use crate::controller::submissions::foreign_runs::{Looked, Traces, Unread};
 use crate::controller::submissions::report_digest::ReportDigest;
 use crate::controller::submissions::view::{
     ContainerView, EndView, EvalaiEnd, EvalaiInfo, EvalaiView, JobEnd, JobView, ObservedFence, ObservedJob,
-    ObservedLog, ObservedNode, ObservedReport, ObservedRoutes, ObservedTexts, ObservedTraces, PodView, RecordView,
-    Stage, Standing, Texts, Turn, View,
+    ObservedLog, ObservedNode, ObservedReport, ObservedRoutes, ObservedTraces, PodView, RecordView, Stage, Standing,
+    Turn, View,
 };
 use crate::pod::report::{Report, ReportPair};
 use crate::pod::run::Stop;
@@ -128,7 +128,6 @@ impl World {
                 // Whatever is asked for is there already; the tests of waiting set it otherwise.
                 report_stage: Some(Stage::JobEnded),
                 report_waited: std::time::Duration::ZERO,
-                texts: ObservedTexts::NotRead,
                 fence: ObservedFence::Held,
                 log: ObservedLog::Kept,
                 evalai: evalai.then_some(known),
@@ -136,7 +135,6 @@ impl World {
                 evalai_waited: std::time::Duration::from_secs(5),
                 written_ago: None,
                 record: Some(RecordView::default()),
-                partial_sent: None,
                 evalai_writes_from: None,
             },
         }
@@ -240,14 +238,9 @@ impl World {
     }
 
     /// Its report shows this.
+    #[allow(clippy::needless_pass_by_value, reason = "the tests read better")]
     pub fn report(&mut self, report: Report) {
-        let digest = ReportDigest::from(&report);
-        self.view.texts = ObservedTexts::Read(Arc::new(Texts {
-            of: digest.id,
-            result: report.results,
-            ..Texts::default()
-        }));
-        self.view.report = ObservedReport::Ours(Arc::new(digest));
+        self.view.report = ObservedReport::Ours(Arc::new(ReportDigest::from(&report)));
     }
 
     pub fn status(&self) -> SubmissionStatus {
@@ -319,9 +312,6 @@ impl World {
         let plan = decide(&self.view);
         rules::check(&self.view, &plan);
         self.submission().status = Some(plan.status.clone());
-        if plan.actions.contains(&Action::Forget) {
-            self.view.texts = ObservedTexts::NotRead;
-        }
         plan
     }
 

@@ -11,7 +11,7 @@ use super::builders::*;
 use crate::controller::submissions::decide::job_name;
 use crate::controller::submissions::view::{
     EvalaiEnd, EvalaiView, JobEnd, JobView, ObservedFence, ObservedJob, ObservedLog, ObservedNode, ObservedReport,
-    ObservedTexts, PodView, Stage, Standing, Turn,
+    PodView, Stage, Standing, Turn,
 };
 use crate::pod::report::Report;
 use crate::pod::run::Stop;
@@ -29,7 +29,6 @@ enum Change {
         waited: Duration,
         fence: ObservedFence,
         log: ObservedLog,
-        texts: ObservedTexts,
     },
     Evalai(Box<EvalaiView>),
     Recorded(bool),
@@ -238,17 +237,11 @@ fn answers() -> impl Strategy<Value = Change> {
             ObservedLog::GivenUp,
         ])
     });
-    let texts = select(vec![
-        ObservedTexts::NotRead,
-        ObservedTexts::Unread("away".into()),
-        ObservedTexts::Read(Arc::default()),
-    ]);
-    (stage, waited(), fence, log, texts).prop_map(|(stage, waited, fence, log, texts)| Change::Answers {
+    (stage, waited(), fence, log).prop_map(|(stage, waited, fence, log)| Change::Answers {
         stage,
         waited,
         fence,
         log,
-        texts,
     })
 }
 
@@ -272,33 +265,31 @@ fn evalai_view() -> impl Strategy<Value = EvalaiView> {
         Some(EvalaiEnd::Ended {
             status: "cancelled".into(),
         }),
-        Some(EvalaiEnd::Refused {
-            message: "no".into(),
-            is_due: false,
-        }),
-        Some(EvalaiEnd::Refused {
-            message: "no".into(),
-            is_due: true,
-        }),
+        Some(EvalaiEnd::Refused { message: "no".into() }),
     ];
-    let error = select(vec![None, Some("away".to_owned())]);
+    let why = select(vec![(None, None), (Some("away".to_owned()), Some("away".to_owned()))]);
+    let partials = select(vec![None, Some(1), Some(2)]);
     let cancels = select(
         vec![(false, false); 18]
             .into_iter()
             .chain([(true, false), (true, true)])
             .collect::<Vec<_>>(),
     );
-    (select(infos), cancels, select(ends), error).prop_map(|(info, (cancelled, overtaken), end, error)| EvalaiView {
-        shows_partial: false,
-        team_id: None,
-        info,
-        read_at: None,
-        cancelled,
-        cancelled_as_of: cancelled.then(|| at(900)),
-        overtaken,
-        end,
-        error,
-    })
+    (select(infos), cancels, select(ends), why, partials).prop_map(
+        |(info, (cancelled, overtaken), end, (error, unread), partial_done)| EvalaiView {
+            shows_partial: false,
+            team_id: None,
+            info,
+            read_at: None,
+            cancelled,
+            cancelled_as_of: cancelled.then(|| at(900)),
+            overtaken,
+            end,
+            unread,
+            partial_done,
+            error,
+        },
+    )
 }
 
 fn change() -> impl Strategy<Value = Change> {
@@ -375,13 +366,11 @@ fn apply(world: &mut World, change: Change) {
             waited,
             fence,
             log,
-            texts,
         } => {
             world.view.report_stage = stage;
             world.view.report_waited = waited;
             world.view.fence = fence;
             world.view.log = log;
-            world.view.texts = texts;
         }
         Change::Evalai(view) => world.view.evalai = is_evalais.then_some(*view),
         Change::Recorded(end) => world.view.record.get_or_insert_default().end_written = end,

@@ -3,11 +3,12 @@
 use std::sync::Arc;
 use std::time::Duration;
 
+use jiff::{SignedDuration, Timestamp};
+
 use super::builders::*;
-use crate::controller::submissions::decide::{Action, EvalaiUpdate, Plan, TableUpdate};
-use crate::controller::submissions::view::{
-    ObservedFence, ObservedLog, ObservedNode, ObservedReport, ObservedTexts, Stage, TextProblem, Texts,
-};
+use crate::controller::submissions::decide::{Action, EvalaiUpdate, Plan, TableUpdate, patience};
+use crate::controller::submissions::view::{ObservedFence, ObservedLog, ObservedNode, ObservedReport, Stage};
+use crate::services::evalai::Patience;
 use leaderboard_api::State::{Cancelled, Failed, Finished, Pending, Running};
 use leaderboard_api::conditions::{self, PUBLISHED, RECORDED};
 use leaderboard_api::reasons;
@@ -23,10 +24,6 @@ fn deletes(plan: &Plan) -> bool {
     has(plan, |a| {
         matches!(a, Action::DeleteJob { .. } | Action::ForceDeletePod { .. })
     })
-}
-
-fn reads_texts(plan: &Plan) -> bool {
-    has(plan, |a| matches!(a, Action::ReadTexts { .. }))
 }
 
 #[test]
@@ -253,12 +250,11 @@ fn nothing_is_forgotten_before_the_log_is_stored() {
     assert!(forgets(&world.pass()));
 }
 
-/// Finished just now; its texts are not read yet.
+/// Finished just now.
 fn finished() -> World {
     let mut world = World::evalai().running();
     world.complete();
     world.report(final_report());
-    world.view.texts = ObservedTexts::NotRead;
     world.pass_to(Finished, reasons::FINISHED);
     world
 }
@@ -271,50 +267,32 @@ fn waits_with(plan: &Plan, type_: &str) -> String {
 }
 
 #[test]
-fn a_result_is_published_with_the_texts_of_its_own_report() {
+fn what_cannot_be_read_of_a_result_is_shown_and_waited_for_but_not_permanently() {
     let mut world = finished();
+    world.in_evalai().unread = Some("stdout is of another round".into());
     let plan = world.pass();
-    assert!(reads_texts(&plan) && evalai_updates(&plan).is_empty());
-    world.view.texts = ObservedTexts::Read(Arc::default());
-    let plan = world.pass();
+    assert_eq!(evalai_updates(&plan), [EvalaiUpdate::Finished]);
+    let shown = waits_with(&plan, PUBLISHED);
     assert!(
-        reads_texts(&plan) && evalai_updates(&plan).is_empty(),
-        "of another report"
+        shown.starts_with("The stored result cannot be read: stdout is of another round"),
+        "{shown}"
     );
-    world.report(final_report());
-    let plan = world.pass();
-    assert_eq!(
-        (reads_texts(&plan), evalai_updates(&plan)),
-        (false, vec![EvalaiUpdate::Finished])
-    );
-}
+    // Another text for the same would be a write each time.
+    world.in_evalai().unread = Some("request 2 timed out".into());
+    assert_eq!(waits_with(&world.pass(), PUBLISHED), shown);
 
-fn with_problem(world: &mut World, problem: TextProblem) {
-    let of = world.view.report.ours().unwrap().id;
-    let problem = Some(problem);
-    world.view.texts = ObservedTexts::Read(Arc::new(Texts {
-        of,
-        problem,
-        ..Texts::default()
-    }));
-}
-
-#[test]
-fn texts_that_cannot_be_read_are_waited_for_but_not_permanently() {
-    for (problem, seconds) in [
-        (TextProblem::Unread("away".into()), 86_400),
-        (TextProblem::Unfit("stdout is of another round".into()), 600),
-    ] {
-        let mut world = finished();
-        with_problem(&mut world, problem);
-        let plan = world.pass();
-        assert!(reads_texts(&plan) && evalai_updates(&plan).is_empty());
-        assert!(waits_with(&plan, PUBLISHED).starts_with("The stored result cannot be read:"));
-        world.wait(seconds - 1);
-        assert_eq!(evalai_updates(&world.pass()), []);
-        world.wait(1);
-        assert_eq!(evalai_updates(&world.pass()), [EvalaiUpdate::Finished]);
-    }
+    let (status, ended) = (world.status(), world.view.now);
+    let after = |seconds| ended + SignedDuration::from_secs(seconds);
+    let expected = Patience {
+        unfit: after(600),
+        unread: after(86_400),
+        report: Timestamp::MAX,
+    };
+    assert_eq!(patience(&world.view, &status), expected, "nothing without its numbers");
+    world.delete();
+    let release = after(900 - 120);
+    let patience = patience(&world.view, &world.status());
+    assert_eq!((patience.unfit, patience.unread), (after(600), release));
 }
 
 #[test]
@@ -373,37 +351,6 @@ fn the_row_of_a_finished_submission_waits_for_its_report_but_not_permanently() {
     world.pass_to(Cancelled, reasons::CANCELLED);
     world.view.report_stage = None;
     assert!(records(&world.pass()), "a row without metrics waits for no report");
-}
-
-#[test]
-fn a_partial_result_is_sent_when_its_texts_are_there_and_left_out_when_they_are_not() {
-    let mut world = World::evalai().running();
-    world.report(report(1));
-    let known = std::mem::replace(&mut world.view.texts, ObservedTexts::NotRead);
-    let plan = world.pass();
-    assert_eq!(
-        (reads_texts(&plan), evalai_updates(&plan)),
-        (true, vec![EvalaiUpdate::Running])
-    );
-    world.view.texts = known;
-    let plan = world.pass();
-    assert_eq!(
-        (reads_texts(&plan), evalai_updates(&plan)),
-        (
-            false,
-            vec![EvalaiUpdate::Running, EvalaiUpdate::Partial { is_shown: false }]
-        )
-    );
-    with_problem(&mut world, TextProblem::Unread("away".into()));
-    let plan = world.pass();
-    assert_eq!(
-        (reads_texts(&plan), evalai_updates(&plan)),
-        (false, vec![EvalaiUpdate::Running])
-    );
-    world.view.report = ObservedReport::Ours(Arc::new((&report(2)).into()));
-    assert!(reads_texts(&world.pass()), "the next route has a result of its own");
-    world.view.partial_sent = Some(2);
-    assert!(!reads_texts(&world.pass()));
 }
 
 #[test]

@@ -21,7 +21,6 @@ pub(super) fn refused() -> World {
     let mut world = finished();
     world.in_evalai().end = Some(EvalaiEnd::Refused {
         message: "it belongs to another phase".into(),
-        is_due: false,
     });
     world
 }

@@ -113,7 +113,7 @@ fn a_finished_one_goes_although_another_attempt_was_asked_for_while_it_ran() {
 fn an_end_that_evalai_refuses_is_kept() {
     let mut world = ended_well();
     let message = "No.".to_owned();
-    world.in_evalai().end = Some(EvalaiEnd::Refused { message, is_due: false });
+    world.in_evalai().end = Some(EvalaiEnd::Refused { message });
     world.recorded();
     world.pass();
     world.wait(10 * KEPT);

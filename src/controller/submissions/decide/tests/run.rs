@@ -27,7 +27,7 @@ fn progress_is_no_transition_and_is_sent_once() {
     );
     assert_eq!(plan.status.message.as_deref(), Some("1/4 routes done."));
 
-    world.view.partial_sent = Some(1);
+    world.in_evalai().partial_done = Some(1);
     assert_eq!(evalai_updates(&world.pass()), [EvalaiUpdate::Running]);
     world.report(report(2));
     assert_eq!(

@@ -2,7 +2,7 @@
 
 use super::builders::*;
 use crate::controller::submissions::decide::{Action, EvalaiUpdate, TableUpdate};
-use crate::controller::submissions::view::{EvalaiEnd, JobEnd, ObservedReport, ObservedTexts};
+use crate::controller::submissions::view::{EvalaiEnd, JobEnd, ObservedReport};
 use crate::pod::report::Report;
 use crate::pod::run::Stop;
 use leaderboard_api::State::{Cancelled, Finished, Pending, Running};
@@ -49,7 +49,6 @@ fn a_running_one_is_asked_to_stop_and_keeps_what_it_has() {
         let mut world = World::evalai().running();
         world.report(report(2));
         world.pass();
-        world.view.texts = ObservedTexts::NotRead;
         request(&mut world);
         let plan = world.pass_to(Running, reasons::STOPPING);
         assert_eq!(

@@ -4,11 +4,7 @@ use std::time::Duration;
 
 use super::builders::*;
 use crate::controller::slots::turns::Turn;
-use crate::controller::submissions::decide::{Action, EvalaiUpdate, Plan, StatusWrite, TableUpdate};
-use crate::controller::submissions::view::{EvalaiEnd, ObservedTexts};
-use leaderboard_api::State::Finished;
-use leaderboard_api::conditions::PUBLISHED;
-use leaderboard_api::reasons;
+use crate::controller::submissions::decide::{Action, EvalaiUpdate, StatusWrite, TableUpdate};
 
 #[test]
 fn progress_waits_since_the_last_write_and_what_matters_does_not() {
@@ -51,23 +47,6 @@ fn a_place_far_back_is_written_in_its_turn() {
         world.view.turn = at(position);
         assert_eq!(world.pass().write, expected, "{position}");
     }
-}
-
-#[test]
-fn texts_are_kept_until_evalai_has_the_end_and_no_longer() {
-    let drops = |world: &mut World| has(&world.pass(), |a| matches!(a, Action::DropTexts | Action::Forget));
-    let mut world = World::evalai().running();
-    assert!(!drops(&mut world), "none were read");
-    world.report(report(1));
-    let plan = world.pass();
-    let partial = EvalaiUpdate::Partial { is_shown: false };
-    assert!(evalai_updates(&plan).contains(&partial) && has(&plan, |a| *a == Action::DropTexts));
-    world.complete();
-    world.report(final_report());
-    assert!(!drops(&mut world), "the end is to be sent with them");
-    world.published();
-    world.view.record.as_mut().unwrap().end_written = true;
-    assert!(drops(&mut world));
 }
 
 #[test]
@@ -120,33 +99,4 @@ fn a_node_is_asked_for_where_none_are_watched_and_only_for_a_pod_that_runs_or_go
     assert!(asks(&mut world));
     world.pod().run_ended = Some(at(20));
     assert!(!asks(&mut world), "it has ended");
-}
-
-#[test]
-fn a_refused_result_that_is_due_again_is_sent_with_texts_that_were_read_anew() {
-    let mut world = World::evalai().running();
-    world.complete();
-    world.report(final_report());
-    world.pass_to(Finished, reasons::FINISHED);
-    let texts = std::mem::replace(&mut world.view.texts, ObservedTexts::NotRead);
-    let drops = |plan: &Plan| has(plan, |a| *a == Action::DropTexts);
-    for (is_due, texts, sends) in [
-        (false, texts.clone(), false),
-        (false, ObservedTexts::NotRead, false),
-        (true, ObservedTexts::NotRead, false),
-        (true, texts, true),
-    ] {
-        world.view.texts = texts;
-        world.in_evalai().end = Some(EvalaiEnd::Refused {
-            message: "no".into(),
-            is_due,
-        });
-        let plan = world.pass();
-        assert_eq!(condition(&plan, PUBLISHED).1, reasons::REFUSED, "until EvalAI takes it");
-        let expected: &[_] = if sends { &[EvalaiUpdate::Finished] } else { &[] };
-        assert_eq!(evalai_updates(&plan), expected);
-        let reads = has(&plan, |a| matches!(a, Action::ReadTexts { .. }));
-        assert_eq!(reads, is_due && !sends);
-        assert_eq!(drops(&plan), world.view.texts != ObservedTexts::NotRead);
-    }
 }

@@ -9,7 +9,7 @@ use tokio::net::{TcpListener, TcpStream};
 
 use super::*;
 use crate::services::evalai::status::Outcome;
-use crate::services::evalai::types::{Ended, Payload};
+use crate::services::evalai::types::{Ended, Outline};
 
 /// One request of a server of the test's own.
 #[derive(Clone, Debug, PartialEq, Eq)]
@@ -139,7 +139,7 @@ fn subject(target: &Target) -> Subject {
 
 fn cancelled(target: &Target, hub: &Hub) {
     let publisher = Publisher::of(subject(target)).unwrap();
-    let end = DesiredUpdate::Final(Outcome::Cancelled, Arc::new(Payload::default()));
+    let end = DesiredUpdate::Final(Outcome::Cancelled, Arc::new(Outline::default()));
     hub.update(&publisher, end).unwrap();
 }
 

@@ -384,7 +384,7 @@ fn a_read_that_is_not_followed_at_once_is_made_again() {
     bench.get(7, row(7, Status::Running));
     // The lease is away for a moment.
     let now = bench.now();
-    assert!(matches!(bench.queue.next(now, false), Next::Wait(_)));
+    assert!(matches!(next(&mut bench.queue, now, false), Next::Wait(_)));
     bench.wait(2.5);
     bench.get(7, row(7, Status::Running));
     bench.write("partial 7");

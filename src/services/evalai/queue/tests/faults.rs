@@ -1,7 +1,6 @@
 //! Answers that are none, refusals, a broken server, no lease, no token.
 
 use super::*;
-use crate::services::held_text::{HeldMemory, HeldText};
 
 #[test]
 fn an_unanswered_end_is_read_again_only_when_the_server_must_have_given_up() {
@@ -99,48 +98,6 @@ fn a_refused_end_is_reported_tried_again_later_and_at_once_with_other_texts() {
     bench.get(7, row(7, Status::Running));
     bench.write("finished 7");
     assert!(matches!(bench.view(7).end, Some(Ended::Published { .. })));
-}
-
-#[test]
-fn a_refused_end_holds_no_texts_and_asks_for_them_when_it_is_due_again() {
-    let place = Arc::new(());
-    let with_texts = || {
-        let stdout = HeldText::new("a table".into(), Arc::clone(&place) as HeldMemory);
-        let payload = Payload {
-            stdout,
-            ..Payload::clone(&results(43.0))
-        };
-        DesiredUpdate::Final(Outcome::Finished, Arc::new(payload))
-    };
-    let is_refused = |bench: &Bench| matches!(bench.view(7).end, Some(Ended::Refused(_)));
-    let mut bench = Bench::new();
-    bench.running(7);
-    bench.update(7, 1, with_texts());
-    for _ in 0..2 {
-        bench.get(7, row(7, Status::Running));
-        let put = bench.expect("finished 7");
-        bench.answer(&put, Reply::Written(Answer::Refused(refusal(About::Request, 400))));
-        drop(put);
-        bench.update(7, 1, with_texts());
-        assert_eq!(Arc::strong_count(&place), 1, "others need the memory");
-        bench.wait(600.0);
-        assert!(!bench.view(7).needs_texts);
-        bench.get(7, row(7, Status::Running));
-        bench.expect_nothing();
-        assert!(is_refused(&bench) && bench.view(7).needs_texts);
-        bench.update(7, 1, with_texts());
-        assert!(is_refused(&bench) && !bench.view(7).needs_texts, "until EvalAI answers");
-        bench.wait(2.0);
-    }
-    bench.get(7, row(7, Status::Running));
-    let sent = bench.write("finished 7");
-    assert!(
-        matches!(&sent.request, Request::Final(_, _, payload) if &*payload.stdout == "a table"),
-        "{sent:?}"
-    );
-    drop(sent);
-    assert!(matches!(bench.view(7).end, Some(Ended::Published { .. })));
-    assert_eq!(Arc::strong_count(&place), 1);
 }
 
 /// A submission whose result EvalAI's row refuses: it belongs to another phase there.
@@ -356,8 +313,8 @@ fn without_the_lease_and_after_a_takeover_only_reads_are_sent() {
     bench.expect_nothing();
     bench.wait(15.0);
     let now = bench.now();
-    assert!(matches!(bench.queue.next(now, false), Next::Send(t) if matches!(t.request, Request::List { .. })));
-    let Next::Wait(Some(again)) = bench.queue.next(now, false) else {
+    assert!(matches!(next(&mut bench.queue, now, false), Next::Send(t) if matches!(t.request, Request::List { .. })));
+    let Next::Wait(Some(again)) = next(&mut bench.queue, now, false) else {
         panic!("a write is sent without the lease")
     };
     assert_eq!(again, now.at + Duration::from_secs(1));
@@ -381,7 +338,7 @@ fn what_waits_for_the_first_write_is_woken_once_when_it_may_be_sent() {
     bench.update(8, 1, DesiredUpdate::Final(Outcome::Failed, results(1.0)));
     bench.queue.take_changes();
     let now = bench.now();
-    let Next::Wait(Some(until)) = bench.queue.next(now, true) else {
+    let Next::Wait(Some(until)) = next(&mut bench.queue, now, true) else {
         panic!("a write is sent before its time")
     };
     assert!(until <= Duration::from_secs(75), "{until:?}");

@@ -215,10 +215,9 @@ fn an_unknown_status_starts_nothing_and_ends_nothing() {
 #[test]
 fn results_that_cannot_be_right_are_not_sent() {
     let mut bench = Bench::new();
-    let empty = Arc::new(Payload {
+    let empty = Arc::new(Outline {
         phase: 1,
-        result: "[]".into(),
-        ..Payload::default()
+        ..Outline::default()
     });
     bench.update(7, 1, DesiredUpdate::Final(Outcome::Finished, empty.clone()));
     bench.get(7, row(7, Status::Running));
@@ -228,9 +227,9 @@ fn results_that_cannot_be_right_are_not_sent() {
     bench.update(7, 1, DesiredUpdate::Final(Outcome::Failed, empty));
     bench.get(7, row(7, Status::Running));
     bench.write("failed 7");
-    let foreign = Arc::new(Payload {
+    let foreign = Arc::new(Outline {
         phase: 2,
-        ..Payload::clone(&results(1.0))
+        ..Outline::clone(&results(1.0))
     });
     bench.update(8, 1, DesiredUpdate::Final(Outcome::Finished, foreign));
     bench.get(8, row(8, Status::Running));

@@ -7,17 +7,19 @@ mod life;
 mod order;
 mod outage;
 mod passing;
+mod payloads;
 mod simulation;
 
 use jiff::SignedDuration;
 
 use super::*;
 use crate::observability::about::LogSpan;
+use crate::services::archive::ContentId;
 use crate::services::evalai::answer::{About, Answer, Refusal, Silence};
 use crate::services::evalai::request::{Purpose, Reply};
 use crate::services::evalai::row::{DatasetSplit, Phase, Row, Schema, Split};
 use crate::services::evalai::status::Status;
-use crate::services::evalai::types::{ImageAnswer, Run, Usage};
+use crate::services::evalai::types::{ImageAnswer, Patience, Payload, PayloadProblem, Run, StoredResult, Usage};
 use crate::services::token::Token;
 use leaderboard_api::Attempt;
 
@@ -97,12 +99,44 @@ fn row(pk: i64, status: Status) -> Row {
     }
 }
 
-fn results(score: f64) -> Arc<Payload> {
-    Arc::new(Payload {
+/// Results whose bucket holds this score.
+fn results(score: f64) -> Arc<Outline> {
+    results_in("bucket", score)
+}
+
+fn results_in(bucket: &str, score: f64) -> Arc<Outline> {
+    let storage = serde_json::from_value(serde_json::json!({"bucket": bucket})).unwrap();
+    Arc::new(Outline {
         phase: 1,
-        result: format!(r#"[{{"split":"leaderboard","accuracies":{{"Driving score":{score}}}}}]"#),
-        ..Payload::default()
+        stored: Some(StoredResult {
+            storage,
+            prefix: score.to_string(),
+            report: ContentId::default(),
+            done: score.trunc().to_string().parse().unwrap(),
+            so_far: false,
+            patience: Patience::ENDLESS,
+        }),
+        ..Outline::default()
     })
+}
+
+/// What that bucket gives out.
+fn stored(outline: &Outline) -> Payload {
+    let score = &outline.stored.as_ref().unwrap().prefix;
+    Payload {
+        result: format!(r#"[{{"split":"leaderboard","accuracies":{{"Driving score":{score}}}}}]"#),
+        ..Payload::bare(outline)
+    }
+}
+
+/// The next request, with what has to be read of a bucket before.
+fn next(queue: &mut Queue, now: Now, may_write: bool) -> Next {
+    loop {
+        match queue.next(now, may_write) {
+            Next::Read(key, outline) => queue.took_payload(&key, Ok((stored(&outline), None)), now),
+            other => return other,
+        }
+    }
 }
 
 fn unanswered() -> Reply {
@@ -186,7 +220,7 @@ impl Bench {
     /// The same, or until when there is nothing to send.
     fn next_or_wait(&mut self) -> Result<(String, Ticket), Option<Duration>> {
         let now = self.now();
-        match self.queue.next(now, true) {
+        match next(&mut self.queue, now, true) {
             Next::Send(ticket) => {
                 let pk = ticket
                     .request
@@ -196,6 +230,7 @@ impl Bench {
                 Ok((format!("{}{pk}", ticket.request.name()), ticket))
             }
             Next::Wait(until) => Err(until),
+            Next::Read(..) => unreachable!("it was read"),
         }
     }
 

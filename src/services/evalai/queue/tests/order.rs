@@ -489,7 +489,7 @@ fn what_runs_by_one_token_keeps_no_end_of_another_token_of_the_same_user_waiting
     while ends < 10 {
         at += Duration::from_millis(10);
         for queue in &mut queues {
-            while let Next::Send(ticket) = queue.next(now(at), true) {
+            while let Next::Send(ticket) = next(queue, now(at), true) {
                 sent += 1;
                 ends += usize::from(ticket.request.is_write());
                 let reply = match &ticket.request {

@@ -90,7 +90,8 @@ impl Outage {
     fn send_all(&mut self) -> Option<Duration> {
         loop {
             let now = self.bench.now();
-            match self.bench.queue.next(now, true) {
+            match next(&mut self.bench.queue, now, true) {
+                Next::Read(..) => unreachable!("it was read"),
                 Next::Wait(until) => return until,
                 Next::Send(ticket) => {
                     assert!(

@@ -90,7 +90,7 @@ fn only_a_leader_reads() {
     let mut bench = Bench::reading();
     bench.pass();
     let now = bench.now();
-    assert!(matches!(bench.queue.next(now, false), Next::Wait(_)));
+    assert!(matches!(next(&mut bench.queue, now, false), Next::Wait(_)));
     bench.expect("message");
 }
 
