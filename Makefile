@@ -30,7 +30,7 @@ measure-scale: ## Measure 200 submissions and 1,000 cancels against the stand-in
 	KUBEBUILDER_ASSETS="$${KUBEBUILDER_ASSETS:-$$($(LAB) tools etcd kube-apiserver kubectl)}" \
 	LEADERBOARD_MINISTACK="$${LEADERBOARD_MINISTACK:-$$($(LAB) aws-venv)/ministack}" \
 	cargo test --workspace --profile $(PROFILE) --test api -- --ignored --nocapture --test-threads 1 \
-		two_hundred_submissions a_thousand_cancels a_thousand_that_end_at_once
+		two_hundred_submissions a_thousand_cancels a_hundred_cancels a_thousand_that_end_at_once
 
 measure-intake: ## Measure the intake of 10,000 messages while controller and bridge are killed 50 times (10 min; no root, no node)
 	KUBEBUILDER_ASSETS="$${KUBEBUILDER_ASSETS:-$$($(LAB) tools etcd kube-apiserver kubectl)}" \

@@ -4,6 +4,7 @@
 //! The small size belongs to the tests. The full one measures, and takes a quarter of an hour: `make measure-scale`.
 
 mod board;
+mod cancels;
 pub(super) mod player;
 
 use std::collections::{BTreeMap, BTreeSet};
@@ -104,37 +105,10 @@ async fn a_thousand_that_end_at_once_are_published_the_oldest_first() {
 
 async fn measure(size: &Size) {
     let mut world = World::start(size).await;
-    let began = Instant::now();
-    let pks: Vec<u64> = (0..size.finals + size.cancels).map(|_| world.submit()).collect();
-    for pk in &pks {
-        world.apply(*pk).await;
-    }
+    let pks = world.run(size).await;
     let all: BTreeSet<String> = pks.iter().map(|pk| name(*pk)).collect();
-    world
-        .until(size, "all run", |seen| {
-            all.iter().all(|name| seen.is(name, State::Running))
-        })
-        .await;
-    println!(
-        "{} submissions run after {:.1} s",
-        pks.len(),
-        began.elapsed().as_secs_f64()
-    );
-
     let (cancelled, others) = pks.split_at(size.cancels);
-    let times = world.cancel(cancelled, size.cancel_over).await;
-    let mut undone = world.settle(size, cancelled).await;
-    let stopped = world.player.seen().asked_to_stop;
-    let waits = cancelled
-        .iter()
-        .filter_map(|pk| Some(between(times[pk], *stopped.get(&name(*pk))?)));
-    say("cancelled in EvalAI to the stop on the Pod", waits.collect());
-    println!(
-        "{} of {} cancels were undone by a write of ours",
-        undone.len(),
-        cancelled.len()
-    );
-    world.explain(&undone, &times);
+    let (mut undone, _) = world.cancel_all(size, cancelled).await;
 
     world.player.fall_the_curtain();
     world
@@ -316,6 +290,23 @@ impl World {
             };
             self.submissions.take(&submission);
         }
+    }
+
+    /// Submits all, and waits until they run.
+    async fn run(&mut self, size: &Size) -> Vec<u64> {
+        let began = Instant::now();
+        let pks: Vec<u64> = (0..size.finals + size.cancels).map(|_| self.submit()).collect();
+        for pk in &pks {
+            self.apply(*pk).await;
+        }
+        let all: BTreeSet<String> = pks.iter().map(|pk| name(*pk)).collect();
+        self.until(size, "all run", |seen| {
+            all.iter().all(|name| seen.is(name, State::Running))
+        })
+        .await;
+        let took = began.elapsed().as_secs_f64();
+        println!("{} submissions run after {took:.1} s", pks.len());
+        pks
     }
 
     /// Cancels at random moments, and returns when each was.
