@@ -156,7 +156,7 @@ impl<S: Source> Poller<S> {
         let outcomes = self.outcomes(&received, &readers).await;
         let count = u32::try_from(received.len()).unwrap_or(1);
         self.each = (self.each * 3 + begun.elapsed() / count) / 4;
-        let (mut deletes, mut held_back) = (Vec::new(), 0_u32);
+        let mut deletes = Vec::new();
         for (message, mut outcome) in received.iter().zip(outcomes) {
             if let MessageOutcome::Dead(reason) = &outcome {
                 outcome = self.set_aside(message, reason, &readers).await;
@@ -168,7 +168,6 @@ impl<S: Source> Poller<S> {
                 .total
                 .of([outcome.as_str()])
                 .inc();
-            held_back = held_back.saturating_add(u32::from(outcome.is_held_back()));
             match outcome {
                 MessageOutcome::Delete(_) | MessageOutcome::Dead(_) => deletes.push(message),
                 MessageOutcome::Later { seconds, why } => {
@@ -179,11 +178,6 @@ impl<S: Source> Poller<S> {
             }
         }
         self.delete(&deletes).await;
-        if held_back > 0 {
-            // The controller does not take what is in flight for another reader's then.
-            let note = format!("{held_back} messages of the queue cannot be used yet and are received again later.");
-            self.publish(&readers, reasons::MESSAGES_HELD_BACK, &note).await;
-        }
     }
 
     /// A message stays in the queue and comes back after so many seconds. How long another reader takes is not ours to show.

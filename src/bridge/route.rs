@@ -140,15 +140,6 @@ pub enum Done {
 }
 
 impl MessageOutcome {
-    /// Whether a message stays in flight that nobody works on, and that no other reader is left.
-    pub fn is_held_back(&self) -> bool {
-        match self {
-            Self::Lapse => true,
-            Self::Later { why, .. } => *why != Later::Foreign,
-            Self::Ingest { .. } | Self::Dead(_) | Self::Delete(_) => false,
-        }
-    }
-
     /// The value of the metric's label.
     pub fn as_str(&self) -> &'static str {
         match self {

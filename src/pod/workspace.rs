@@ -147,10 +147,7 @@ impl WorkspaceVerdict {
 #[derive(thiserror::Error, Debug)]
 pub enum WorkspaceError {
     /// The results of another submission are there.
-    #[error(
-        "s3://{0} already holds results of something else. Apply the submission with attempt: 2 to take them up, or \
-         empty the prefix."
-    )]
+    #[error("s3://{0} already holds results of something else.")]
     PrefixInUse(String),
     /// `network.enforcement` is `Require`.
     #[error("{0} The run is not started, because network.enforcement is Require.")]

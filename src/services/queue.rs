@@ -2,7 +2,6 @@
 //! bridge's alone.
 
 use std::collections::HashMap;
-use std::time::Duration;
 
 use aws_sdk_sqs::types::QueueAttributeName;
 
@@ -40,31 +39,27 @@ impl QueueError {
 /// What SQS shows of a queue. Its numbers are approximate, and up to a minute old.
 #[derive(Clone, Debug, Default, PartialEq, Eq)]
 pub struct Reading {
-    pub arn: Option<String>,
     /// Messages that a receive would get.
     pub visible: u64,
     /// Messages that were received, and are neither deleted nor visible again.
     pub in_flight: u64,
-    /// How long a received message stays invisible by itself.
-    pub visibility: Duration,
 }
 
 impl Reading {
-    const ATTRIBUTES: [QueueAttributeName; 4] = [
-        QueueAttributeName::QueueArn,
-        QueueAttributeName::VisibilityTimeout,
+    const ATTRIBUTES: [QueueAttributeName; 2] = [
         QueueAttributeName::ApproximateNumberOfMessages,
         QueueAttributeName::ApproximateNumberOfMessagesNotVisible,
     ];
 
     fn of(attributes: Option<&HashMap<QueueAttributeName, String>>) -> Self {
-        let text = |name| attributes.and_then(|all| all.get(&name)).cloned();
-        let number = |name| text(name).and_then(|text| text.parse().ok()).unwrap_or_default();
+        let number = |name| {
+            attributes
+                .and_then(|all| all.get(&name)?.parse().ok())
+                .unwrap_or_default()
+        };
         Self {
-            arn: text(QueueAttributeName::QueueArn),
             visible: number(QueueAttributeName::ApproximateNumberOfMessages),
             in_flight: number(QueueAttributeName::ApproximateNumberOfMessagesNotVisible),
-            visibility: Duration::from_secs(number(QueueAttributeName::VisibilityTimeout)),
         }
     }
 }

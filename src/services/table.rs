@@ -121,7 +121,10 @@ pub enum Written {
     /// The row is stored, now or by an earlier try.
     Stored,
     /// The table holds the end of this attempt, or a later attempt, with other values.
-    Stale,
+    Stale {
+        /// The attempt of that row.
+        kept: i64,
+    },
 }
 
 /// Why a row is not stored.
@@ -165,10 +168,8 @@ pub enum TableError {
         problem: String,
     },
     /// The table holds a later state of the submission.
-    #[error(
-        "table {table} already holds a later attempt or another end of submission {run_id}; the row is left as it is"
-    )]
-    Stale { table: String, run_id: String },
+    #[error("table {table} already holds attempt {kept} of submission {run_id}; the row is left as it is")]
+    Stale { table: String, run_id: String, kept: i64 },
 }
 
 impl TableError {
@@ -222,8 +223,10 @@ impl Table {
             Ok(_) => Ok(Written::Stored),
             Err(error) => match error.as_service_error() {
                 Some(UpdateItemError::ConditionalCheckFailedException(lost)) => {
-                    let same = lost.item().is_some_and(|old| is_same(old, row.attempt, &columns));
-                    Ok(if same { Written::Stored } else { Written::Stale })
+                    let old = lost.item();
+                    let same = old.is_some_and(|old| is_same(old, row.attempt, &columns));
+                    let kept = old.and_then(attempt_of).unwrap_or(row.attempt);
+                    Ok(if same { Written::Stored } else { Written::Stale { kept } })
                 }
                 _ => Err(failed(&self.name, "UpdateItem", &error)),
             },
@@ -287,11 +290,13 @@ fn set_columns(mut request: UpdateItemFluentBuilder, columns: &Columns<'_>) -> U
     request.update_expression(update)
 }
 
+fn attempt_of(item: &HashMap<String, AttributeValue>) -> Option<i64> {
+    item.get(ATTEMPT)?.as_n().ok()?.parse().ok()
+}
+
 /// True if the stored item holds what we were about to write.
 fn is_same(old: &HashMap<String, AttributeValue>, attempt: i64, columns: &Columns<'_>) -> bool {
-    let stored = old.get(ATTEMPT).and_then(|value| value.as_n().ok());
-    let same_attempt = stored.and_then(|text| text.parse::<i64>().ok()) == Some(attempt);
-    same_attempt
+    attempt_of(old) == Some(attempt)
         && columns.iter().all(|(column, value)| match (old.get(*column), value) {
             (stored, None) => stored.is_none(),
             (stored, Some(value)) => stored.and_then(|v| v.as_s().ok()).is_some_and(|text| text == value),

@@ -78,13 +78,14 @@ async fn what_has_ended_is_deleted_after_its_time_and_only_a_resume_runs_again()
     assert_eq!(in_evalai(), Status::Failed);
     assert_eq!(row(&world, &table).await, ("1".to_owned(), "FAILED".to_owned()));
 
-    // The same message once more: every system has the end, so it is shown, and nothing is run and nothing is written.
+    // The same message once more: EvalAI shows the end, so nothing is run and nothing is written.
     let image = json!("r/team-a:1");
     world.object("short", 1, pk, &image).await;
     let uid = uid_of(&world, &name).await;
-    let ended =
-        |s: &SubmissionStatus| s.state == Some(State::Failed) && s.reason.as_deref() == Some(reasons::IMPORTED_FAILURE);
-    world.until(&name, "it shows its end", ended).await;
+    let ended = |s: &SubmissionStatus| {
+        s.state == Some(State::Cancelled) && s.reason.as_deref() == Some(reasons::ENDED_IN_EVALAI)
+    };
+    world.until(&name, "it shows that it has ended", ended).await;
     until_deleted(&world, &name, &uid).await;
     let job = names::job(&name, JobNumber::first(Attempt(1)));
     assert_eq!(world.api::<Job>().get_opt(&job).await.unwrap(), None);

@@ -172,15 +172,15 @@ async fn an_older_row_never_wins() {
         (row(1, "RUNNING"), Written::Stored),
         (row(1, "FAILED"), Written::Stored),
         (row(1, "FAILED"), Written::Stored),
-        (row(1, "RUNNING"), Written::Stale),
-        (row(1, "FINISHED"), Written::Stale),
+        (row(1, "RUNNING"), Written::Stale { kept: 1 }),
+        (row(1, "FINISHED"), Written::Stale { kept: 1 }),
         (row(2, "RUNNING"), Written::Stored),
-        (row(1, "FAILED"), Written::Stale),
+        (row(1, "FAILED"), Written::Stale { kept: 2 }),
         (row(2, "CANCELLED"), Written::Stored),
-        (row(2, "RUNNING"), Written::Stale),
-        (row(2, "FINISHED"), Written::Stale),
+        (row(2, "RUNNING"), Written::Stale { kept: 2 }),
+        (row(2, "FINISHED"), Written::Stale { kept: 2 }),
         (row(10, "PENDING"), Written::Stored),
-        (row(9, "FINISHED"), Written::Stale),
+        (row(9, "FINISHED"), Written::Stale { kept: 10 }),
     ];
     for (step, (row, want)) in steps.into_iter().enumerate() {
         assert_eq!(table.write(&row).await, Ok(want), "step {step}");
@@ -245,7 +245,7 @@ async fn metrics_of_an_earlier_row_are_removed() {
     }
     assert_eq!(
         table.write(&with(row(1, "FAILED"), Some("10.5"))).await,
-        Ok(Written::Stale),
+        Ok(Written::Stale { kept: 1 }),
         "it is not the same"
     );
 }
@@ -273,14 +273,14 @@ async fn a_cancel_is_written_over_another_end_and_takes_its_metrics_away() {
         }
         assert_eq!(
             table.write(&ended).await,
-            Ok(Written::Stale),
+            Ok(Written::Stale { kept: attempt }),
             "{end} does not come back"
         );
     }
     let older = with(row(1, "CANCELLED"), None);
     assert_eq!(
         table.write(&older).await,
-        Ok(Written::Stale),
+        Ok(Written::Stale { kept: 2 }),
         "it is of an older attempt"
     );
 }

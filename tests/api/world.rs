@@ -14,7 +14,7 @@ use k8s_openapi::api::events::v1::Event;
 use kube::api::{ApiResource, DeleteParams, DynamicObject, ListParams, Patch, PatchParams, PostParams};
 use kube::runtime::wait::await_condition;
 use kube::{Api, Client, ResourceExt};
-use leaderboard_api::{Attempt, JobNumber, Leaderboard, Storage, Submission, SubmissionStatus, names};
+use leaderboard_api::{Attempt, JobNumber, Leaderboard, Storage, Submission, SubmissionStatus, names, reasons};
 use leaderboard_operator::allowed::Allowed;
 use leaderboard_operator::controller::runtime::leader::{self, Identity};
 use leaderboard_operator::controller::runtime::{self as run, Clients};
@@ -23,6 +23,7 @@ use leaderboard_operator::kubernetes::Namespaces;
 use leaderboard_operator::observability::Observability;
 use leaderboard_operator::observability::shutdown::Stop;
 use leaderboard_operator::page::Page;
+use leaderboard_operator::pod::workspace::WorkspaceError;
 use leaderboard_operator::services::archive::Archive;
 use leaderboard_runner::verdict::{Verdict, What};
 use serde_json::{Map, Value, json};
@@ -297,6 +298,22 @@ impl World {
         patched.unwrap();
     }
 
+    /// The Pod of this submission's first Job finds results of something else below the prefix. Returns once the submission is held back and
+    /// the Job is gone.
+    pub(super) async fn finds_its_prefix_in_use(&self, name: &str) {
+        let job = self.job(name, 0).await;
+        self.pod(&job, &prefix_in_use()).await;
+        let is_held = |status: &SubmissionStatus| status.reason.as_deref() == Some(reasons::FOREIGN);
+        self.until(name, "it is held back", is_held).await;
+        let (jobs, name) = (self.api::<Job>(), job.name_any());
+        let goes = |job: Option<&Job>| job.is_some_and(|job| job.metadata.deletion_timestamp.is_some());
+        let goes = timeout(LIMIT, await_condition(jobs.clone(), &name, goes)).await;
+        goes.expect("its Job is deleted").unwrap();
+        // There is no garbage collector that would end its Pod first.
+        let bare = Patch::Merge(json!({"metadata": {"finalizers": null}}));
+        jobs.patch(&name, &PatchParams::default(), &bare).await.unwrap();
+    }
+
     pub(super) async fn until(&self, name: &str, what: &str, holds: impl Fn(&SubmissionStatus) -> bool) {
         let holds = |found: Option<&Submission>| found.and_then(|s| s.status.as_ref()).is_some_and(&holds);
         let seen = timeout(LIMIT, await_condition(self.api::<Submission>(), name, holds)).await;
@@ -367,5 +384,20 @@ pub(super) fn running() -> Value {
         "conditions": [{"type": "PodScheduled", "status": "True", "lastTransitionTime": now}],
         "initContainerStatuses": [running("logcopy")],
         "containerStatuses": [running("simulator-1"), running("agent-1")],
+    })
+}
+
+/// The status of a Pod whose `workspace` has found results of something else below the prefix of the run.
+pub(super) fn prefix_in_use() -> Value {
+    let now = ago(0);
+    let verdict = WorkspaceError::PrefixInUse("results/77/".into()).verdict();
+    let ended = json!({
+        "exitCode": 1, "reason": "Error", "message": verdict.to_json(), "startedAt": now, "finishedAt": now,
+    });
+    json!({
+        "phase": "Pending",
+        "conditions": [{"type": "PodScheduled", "status": "True", "lastTransitionTime": now}],
+        "initContainerStatuses": [{"name": names::CONTAINER_WORKSPACE, "image": "i", "imageID": "", "ready": false,
+                                   "restartCount": 0, "state": {"terminated": ended}}],
     })
 }

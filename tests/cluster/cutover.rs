@@ -8,7 +8,7 @@ use std::time::Duration;
 
 use evalai_stand_in::model::Status;
 use kube::ResourceExt;
-use leaderboard_api::{Submission, names};
+use leaderboard_api::{Submission, names, reasons};
 use serde_json::{Value, json};
 
 use super::matrix::Case;
@@ -168,6 +168,11 @@ impl Rehearsal<'_> {
         // A Pipe deletes what its filter does not match, so only one of the two may read. The sweep finds what the Pipe deletes.
         self.scene.change_leaderboard("lb", &json!({"queue": null})).await;
         drop(reader);
+        // A Pipe that was not stopped takes one of ours, whose run then waits for a node.
+        self.old.start_pipe(&[SENSORS, MAP]);
+        let taken = self.submit(MAP).await;
+        self.old.reached(taken, Stage::Accepted, LIMIT).await;
+        self.old.stop_pipe().await;
         self.old.start_pipe(&[SENSORS]);
         let (swept, later) = (self.submit(MAP).await, self.submit(SENSORS).await);
         self.old.await_deleted(swept, LIMIT).await;
@@ -175,9 +180,21 @@ impl Rehearsal<'_> {
             self.old.reached(pk, Stage::Accepted, LIMIT).await;
         }
         self.exists(swept, LOST).await;
+        let is_held = |submission: &Submission| {
+            let status = submission.status.as_ref();
+            status.is_some_and(|status| status.reason.as_deref() == Some(reasons::FOREIGN))
+        };
+        let (name, what) = (submission(taken), "it waits for the old pipeline's run");
+        self.scene.submission(&name, what, LOST, is_held).await;
         for pk in [map, failed, swept] {
             self.finished(pk).await;
         }
+        assert_eq!(self.evalai.submission(taken).status, Status::Submitted);
+        self.old.drive(taken, ROUTES_A_PAIR);
+        let not_stopped = self
+            .ended("cutover: MAP, taken by a Pipe that was not stopped", BY_THE_OLD, taken)
+            .await;
+        self.finished(taken).await;
         // The sweep has read this row too: it is as old, in a phase of ours, and still submitted.
         assert_eq!(self.evalai.submission(old_map).status, Status::Submitted);
         self.old.drive(old_map, ROUTES_A_PAIR);
@@ -187,6 +204,7 @@ impl Rehearsal<'_> {
 
         let mut stories = vec![
             under_way,
+            not_stopped,
             ours("cutover: MAP, submitted during the first switch", map),
             ours("cutover: MAP, submitted while the Pipe serves SENSORS", swept),
         ];
@@ -236,10 +254,18 @@ impl Rehearsal<'_> {
 
     /// None is lost, none is run twice, and everything is where it was.
     async fn assert_all(&self, stories: Vec<Story>) {
-        let objects = self.scene.all::<Submission>().await;
         let jobs = self.scene.jobs().await;
-        assert_eq!(objects.len(), jobs.len(), "each has one Job: {jobs:?}");
-        let ours: Vec<String> = objects.iter().map(ResourceExt::name_any).collect();
+        let jobs_of = |name: &str| jobs.iter().filter(|job| job.starts_with(&format!("{name}-"))).count();
+        let objects = self.scene.all::<Submission>().await;
+        let (ours, held): (Vec<String>, Vec<String>) = objects
+            .iter()
+            .map(ResourceExt::name_any)
+            .partition(|name| jobs_of(name) > 0);
+        assert_eq!(
+            (ours.len(), held.len()),
+            (jobs.len(), 1),
+            "each but one has one Job: {jobs:?}"
+        );
         let taken = self.old.taken();
         let all = self.evalai.handle.state().submissions.len();
         assert_eq!(stories.len(), all, "each submission has its story");

@@ -1,8 +1,8 @@
 //! A proxy before the stand-in that is an AWS which is asked too often: it refuses as many requests as a test asks for, and hands on
 //! the others.
 
+use std::sync::Arc;
 use std::sync::atomic::{AtomicU32, Ordering};
-use std::sync::{Arc, Mutex};
 
 use axum::body::Body;
 use axum::extract::Request;
@@ -18,8 +18,6 @@ pub struct Throttle {
     endpoint: String,
     left: Arc<AtomicU32>,
     refused: Arc<AtomicU32>,
-    /// Path and query of each request.
-    asked: Arc<Mutex<Vec<String>>>,
     task: JoinHandle<()>,
 }
 
@@ -30,14 +28,11 @@ impl Throttle {
         let endpoint = format!("http://{}", listener.local_addr().unwrap());
         let (left, refused) = (Arc::new(AtomicU32::new(0)), Arc::new(AtomicU32::new(0)));
         let (to, counts) = (to.to_owned(), (Arc::clone(&left), Arc::clone(&refused)));
-        let asked = Arc::<Mutex<Vec<String>>>::default();
-        let seen = Arc::clone(&asked);
         // Another test may have done it already.
         let _ = rustls::crypto::ring::default_provider().install_default();
         let http = reqwest::Client::builder().no_proxy().build().unwrap();
         let router = axum::Router::new().fallback(move |request: Request| {
             let (to, (left, refused), http) = (to.clone(), counts.clone(), http.clone());
-            seen.lock().unwrap().push(request.uri().to_string());
             async move {
                 let takes = |count: u32| count.checked_sub(1);
                 if left.fetch_update(Ordering::SeqCst, Ordering::SeqCst, takes).is_ok() {
@@ -52,19 +47,8 @@ impl Throttle {
             endpoint,
             left,
             refused,
-            asked,
             task,
         }
-    }
-
-    /// How many requests had this in path or query.
-    pub fn asked(&self, part: &str) -> usize {
-        self.asked
-            .lock()
-            .unwrap()
-            .iter()
-            .filter(|uri| uri.contains(part))
-            .count()
     }
 
     /// `http://127.0.0.1:<port>`.

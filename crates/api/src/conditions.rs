@@ -19,8 +19,6 @@ pub const ARCHIVED: &str = "Archived";
 pub const RECORDED: &str = "Recorded";
 /// The end is in EvalAI.
 pub const PUBLISHED: &str = "Published";
-/// The end is the one that EvalAI shows of another program's run; only there where nothing is published.
-pub const COMPARED: &str = "Compared";
 /// Nothing moves, although it should.
 pub const STALLED: &str = "Stalled";
 /// The scores follow from the infractions; only there once they did not.

@@ -9,6 +9,6 @@ pub enum EvalaiMode {
     /// EvalAI gets states and results.
     #[default]
     Publish,
-    /// Nothing is written to EvalAI: the submissions that another program runs are run once more, and the ends are compared.
+    /// Nothing is written to EvalAI: the submissions that another program runs are run once more.
     Observe,
 }

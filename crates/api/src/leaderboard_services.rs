@@ -61,7 +61,7 @@ pub struct Evalai {
     /// The challenge's queue, if it is in EvalAI's account; a queue in SQS is `spec.queue`.
     #[serde(default, skip_serializing_if = "Option::is_none")]
     pub queue: Option<EvalaiQueue>,
-    /// Whether results go to EvalAI, or the submissions of another program are only run once more and compared.
+    /// Whether results go to EvalAI, or the submissions of another program are only run once more.
     #[serde(default)]
     pub mode: EvalaiMode,
 }

@@ -21,11 +21,8 @@ pub const OPERATOR: &str = "leaderboard-operator";
 
 /// Annotation on a Submission: which message made or bumped it; see [`super::Ingested`].
 pub const ANNOTATION_INGESTED: &str = "leaderboard.carla.org/ingested";
-/// Annotation on a Submission, `true`: a person hands it over that another program has begun, or that was restored; it takes up what is
-/// stored.
+/// Annotation on a Submission, `true`: a person hands it over that is held back for another program; it takes up what is stored.
 pub const ANNOTATION_ADOPT: &str = "leaderboard.carla.org/adopt";
-/// Label that Velero puts on every object which it restores.
-pub const LABEL_VELERO_RESTORE: &str = "velero.io/restore-name";
 /// Annotation on a Pod: why it is to stop, `Cancel`, `Retries` or `RunDeadline`.
 pub const ANNOTATION_STOP: &str = "leaderboard.carla.org/stop";
 /// Annotation on a Job: which infrastructure retry of the attempt it is.

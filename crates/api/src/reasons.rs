@@ -19,8 +19,6 @@ pub enum Class {
     Infrastructure,
     /// The conditions `Archived`, `Published` and `Recorded`.
     System,
-    /// The condition `Compared`.
-    Comparison,
     /// The condition `Plausible`.
     Scores,
     /// The condition `Logged`.

@@ -26,8 +26,7 @@ const CLAIMS_NOT_SERVED: &str = "gpu.mode is Claim, and the API server does not 
                                  Update the cluster, or choose another gpu.mode.";
 const FIRST_LOOK: &str = "The bucket and whatever else the Leaderboard names are being asked for the first time, and not all have answered yet.";
 /// What the host of a Leaderboard that only observes is to know.
-const OBSERVES: &str = "evalai.mode is Observe: nothing is written to EvalAI; the condition Compared of each submission shows whether \
-                        the ends agree.";
+const OBSERVES: &str = "evalai.mode is Observe: nothing is written to EvalAI.";
 
 /// What one reconcile has read of a Leaderboard.
 #[derive(Clone, Debug)]
@@ -63,8 +62,6 @@ pub struct LeaderboardView {
     pub unreachable: Option<Unreachable>,
     /// What its host should know of places that it can do without.
     pub place_notes: Vec<String>,
-    /// The note about another reader of its queue.
-    pub shared_queue: Option<String>,
     pub evalai: EvalaiStanding,
     /// Until when nothing is written to EvalAI, because the controller before may still have requests under way.
     pub evalai_writes_from: Option<Timestamp>,
@@ -165,14 +162,10 @@ fn ready(view: &LeaderboardView) -> Option<(Truth, &'static str, String)> {
     is_new.then(|| (Truth::Unknown, reasons::CHECKING, FIRST_LOOK.to_owned()))
 }
 
-/// What the looks at its queue, its places and EvalAI have found.
+/// What the looks at its places and EvalAI have found.
 fn found(view: &LeaderboardView) -> (Truth, &'static str, String) {
     let unreachable = |truth| view.unreachable.as_ref().filter(|found| found.truth == truth);
     let (evalai_truth, reason, message) = evalai(&view.evalai);
-    // Before all that the sweep goes on with: the sweep reads it here.
-    if let Some(message) = &view.shared_queue {
-        return (Truth::False, reasons::QUEUE_SHARED, message.clone());
-    }
     if let Some(found) = unreachable(Truth::False) {
         return (Truth::False, found.reason, found.message.clone());
     }

@@ -59,7 +59,6 @@ fn view(mine: &Arc<Leaderboard>, all: &[Arc<Leaderboard>]) -> LeaderboardView {
         claims: Claims::NotRequired,
         unreachable: None,
         place_notes: Vec::new(),
-        shared_queue: None,
         evalai: EvalaiStanding::Fits { note: None },
         evalai_writes_from: None,
         usage: Some(USAGE),
@@ -85,22 +84,6 @@ fn of_two_with_the_same_phase_the_older_serves() {
         reason(&decide(&view(&new, &all))),
         ("False".into(), reasons::PHASE_CONFLICT.into())
     );
-}
-
-#[test]
-fn another_reader_of_the_queue_hides_behind_no_fault_with_which_submissions_start() {
-    let one = leaderboard("one", 1, 7, "https://e", "a/");
-    let mut seen = view(&one, &[]);
-    seen.shared_queue = Some("The queue has another reader.".into());
-    let shared = ("False".to_owned(), reasons::QUEUE_SHARED.to_owned());
-    assert_eq!(reason(&decide(&seen)), shared);
-    seen.evalai = EvalaiStanding::TokenRefused("no".into());
-    seen.unreachable = Some(Unreachable {
-        truth: Truth::False,
-        reason: reasons::BUCKET_UNREACHABLE,
-        message: "It does not exist.".into(),
-    });
-    assert_eq!(reason(&decide(&seen)), shared);
 }
 
 #[test]
@@ -443,7 +426,6 @@ fn before_the_first_look_only_what_is_surely_wrong_is_shown() {
     );
     let before = conditions::get(conditions, conditions::READY).cloned();
     let mut seen = unseen(&one);
-    seen.shared_queue = Some("Not looked at either.".into());
     let plan = decide(&seen);
     assert_eq!(
         conditions::get(&plan.status.conditions, conditions::READY).cloned(),

@@ -14,10 +14,8 @@ mod places;
 mod pod_notes;
 mod priority;
 pub mod probe;
-mod queue_readers;
 mod reach;
 mod refusal;
-pub mod shared_queue;
 pub mod standing;
 pub mod state;
 mod tried_pods;
@@ -210,7 +208,6 @@ fn observe(
         claims: probe.claims.clone(),
         unreachable: probe.reach.unreachable(now),
         place_notes: probe.reach.notes(now),
-        shared_queue: probe.shared_queue(),
         evalai: standing::standing(hub, leaderboard, probe.token(leaderboard), now),
         evalai_writes_from: hub.writes_from(),
         usage: hub.usage(&key),

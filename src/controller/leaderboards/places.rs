@@ -30,18 +30,10 @@ pub(super) struct Readings {
     pub(super) dead_letters: Option<Reading>,
 }
 
-/// What has to be asked now, each with its address in words; the queue also if it is in question.
-pub(super) fn due(
-    leaderboard: &Leaderboard,
-    reach: &Reach,
-    is_queue_due: bool,
-    now: Timestamp,
-) -> Vec<(AwsResource, String)> {
+/// What has to be asked now, each with its address in words.
+pub(super) fn due(leaderboard: &Leaderboard, reach: &Reach, now: Timestamp) -> Vec<(AwsResource, String)> {
     let generation = leaderboard.metadata.generation.unwrap_or_default();
-    let is_due = |(place, address): &(AwsResource, String)| {
-        let is_in_question = *place == AwsResource::Queue && is_queue_due;
-        is_in_question || reach.is_due(*place, address, generation, now)
-    };
+    let is_due = |(place, address): &(AwsResource, String)| reach.is_due(*place, address, generation, now);
     named(leaderboard).into_iter().filter(is_due).collect()
 }
 

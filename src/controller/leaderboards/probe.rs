@@ -13,9 +13,7 @@ use leaderboard_results::metrics;
 use super::claims::{self, Claims};
 use super::places::{self, Readings};
 use super::priority;
-use super::queue_readers;
 use super::reach::{AwsResource, Reach};
-use super::shared_queue::SharedQueue;
 use super::tried_pods::{TriedPods, try_pods};
 use crate::controller::objects::key_of;
 use crate::controller::settings::Settings;
@@ -25,7 +23,6 @@ use crate::observability::metrics::leader::{self, Gauge};
 use crate::pod::run::results_format;
 use crate::services::aws::Aws;
 use crate::services::evalai::Target;
-use crate::services::queue::Reading;
 use crate::services::token::{Token, TokenSource};
 use leaderboard_api::{EvalaiMode, Leaderboard, Token as TokenPlace};
 
@@ -52,8 +49,6 @@ pub(super) struct Probe {
     generation: Option<i64>,
     token: Option<FoundToken>,
     pub(super) reach: Reach,
-    /// Whether somebody else reads its queue.
-    queue: Option<SharedQueue>,
     /// Messages of the queue, visible and in flight, and of its dead-letter queue.
     messages: Option<(u64, u64)>,
     dead_letters: Option<u64>,
@@ -98,12 +93,11 @@ impl Probe {
         let is_edited = !self.is_of(leaderboard);
         let has_classes = !self.pods.classes.is_empty();
         let has_claims = self.claims != Claims::NotRequired;
-        let is_queue_due = self.queue.as_ref().is_some_and(|queue| queue.is_due(now));
         Due {
             priority: is_edited || has_classes && due(self.priority_at, self.priority.refused.is_none(), now),
             claims: is_edited || has_claims && due(self.claims_at, self.claims == Claims::InPlace, now),
             token: leaderboard.spec.evalai.is_some() && self.token_is_due(leaderboard, is_token_refused, now),
-            places: places::due(leaderboard, &self.reach, is_queue_due, now),
+            places: places::due(leaderboard, &self.reach, now),
         }
     }
 
@@ -141,17 +135,12 @@ impl Probe {
                 tracing::warn!(leaderboard = %key_of(leaderboard), %error, "old ResourceClaimTemplates are not removed");
             }
         }
-        let is_queue_due = due.places.iter().any(|(place, _)| *place == AwsResource::Queue);
-        if let Some(queue) = self.queue.as_mut().filter(|_| is_queue_due) {
-            queue.asked(now);
-        }
         // A bucket that hangs must not keep EvalAI waiting.
         let places = places::look(aws, leaderboard, &mut self.reach, due.places, now);
         let token = find_token(client, aws, leaderboard, due.token.then_some(now));
         let (readings, read) = tokio::join!(places, token);
         self.token = read.or(self.token);
         self.note_messages(leaderboard, &readings);
-        self.note_queue(uses, leaderboard, readings.queue, now).await;
         self.generation = Some(generation_of(leaderboard));
         self
     }
@@ -181,32 +170,6 @@ impl Probe {
         for (gauge, count) in messages {
             show(gauge, count.map(|count| i64::try_from(count).unwrap_or(i64::MAX)));
         }
-    }
-
-    async fn note_queue(
-        &mut self,
-        uses: Uses<'_>,
-        leaderboard: &Leaderboard,
-        reading: Option<Reading>,
-        now: Timestamp,
-    ) {
-        let before = self.queue.take();
-        let Some(queue) = &leaderboard.spec.queue else { return };
-        let (client, stores) = (uses.client, uses.stores);
-        let known = before.unwrap_or_else(|| SharedQueue::of_status(leaderboard));
-        let mut known = known.of_queue(&queue.url);
-        if queue_readers::is_on_purpose(stores, queue) {
-            known = SharedQueue::default().of_queue(&queue.url);
-        } else if let Some(reading) = reading {
-            let sign = queue_readers::sign(client, stores, queue, &reading, now).await;
-            known.take(&reading, sign, now);
-        }
-        self.queue = Some(known);
-    }
-
-    /// The note about another reader of its queue.
-    pub(super) fn shared_queue(&self) -> Option<String> {
-        self.queue.as_ref()?.message()
     }
 
     /// The way to EvalAI, once there is a token.
@@ -262,8 +225,7 @@ impl Probe {
         let is_missing = matches!(self.claims, Claims::NotServed | Claims::Missing(_));
         let claims = self.claims_at.filter(|_| is_missing);
         let [missing, priority, claims] = [missing, priority, claims].map(|at| at?.checked_add(SOON).ok());
-        let queue = self.queue.as_ref().and_then(SharedQueue::next);
-        [self.reach.next(now), missing, refused, claims, priority, queue]
+        [self.reach.next(now), missing, refused, claims, priority]
             .into_iter()
             .flatten()
             .min()

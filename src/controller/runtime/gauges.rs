@@ -31,13 +31,6 @@ const STATES: [State; 6] = [
     State::Failed,
     State::Cancelled,
 ];
-/// What a comparison may show.
-const COMPARED: [&str; 4] = [
-    reasons::SAME_END,
-    reasons::DIFFERENT_END,
-    reasons::DIFFERENT_ROUTES,
-    reasons::AWAITING_OTHER_END,
-];
 
 /// Shows what a walk finds, at once and then `every` so often, until the stop.
 pub(super) async fn keep(every: Duration, walk: impl Fn() -> Samples, telemetry: Observability) {
@@ -81,28 +74,17 @@ fn show_queue(samples: &mut Samples, kind: &str, queue: &Queue) {
 /// How many Submissions stand where.
 fn show_states(samples: &mut Samples, submissions: &[Arc<Submission>]) {
     let mut states = STATES.map(|state| (state.as_str(), 0)).into();
-    let mut compared = COMPARED.map(|reason| (reason, 0)).into();
     let mut standings = BTreeMap::new();
     for submission in submissions {
         let standing = standing(submission);
         count(&mut states, standing[0]);
         count(&mut standings, standing);
-        let found = submission
-            .status
-            .as_ref()
-            .and_then(|status| status.condition(conditions::COMPARED));
-        if let Some(reason) = found.and_then(|found| COMPARED.into_iter().find(|known| *known == found.reason)) {
-            count(&mut compared, reason);
-        }
     }
     for (state, number) in states {
         samples.set(&leader::SUBMISSIONS, [state], number);
     }
     for (standing, number) in standings {
         samples.set(&leader::SUBMISSIONS_BY_REASON, standing, number);
-    }
-    for (reason, number) in compared {
-        samples.set(&leader::OBSERVED, [reason], number);
     }
 }
 

@@ -9,10 +9,9 @@ use tokio::sync::mpsc;
 use tracing::Instrument;
 
 use crate::bridge::ingest::{self, Incoming, Outcome, Source};
-use crate::controller::leaderboards::shared_queue::is_shown;
 use crate::kubernetes::Store;
-use crate::services::evalai::SweepRow;
-use leaderboard_api::{Evalai, Leaderboard, Submission};
+use crate::services::evalai::{SweepRow, Swept};
+use leaderboard_api::{Evalai, Foreign, Leaderboard, Submission};
 
 /// Takes rows in until their sender is gone.
 pub(super) async fn into_cluster(
@@ -25,21 +24,11 @@ pub(super) async fn into_cluster(
         let Some(board) = serving(&all, &row) else { continue };
         let namespace = board.namespace().unwrap_or_default();
         let span = ingest::span(&namespace, &board.name_any(), row.submission);
-        if let Some(queue) = shared_queue(&all, board) {
-            span.in_scope(|| {
-                tracing::warn!(
-                    server = row.server,
-                    queue,
-                    "EvalAI waits for a submission, and another reader of the queue may have its message"
-                );
-            });
-            continue;
-        }
-        take(&client, board, &row).instrument(span).await;
+        take(&client, board, &row, kind(&all, &row)).instrument(span).await;
     }
 }
 
-async fn take(client: &Client, board: &Leaderboard, row: &SweepRow) {
+async fn take(client: &Client, board: &Leaderboard, row: &SweepRow, kind: Swept) {
     let namespace = board.namespace().unwrap_or_default();
     let api: Api<Submission> = Api::namespaced(client.clone(), &namespace);
     let incoming = Incoming {
@@ -47,7 +36,7 @@ async fn take(client: &Client, board: &Leaderboard, row: &SweepRow) {
         phase: row.phase,
         submission: row.submission,
         image: None,
-        source: Source::Sweep(row.kind),
+        source: Source::Sweep(kind),
         sent_ms: row.time.as_millisecond(),
     };
     let server = &row.server;
@@ -67,20 +56,22 @@ async fn take(client: &Client, board: &Leaderboard, row: &SweepRow) {
 
 /// The oldest Leaderboard of the row's server that serves its phase: the same one that the bridge and `Ready` name.
 fn serving<'a>(all: &'a [Arc<Leaderboard>], row: &SweepRow) -> Option<&'a Arc<Leaderboard>> {
-    let serves = |l: &&Arc<Leaderboard>| {
-        let is_of_server = l.spec.evalai.as_ref().map(Evalai::server).as_ref() == Some(&row.server);
-        is_of_server && l.serves(row.challenge, row.phase) && l.metadata.deletion_timestamp.is_none()
-    };
-    all.iter().filter(serves).min_by_key(|l| l.seniority())
+    all.iter().filter(|l| serves(l, row)).min_by_key(|l| l.seniority())
 }
 
-/// The queue of a Leaderboard, while one of those that read it shows that somebody else does too. The row is found again
-/// ten minutes later.
-fn shared_queue<'a>(all: &[Arc<Leaderboard>], board: &'a Leaderboard) -> Option<&'a str> {
-    let url = &board.spec.queue.as_ref()?.url;
-    let is_of_queue = |other: &Leaderboard| other.spec.queue.as_ref().is_some_and(|queue| queue.url == *url);
-    let is_shared = all.iter().any(|other| is_of_queue(other) && is_shown(other));
-    is_shared.then_some(url)
+fn serves(board: &Leaderboard, row: &SweepRow) -> bool {
+    let is_of_server = board.spec.evalai.as_ref().map(Evalai::server).as_ref() == Some(&row.server);
+    is_of_server && board.serves(row.challenge, row.phase) && board.metadata.deletion_timestamp.is_none()
+}
+
+/// Where a queue of the phase leaves messages to another reader, that one may have the message of any row: no object is made of it.
+fn kind(all: &[Arc<Leaderboard>], row: &SweepRow) -> Swept {
+    let leaves = |board: &Leaderboard| board.spec.queue.as_ref().is_some_and(|q| q.foreign == Foreign::Leave);
+    let is_shared = all.iter().any(|board| serves(board, row) && leaves(board));
+    match row.kind {
+        Swept::New | Swept::Rerun if is_shared => Swept::Edited,
+        kind => kind,
+    }
 }
 
 #[cfg(test)]
@@ -92,7 +83,6 @@ mod tests {
     use serde_json::{Value, json};
 
     use super::*;
-    use crate::services::evalai::Swept;
 
     /// A Leaderboard of challenge 1 with phase 2, created at this second, in a namespace of its own name.
     fn board(name: &str, second: i64, server: &str) -> Leaderboard {
@@ -141,30 +131,31 @@ mod tests {
     }
 
     #[test]
-    fn nothing_is_swept_up_while_a_leaderboard_of_the_queue_shows_another_reader() {
-        let with_queue = |name: &str, url: &str, reason: &str| {
+    fn where_a_queue_of_the_phase_is_shared_on_purpose_a_row_makes_nothing_new() {
+        let with_queue = |name: &str, foreign: &str| {
             let mut board = board(name, 1, "https://eval.ai");
-            board.spec.queue = serde_json::from_value(json!({"url": url})).unwrap();
-            let ready = json!([{"type": "Ready", "status": "False", "reason": reason, "message": "", "lastTransitionTime": "2026-11-20T10:00:00Z"}]);
-            board.status.get_or_insert_default().conditions = serde_json::from_value(ready).unwrap();
+            board.spec.queue = serde_json::from_value(json!({"url": "https://q", "foreign": foreign})).unwrap();
             Arc::new(board)
         };
-        let (mine, quiet) = (
-            with_queue("a", "https://q", "Ready"),
-            with_queue("b", "https://q", "BucketUnreachable"),
-        );
-        let shared = |other: Arc<Leaderboard>| shared_queue(&[Arc::clone(&mine), other], &mine).map(str::to_owned);
-        assert_eq!(shared(quiet), None);
-        assert_eq!(
-            shared(with_queue("b", "https://q", "QueueShared")).as_deref(),
-            Some("https://q")
-        );
-        assert_eq!(shared(with_queue("b", "https://other", "QueueShared")), None);
-        let without = Arc::new(board("c", 1, "https://eval.ai"));
-        assert_eq!(
-            shared_queue(&[with_queue("b", "https://q", "QueueShared")], &without),
-            None
-        );
+        let without = || Arc::new(board("c", 1, "https://eval.ai"));
+        let of = |kind| SweepRow {
+            kind,
+            ..row("https://eval.ai", 2)
+        };
+        let alone = [with_queue("a", "DeadLetter"), without()];
+        let shared = [with_queue("a", "Leave"), without()];
+        for (swept, among_shared) in [
+            (Swept::New, Swept::Edited),
+            (Swept::Rerun, Swept::Edited),
+            (Swept::Resuming, Swept::Resuming),
+            (Swept::Edited, Swept::Edited),
+        ] {
+            assert_eq!(kind(&alone, &of(swept)), swept);
+            assert_eq!(kind(&shared, &of(swept)), among_shared);
+        }
+        // Another phase's queue, and another server's, are not this row's.
+        assert_eq!(kind(&shared, &row("https://eval.ai", 3)), Swept::New);
+        assert_eq!(kind(&shared, &row("https://staging", 2)), Swept::New);
     }
 
     /// Answers with what was sent, and hands back each path.
@@ -175,7 +166,7 @@ mod tests {
             while let Some((request, answer)) = handle.next_request().await {
                 let line = format!("{} {}", request.method(), request.uri().path());
                 let body = request.into_body().collect_bytes().await.unwrap();
-                let _ = sender.send((line, serde_json::from_slice(&body).unwrap()));
+                let _ = sender.send((line, serde_json::from_slice(&body).unwrap_or_default()));
                 answer.send_response(Response::new(Body::from(body.to_vec())));
             }
         });
@@ -185,9 +176,7 @@ mod tests {
     #[tokio::test]
     async fn what_another_reader_may_have_is_not_made() {
         let mut shared = board("real", 1, "http://one");
-        shared.spec.queue = serde_json::from_value(json!({"url": "https://q"})).unwrap();
-        let ready = json!([{"type": "Ready", "status": "False", "reason": "QueueShared", "message": "", "lastTransitionTime": "2026-11-20T10:00:00Z"}]);
-        shared.status.get_or_insert_default().conditions = serde_json::from_value(ready).unwrap();
+        shared.spec.queue = serde_json::from_value(json!({"url": "https://q", "foreign": "Leave"})).unwrap();
         let (client, mut asked) = cluster();
         let (sender, rows) = mpsc::unbounded_channel();
         sender.send(row("http://one", 2)).unwrap();
@@ -199,8 +188,10 @@ mod tests {
             rows,
         )
         .await;
-        let (line, _) = asked.recv().await.unwrap();
+        let mut made = std::iter::from_fn(|| asked.try_recv().ok()).filter(|(line, _)| line.starts_with("POST"));
+        let (line, _) = made.next().unwrap();
         assert!(line.ends_with("/namespaces/quiet/submissions"), "{line}");
+        assert!(made.next().is_none());
     }
 
     #[tokio::test]

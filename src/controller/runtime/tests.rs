@@ -17,19 +17,18 @@ use crate::kubernetes::Namespaces;
 use crate::observability::shutdown::Stop;
 
 /// All that runs in a leader without Leaderboards, in the order of names.
-const TASKS: [&str; 19] = [
+const TASKS: [&str; 18] = [
     "events of Jobs",
     "events of Pods",
-    "foreign runs",
     "gauges",
     "inbox",
     "lease",
     "looks",
     "lookups",
     "nodes",
-    "other results",
     "policies",
     "reconciles",
+    "rows",
     "sweep",
     "watch of jobs",
     "watch of leaderboards",

@@ -20,7 +20,7 @@ use super::observe::workers::Workers;
 use super::phases::{self, Ended, Phase};
 use super::spans;
 use super::view::{LogPlace, View};
-use crate::controller::objects::{key_of, uid};
+use crate::controller::objects::{key_of, log_span_of, uid};
 use crate::controller::settings::Settings;
 use crate::controller::slots::SlotAllocator;
 use crate::controller::stores::Stores;
@@ -143,8 +143,7 @@ impl Actor<'_> {
                 self.delete_submission(uid, resource_version).await?;
             }
             Action::JoinLine(place) => uses.slots.join(submission, place),
-            Action::LookForForeignRun(question) => workers.foreign_runs.want(submission, *question),
-            Action::ReadOtherResults(question) => workers.other_results.want(submission, *question),
+            Action::ReadRow(row) => workers.rows.want(&key_of(submission), *row, log_span_of(submission)),
             Action::TakeOwnership => workers.archive.want_fence(submission, status),
             Action::KeepLog { places } => workers.archive.want_log(submission, status, log_demand(places, status)),
             Action::LookUpNode(name) => workers.lookups.want(submission, &name),

@@ -99,7 +99,7 @@ impl ExternalSystems {
             .filter(|seen| Some(seen.attempt) == attempt);
         Some(seen.map_or_else(RecordView::default, |s| RecordView {
             end_written: s.end_written,
-            is_superseded: s.is_superseded,
+            superseded_by: s.superseded_by,
             error: s.error,
         }))
     }

@@ -12,9 +12,10 @@ use serde_json::{Value, json};
 use tokio::sync::mpsc;
 
 use super::*;
+use crate::ask::Lookup;
 use crate::controller::fixtures::{Cluster, Surroundings, leaderboard, surroundings, with_job};
 use crate::controller::submissions::view::{
-    ObservedFence, ObservedJob, ObservedLog, ObservedNode, ObservedReport, ObservedRoutes, ObservedTraces, Turn,
+    ObservedFence, ObservedJob, ObservedLog, ObservedNode, ObservedReport, Turn,
 };
 use leaderboard_api::conditions::{self, Truth};
 use leaderboard_api::{Attempt, State, reasons};
@@ -95,8 +96,7 @@ async fn bench(state: State) -> Bench {
         leaderboard: Some(Arc::new(board)),
         not_allowed: None,
         is_policy_in_place: true,
-        traces: ObservedTraces::NotAsked,
-        other_routes: ObservedRoutes::NotAsked,
+        row: Lookup::default(),
         turn: Turn::Go,
         job: ObservedJob::Absent,
         job_refused: None,

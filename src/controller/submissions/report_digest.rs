@@ -13,14 +13,6 @@ use leaderboard_api::{Attempt, Progress, Score};
 /// Longest text of a report that is kept, in characters.
 const LONGEST: usize = 500;
 
-/// A report that was found below a run's prefix.
-#[derive(Clone, Debug, PartialEq)]
-pub struct StoredReport {
-    /// UID of the object whose Pods have written it.
-    pub submission_uid: String,
-    pub digest: ReportDigest,
-}
-
 /// What is kept of a report. Its texts are read again when they are published.
 #[derive(Clone, Debug, Default, PartialEq)]
 pub struct ReportDigest {
@@ -50,17 +42,6 @@ pub struct ReportDigest {
     pub metrics: Option<Box<Map<String, Value>>>,
     /// Why EvalAI is not sent one of its texts.
     pub left_out: Option<Box<str>>,
-}
-
-impl StoredReport {
-    /// Reads a report as hostile text, of whatever object it is.
-    pub(super) fn read(bytes: &[u8]) -> Result<Self, ReportError> {
-        let report = Report::parse(bytes)?;
-        Ok(Self {
-            digest: ReportDigest::of(&report, ContentId::of(bytes)),
-            submission_uid: cut(&report.submission_uid),
-        })
-    }
 }
 
 impl ReportDigest {

@@ -6,9 +6,9 @@ use std::time::Duration;
 use jiff::Timestamp;
 use leaderboard_runner::verdict::Verdict;
 
-pub use super::foreign_runs::ObservedTraces;
-pub use super::other_results::ObservedRoutes;
 use super::report_digest::ReportDigest;
+use super::rows::Row;
+use crate::ask::Lookup;
 pub use crate::controller::slots::turns::Turn;
 use crate::pod::run::Stop;
 use leaderboard_api::{Attempt, JobNumber, Leaderboard, SharedText, Submission, names};
@@ -23,10 +23,8 @@ pub struct View {
     pub not_allowed: Option<String>,
     /// Whether the NetworkPolicy that the Leaderboard's present spec asks for is in place; only meaningful while it has no Job.
     pub is_policy_in_place: bool,
-    /// What another program has left of it.
-    pub traces: ObservedTraces,
-    /// How many routes another program's run of it has; read only where a Leaderboard observes.
-    pub other_routes: ObservedRoutes,
+    /// The row that another program may have written of it.
+    pub row: Lookup<Row>,
     /// Whether it may start now; only meaningful while it has no Job and all else is settled.
     pub turn: Turn,
     pub job: ObservedJob,
@@ -401,8 +399,8 @@ pub enum EvalaiEnd {
 pub struct RecordView {
     /// The end of this attempt is written.
     pub end_written: bool,
-    /// The table keeps a later attempt, or another end, in place of this end.
-    pub is_superseded: bool,
+    /// The attempt of the row that the table keeps in place of this end.
+    pub superseded_by: Option<i64>,
     /// Why the last write failed.
     pub error: Option<String>,
 }

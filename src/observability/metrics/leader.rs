@@ -22,11 +22,6 @@ pub const SUBMISSIONS_BY_REASON: Gauge<3> = Gauge(
     ["state", "reason", "class"],
     "Submissions by the reason of their state; `class` is that of the failure, or empty",
 );
-pub const OBSERVED: Gauge<1> = Gauge(
-    "observed_submissions",
-    ["reason"],
-    "Submissions that are only observed, by what their comparison shows",
-);
 pub const GPU_SECONDS: Gauge<2> = Gauge(
     "submission_gpu_seconds",
     ["leaderboard", "submission"],

@@ -50,7 +50,6 @@ fn samples() -> Samples {
         ["Failed", "AgentCrashed", "Participant"],
         3,
     );
-    samples.set(&leader::OBSERVED, ["SameEnd"], 1);
     samples.set(&leader::GPU_SECONDS, ["ns/board", "submission-1"], 240);
     samples.set(&leader::READY, board, 1);
     samples.set(&leader::OLDEST_PENDING, board, 9);

@@ -45,8 +45,8 @@ pub struct RowState {
     pub attempt: i64,
     /// True if the end of that attempt is in the table.
     pub end_written: bool,
-    /// True if the table keeps a later attempt, or another end, in place of that end.
-    pub is_superseded: bool,
+    /// The attempt of the row that the table keeps in place of that end.
+    pub superseded_by: Option<i64>,
     /// Why the newest row is not in the table.
     pub error: Option<String>,
 }
@@ -70,7 +70,7 @@ struct Entry {
     newest: RowUpdate,
     is_pending: bool,
     is_written: bool,
-    is_superseded: bool,
+    superseded_by: Option<i64>,
     refused_until: Option<Instant>,
     error: Option<String>,
 }
@@ -95,7 +95,7 @@ impl Ledger {
             if is_older || is_known {
                 return false;
             }
-            if update.row.attempt != old.row.attempt || entry.is_superseded {
+            if update.row.attempt != old.row.attempt || entry.superseded_by.is_some() {
                 entry.error = None;
             }
             if !entry.is_pending {
@@ -103,7 +103,7 @@ impl Ledger {
             }
             entry.newest = update;
             (entry.is_pending, entry.is_written, entry.refused_until) = (true, false, None);
-            entry.is_superseded = false;
+            entry.superseded_by = None;
             return true;
         }
         let entry = Entry {
@@ -113,7 +113,7 @@ impl Ledger {
             newest: update,
             is_pending: true,
             is_written: false,
-            is_superseded: false,
+            superseded_by: None,
             refused_until: None,
             error: None,
         };
@@ -164,7 +164,10 @@ impl Ledger {
             }
             Err(error) if is_newest => {
                 (entry.is_pending, entry.refused_until) = (false, Some(now + REFUSED));
-                entry.is_superseded = matches!(error, TableError::Stale { .. });
+                entry.superseded_by = match error {
+                    TableError::Stale { kept, .. } => Some(kept),
+                    _ => None,
+                };
                 entry.error = Some(error.to_string());
             }
             // A newer row waits already; what became of the older one means nothing.
@@ -178,7 +181,7 @@ impl Ledger {
         self.entries.get(key).map(|entry| RowState {
             attempt: entry.newest.row.attempt,
             end_written: entry.newest.end && entry.is_written,
-            is_superseded: entry.is_superseded,
+            superseded_by: entry.superseded_by,
             error: entry.error.clone(),
         })
     }
@@ -201,11 +204,12 @@ fn stale_is_an_error(
     result: Result<Written, TableError>,
 ) -> Result<(), TableError> {
     match result? {
-        Written::Stale if update.end => Err(TableError::Stale {
+        Written::Stale { kept } if update.end => Err(TableError::Stale {
             table: table.name.clone(),
             run_id: update.row.run_id.clone(),
+            kept,
         }),
-        Written::Stored | Written::Stale => Ok(()),
+        Written::Stored | Written::Stale { .. } => Ok(()),
     }
 }
 
@@ -248,7 +252,7 @@ mod tests {
         RowState {
             attempt,
             end_written,
-            is_superseded: false,
+            superseded_by: None,
             error: error.map(str::to_owned),
         }
     }
@@ -421,12 +425,13 @@ mod tests {
     fn a_stale_end_is_an_error_and_a_stale_partial_row_is_not() {
         let (mut ledger, now, a) = (Ledger::default(), Instant::now(), key("a"));
         ledger.record(table("t"), &a, update(1, "1/9", false), now);
-        assert!(!ledger.report(&table("t"), &a, &update(1, "1/9", false), Ok(Written::Stale), now));
+        let stale = || Ok(Written::Stale { kept: 3 });
+        assert!(!ledger.report(&table("t"), &a, &update(1, "1/9", false), stale(), now));
         ledger.record(table("t"), &a, update(1, "9/9", true), now);
-        ledger.report(&table("t"), &a, &update(1, "9/9", true), Ok(Written::Stale), now);
-        let error = "table t already holds a later attempt or another end of submission 7; the row is left as it is";
+        ledger.report(&table("t"), &a, &update(1, "9/9", true), stale(), now);
+        let error = "table t already holds attempt 3 of submission 7; the row is left as it is";
         let superseded = RowState {
-            is_superseded: true,
+            superseded_by: Some(3),
             ..view(1, false, Some(error))
         };
         assert_eq!(ledger.view(&a), Some(superseded));
@@ -438,7 +443,8 @@ mod tests {
         for next in [update(1, "cancelled", true), update(2, "1/9", false)] {
             let (mut ledger, now, a) = (Ledger::default(), Instant::now(), key("a"));
             ledger.record(table("t"), &a, update(1, "9/9", true), now);
-            assert!(ledger.report(&table("t"), &a, &update(1, "9/9", true), Ok(Written::Stale), now));
+            let stale = Ok(Written::Stale { kept: 1 });
+            assert!(ledger.report(&table("t"), &a, &update(1, "9/9", true), stale, now));
             let attempt = next.row.attempt;
             let is_end = next.end;
             assert!(ledger.record(table("t"), &a, next.clone(), now));

@@ -18,8 +18,6 @@ pub struct ObservedRow {
     pub status: String,
     /// It has the column that only this operator writes.
     pub is_ours: bool,
-    /// The attempt in that column.
-    pub attempt: Option<i64>,
     /// Since when, as it is stored: the start of the run, else the time of the submission.
     pub since: Option<String>,
 }
@@ -51,7 +49,6 @@ fn row(item: &HashMap<String, AttributeValue>) -> ObservedRow {
     ObservedRow {
         status: text(STATUS).unwrap_or_default(),
         is_ours: item.contains_key(ATTEMPT),
-        attempt: item.get(ATTEMPT).and_then(|value| value.as_n().ok()?.parse().ok()),
         since: time(START).or_else(|| time(SUBMITTED)),
     }
 }
@@ -76,7 +73,7 @@ mod tests {
         assert_eq!(running.since.as_deref(), Some("tuesday"));
         let mut ours = item(&[(STATUS, "RUNNING")]);
         ours.insert(ATTEMPT.to_owned(), AttributeValue::N("1".to_owned()));
-        assert_eq!((row(&ours).is_ours, row(&ours).attempt), (true, Some(1)));
+        assert!(row(&ours).is_ours);
         assert_eq!(row(&HashMap::new()), ObservedRow::default());
     }
 }

@@ -4,11 +4,6 @@ use super::{Class, Reason};
 
 reasons! {
     Leaderboard {
-        QUEUE_SHARED = "QueueShared",
-            "Somebody else reads the queue too, such as the EventBridge Pipe of the old pipeline: in three readings running, messages \
-             were in flight that no bridge of this operator holds. What the other reader takes is run there; the sweep starts nothing \
-             while it lasts, and goes on after three readings without it. Submissions that the bridge takes in run as always.",
-            "Stop the Pipe that the message helps to find. If the queue is shared on purpose, set `queue.foreign` to `Leave`.";
         READY = "Ready",
             "Submissions can run. The message may have a note: metrics of a phase's leaderboard that stay empty, a token that \
              expires soon, until when nothing is written to EvalAI after a change of operators, images of several teams that cannot be pulled \

@@ -28,18 +28,14 @@ reasons! {
              resume it. If the Submission has the wrong phase, delete it within the hour and apply it with the right one.",
             after_failure: "Set the phase back in EvalAI, then resume the submission. If the Submission has the wrong phase, \
              delete it and apply it with the right one.";
-        LOOKING_FOR_FOREIGN_RUN = "LookingForForeignRun",
-            "Table and bucket are being asked whether another program runs the submission. Shown if that takes 5 s or longer.",
-            "Nothing. Within 20 s the submission goes on, or shows why it waits.";
         FOREIGN = "Foreign",
-            "Another program, such as the old pipeline, runs the submission, or whether one does cannot be read: the table's row is \
-             `SUBMITTED` or `RUNNING` and has no `attempt`; or, where there is no row, objects below its prefix are younger than \
-             `deadlines.runSeconds` (without a limit: than a day) and have no `logcopy/owner`. No Job is created, and nothing is \
-             written to EvalAI, table and bucket. Where EvalAI shows an end and the Submission has no status of a run, as after a restore \
-             from a backup: whether the end is that of a run of this operator cannot be read.",
-            "Wait for the end of the other run; the submission is looked for every 30 s. If nothing runs it any more, set the row's \
-             `submission_status` to `FAILED`, or annotate the Submission with `leaderboard.carla.org/adopt=true`: it then continues \
-             from what is stored. If the message has an error, do what it asks.";
+            "The submission is held back, because another program such as the old pipeline may run it. Either the table's row is \
+             `SUBMITTED` or `RUNNING` and has no `attempt`, or the row cannot be read; then nothing has been written anywhere. Or the \
+             Pod has found results of something else below the run's prefix; then its Job was deleted, and nothing more is written to \
+             EvalAI, table and bucket.",
+            "With a row: wait for the end of the other run; the row is read every 30 s. If nothing runs it any more, set the row's \
+             `submission_status` to `FAILED`. In each case the annotation `leaderboard.carla.org/adopt=true` hands the Submission over: \
+             it then continues from what is stored. If the message has an error, do what it asks.";
         WAITING_FOR_SLOT = "WaitingForSlot",
             "All slots that `concurrency.total` and `concurrency.perTeam` allow are in use. `status.waiting` has the position in the line \
              and an estimate.",
@@ -87,10 +83,6 @@ reasons! {
     Running {
         ACCEPTED = "Accepted",
             "Leaderboard, track and image are known, and the plan is pinned (condition `Accepted`).",
-            "Nothing.";
-        RESTORED = "Restored",
-            "As `Accepted`, but the object had no status although it was run before, as after a restore from a backup: what is stored \
-             in the bucket is taken up (condition `Accepted`; the message says where).",
             "Nothing.";
         RUNNING = "Running",
             "The agents of the first attempt are running.",
@@ -241,17 +233,10 @@ reasons! {
             "The Job ended while the operator was away, or the bucket could not be read, for longer than the Job is kept (at least 7 \
              days): Kubernetes removed it before its end was read. There is no further Job.",
             "Look at the stored results and logs, then resume the submission.";
-        IMPORTED_FAILURE = "ImportedFailure",
-            "The Submission had failed before it was restored from a backup without its status. Neither the row nor the bucket \
-             holds why.",
-            "Look at the results and logs that are stored for it. To run it again, resume it in EvalAI, or raise `spec.attempt`.";
         JOB_FAILED = "JobFailed",
             "Kubernetes ended the Job for a reason that no container explains.",
             "Look at the Job's events, then resume the submission.",
             log: "the log of `logcopy`";
-        PREFIX_IN_USE = "PrefixInUse",
-            "The run's folder in the bucket holds another Submission's results. There is no retry.",
-            "Apply the Submission with `attempt: 2` to continue from these results, or empty the prefix.";
     }
     System {
         STORED = "Stored",
@@ -292,22 +277,6 @@ reasons! {
              EvalAI may show the wrong end. The operator reads EvalAI again and writes `cancelled` if needed.",
             "Nothing.";
     }
-    Comparison {
-        SAME_END = "SameEnd",
-            "EvalAI shows the same end as this run, and the other program's results have as many routes, if they were found: the message \
-             says so (condition `Compared`, only with `evalai.mode: Observe`).",
-            "Nothing. Scores are not compared: runs are not deterministic.";
-        DIFFERENT_END = "DifferentEnd",
-            "EvalAI shows another end than this run (condition `Compared`, only with `evalai.mode: Observe`).",
-            "Compare `status.failure` and the logs of this run with those of the other program.";
-        DIFFERENT_ROUTES = "DifferentRoutes",
-            "Both runs have the same end, and the other program's results have another number of routes (condition `Compared`, only \
-             with `evalai.mode: Observe`).",
-            "Compare `routes`, `repetitions` and the contents image of the Leaderboard with what the other program runs.";
-        AWAITING_OTHER_END = "AwaitingOtherEnd",
-            "This run has ended, and EvalAI shows no end of the other program's yet (condition `Compared`).",
-            "Nothing. EvalAI is read until it does.";
-    }
     Scores {
         UNEXPLAINED_SCORES = "UnexplainedScores",
             "The Leaderboard's `verify` is `Warn`, and scores in a checkpoint do not follow from its infractions. The message has \
@@ -328,11 +297,6 @@ reasons! {
             "Nothing.";
     }
     Event {
-        MESSAGES_HELD_BACK = "MessagesHeldBack",
-            "Event of a Leaderboard: the bridge cannot use messages of its queue yet, and receives them again later: no Leaderboard \
-             serves their phase, an older Submission of the same name is being deleted, the attempt before is being stopped, or the API \
-             server does not take them.",
-            "Apply the Leaderboard of their phase. If it lasts, look at the log of the bridge.";
         JOB_RECREATED = "JobRecreated",
             "Somebody deleted the Job; the operator creates it again, at most three times between two retries.",
             "Find out who deletes Jobs.";

@@ -6,14 +6,13 @@ use std::fmt::Write as _;
 use super::*;
 
 const STATES: &str = concat!(env!("CARGO_MANIFEST_DIR"), "/../../docs/states.md");
-const CLASSES: [Class; 12] = [
+const CLASSES: [Class; 11] = [
     Class::Pending,
     Class::Running,
     Class::End,
     Class::Participant,
     Class::Infrastructure,
     Class::System,
-    Class::Comparison,
     Class::Scores,
     Class::CloudWatch,
     Class::Event,

@@ -8,7 +8,7 @@ use super::failure::{self, infrastructure};
 use super::isolation::Missing;
 use super::plan::Action;
 use super::plan_builder::{PlanBuilder, Terms, after};
-use super::{end, foreign, image, isolation, pin, restored, stored};
+use super::{end, foreign, image, isolation, pin};
 use crate::controller::submissions::view::{EvalaiInfo, Standing};
 use leaderboard_api::conditions::{self, Truth};
 use leaderboard_api::text::{LONGEST_NAME, one_line, sentence};
@@ -55,7 +55,7 @@ pub(super) fn decide(draft: &mut PlanBuilder<'_>) -> bool {
         info,
     };
     // Before anything that could end it comes the look for another program: an end is written over what that one writes.
-    if waits_for_phase(draft, info) || foreign::waits(draft, terms) || restored::ends(draft, terms) {
+    if foreign::waits(draft, terms) || waits_for_phase(draft, info) {
         return false;
     }
     decide_run(draft, terms)
@@ -73,54 +73,8 @@ fn decide_run(draft: &mut PlanBuilder<'_>, terms: Terms<'_>) -> bool {
         return wait_for_policy(draft, &missing);
     }
     pin::pin(draft, terms, image);
-    take(draft);
+    draft.condition(conditions::ACCEPTED, Truth::True, reasons::ACCEPTED, "");
     true
-}
-
-/// Accepts it, with the note that it was restored.
-fn take(draft: &mut PlanBuilder<'_>) {
-    let known = draft.status.condition(conditions::ACCEPTED);
-    let known = known
-        .filter(|c| c.reason == reasons::RESTORED)
-        .map(|c| c.message.to_string());
-    let note = known.or_else(|| stored::note(draft));
-    let reason = if note.is_some() {
-        reasons::RESTORED
-    } else {
-        reasons::ACCEPTED
-    };
-    draft.condition(conditions::ACCEPTED, Truth::True, reason, &note.unwrap_or_default());
-}
-
-/// Whether EvalAI's own end is ours, of an object that has lost its status, or that is still being found out.
-pub(super) fn had_ended(draft: &mut PlanBuilder<'_>) -> bool {
-    let leaderboard = draft.leaderboard().filter(|_| draft.view.not_allowed.is_none());
-    let Some((leaderboard, info)) = leaderboard.zip(draft.evalai_info()) else {
-        return false;
-    };
-    let track = find_track(draft, leaderboard).filter(|_| stored::may_have_ended(draft, info));
-    let Some(track) = track else { return false };
-    let info = Some(info);
-    take_team(draft, info);
-    let terms = Terms {
-        leaderboard,
-        track,
-        info,
-    };
-    let Some(looked) = foreign::look(draft, terms) else {
-        return true;
-    };
-    if let Err(unread) = &looked.found {
-        foreign::looks_again(draft, terms, unread);
-        return true;
-    }
-    restored::ends(draft, terms)
-}
-
-/// Whether EvalAI's own end may be ours, of an object that has lost its status.
-pub(super) fn may_have_ended(draft: &PlanBuilder<'_>) -> bool {
-    let info = draft.evalai_info();
-    info.is_some_and(|info| stored::may_have_ended(draft, info))
 }
 
 /// The image, if one is named that the Leaderboard allows. Otherwise the draft shows why not.

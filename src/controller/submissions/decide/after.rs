@@ -8,8 +8,8 @@ use k8s_openapi::apimachinery::pkg::apis::meta::v1::Time;
 use super::plan::{Action, EvalaiUpdate};
 use super::plan_builder::{PlanBuilder, after, seconds};
 use super::reading::{self, Reading};
-use super::record::{self, is_superseded, record_end};
-use super::{accept, log, observe, retention, stop};
+use super::record::{self, record_end, superseded};
+use super::{accept, log, retention, stop};
 use crate::controller::submissions::view::{EvalaiEnd, EvalaiView, ObservedJob};
 use leaderboard_api::conditions::{self, Truth};
 use leaderboard_api::text::sentence;
@@ -56,7 +56,7 @@ pub(super) fn decide(draft: &mut PlanBuilder<'_>) {
     }
     let is_published = matches!(published, Delivery::Done | Delivery::Answered(_));
     let complete = is_published && recorded && log_left.is_none();
-    if complete && !observe::awaits_end(draft) {
+    if complete {
         draft.act(Action::Forget);
         retention::decide(draft);
     } else {
@@ -330,7 +330,7 @@ fn amend(draft: &mut PlanBuilder<'_>, status: &str) -> Delivery {
     draft.show(reasons::ENDED_IN_EVALAI, message);
     // While EvalAI refused the result, the table was handed the outcome that no longer holds; the status may not show that yet.
     let is_written = draft.view.record.as_ref().is_some_and(|row| row.end_written);
-    if !is_written && !draft.status.is_true(conditions::RECORDED) && !is_superseded(draft) {
+    if !is_written && !draft.status.is_true(conditions::RECORDED) && superseded(draft).is_none() {
         return Delivery::Done;
     }
     draft.condition(conditions::RECORDED, Truth::False, reasons::WAITING, "");

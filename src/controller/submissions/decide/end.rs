@@ -176,10 +176,8 @@ fn of_job(draft: &PlanBuilder<'_>, end: &JobEnd) -> Failure {
 
 /// Failures that a second try may fix.
 fn may_retry(draft: &PlanBuilder<'_>, found: &Failure) -> bool {
-    const FINAL: [&str; 6] = [
-        reasons::IMPORTED_FAILURE,
+    const FINAL: [&str; 4] = [
         reasons::GRAPHICS_DRIVER_MISSING,
-        reasons::PREFIX_IN_USE,
         reasons::JOB_DELETED,
         reasons::JOB_EXPIRED,
         reasons::SCHEDULE_DEADLINE,

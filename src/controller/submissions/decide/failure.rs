@@ -72,14 +72,6 @@ pub(super) fn job_expired() -> Failure {
     )
 }
 
-/// The report shows that the run was stopped for a failure, and not which.
-pub(super) fn before_restore() -> Failure {
-    infrastructure(
-        reasons::IMPORTED_FAILURE,
-        "The submission had failed before its object was restored without a status; finished routes are kept.",
-    )
-}
-
 pub(super) fn node_lost(node: Option<&str>, node_state: ObservedNode) -> Failure {
     let node = node.map_or_else(|| "The node of the Pod".to_owned(), |node| format!("Node {node}"));
     let what = if node_state == ObservedNode::Reports {

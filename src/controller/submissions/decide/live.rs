@@ -6,8 +6,8 @@ use std::time::Duration;
 use super::plan::{Action, EvalaiUpdate, TableUpdate};
 use super::plan_builder::{PlanBuilder, after};
 use super::{
-    accept, clock, crashes, disk, end, failure, image, interruption, isolation, line, reading, record, reported,
-    restored, start, stop,
+    accept, clock, crashes, disk, end, failure, foreign, image, interruption, isolation, line, reading, record,
+    reported, start, stop,
 };
 use crate::controller::submissions::job_spec;
 use crate::controller::submissions::report_digest::ReportDigest;
@@ -72,14 +72,7 @@ fn name_taken(draft: &mut PlanBuilder<'_>) {
 
 fn in_line(draft: &mut PlanBuilder<'_>) {
     if draft.is_cancelled() {
-        let mut reason = end::cancel_reason(draft);
-        if reason == reasons::ENDED_IN_EVALAI && accept::had_ended(draft) {
-            return;
-        }
-        if accept::may_have_ended(draft) {
-            // Who ends the wait for that ends nothing in EvalAI: `cancelled` would be written over `finished`.
-            reason = reasons::ENDED_IN_EVALAI;
-        }
+        let reason = end::cancel_reason(draft);
         let what = if reason == reasons::ENDED_IN_EVALAI {
             "EvalAI ended the submission"
         } else {
@@ -173,7 +166,7 @@ fn without_its_job(draft: &mut PlanBuilder<'_>) {
     // A report from before this Job was seen is its predecessor's.
     let says = |report: &Arc<ReportDigest>| report.is_verdict() && reported::is_of_present_job(draft, report);
     let is_verdict = is_read && draft.view.report.ours().is_some_and(says);
-    if draft.is_to_stop() || (is_verdict && draft.was_job_seen()) || restored::awaits_report(draft) {
+    if draft.is_to_stop() || (is_verdict && draft.was_job_seen()) {
         return end::decide(draft, None);
     }
     if draft.was_job_seen() && has_expired(draft) {
@@ -231,10 +224,13 @@ fn has_expired(draft: &PlanBuilder<'_>) -> bool {
 }
 
 fn with_job(draft: &mut PlanBuilder<'_>, job: &JobView) {
+    if foreign::holds(draft, job) {
+        return;
+    }
     draft.status.job_name = Some(job.name.clone());
     draft.status.waiting = None;
     draft.status.next_retry_time = None;
-    // An object that was restored from a backup has lost its status and with it the plan.
+    // Somebody has removed the status, and with it the plan.
     if draft.status.plan.is_none() && !draft.is_to_stop() && !accept::decide(draft) {
         return draft.requeue_in(LOOK);
     }

@@ -3,7 +3,7 @@
 //! Owns the state machine of docs/states.md. Called by the reconciler, once a reconcile. Knows no client, no clock but the
 //! one in the view, and no `async`. One file a stage of life: `accept`, `line`, `live`, `start`, `stop`, `end`, `after`; `interruption` is a
 //! node that is taken away, `pulls` bounds a start, `blame` decides whose fault a crash was,
-//! `crashes` counts them, `clock` how long a run has gone on, `stored` finds what a lost status leaves and `restored` takes it up, `pin` pins the plan, `reported` takes reports in, `provoked` bounds failures that an agent can cause, `retention` deletes what
+//! `crashes` counts them, `clock` how long a run has gone on, `pin` pins the plan, `reported` takes reports in, `provoked` bounds failures that an agent can cause, `retention` deletes what
 //! has ended long ago, `significance` decides when a changed status is worth a write, `failure` names the causes of an end and `next_steps` what to do about them, `trouble` the causes of a wait,
 //! `words` whose fault a start is by what Kubernetes writes of it, `disk` whose disk was full.
 
@@ -23,7 +23,6 @@ mod line;
 mod live;
 mod log;
 mod next_steps;
-mod observe;
 mod pin;
 mod plan;
 mod plan_builder;
@@ -32,12 +31,10 @@ mod pulls;
 mod reading;
 mod record;
 mod reported;
-mod restored;
 mod retention;
 mod significance;
 mod start;
 mod stop;
-mod stored;
 #[cfg(test)]
 mod tests;
 mod trouble;

@@ -46,8 +46,7 @@ pub(super) fn of_participant(reason: &str) -> String {
 /// What a host does about a failure of the infrastructure that no retry has ended.
 pub(super) fn of_infrastructure(reason: &str) -> &'static str {
     match reason {
-        // The text of `workspace` already has the step, or the step before this one.
-        reasons::PREFIX_IN_USE => "",
+        // The text of `workspace` has the step before this one.
         reasons::NOT_ISOLATED => "Then resume the submission.",
         _ => reasons::after_failure(reason).unwrap_or("Fix this, then resume the submission."),
     }
@@ -70,7 +69,6 @@ pub(super) fn infrastructure_for_participants(reason: &str) -> String {
         reasons::JOB_DELETED | reasons::JOB_EXPIRED | reasons::JOB_FAILED => "The cluster ended the run.",
         reasons::PHASE_DIFFERS => "The submission's phase in EvalAI is not the one it was submitted to.",
         reasons::NOT_ISOLATED => "The run could not be isolated from the network.",
-        reasons::PREFIX_IN_USE => "The place for the results is in use.",
         _ => "The run could not be set up.",
     };
     format!("{what} Your agent is not the cause. Ask the challenge's hosts to resume the submission, or submit again.")

@@ -1,9 +1,8 @@
 //! Pins the plan of a submission: what is run stays as it was accepted, however its Leaderboard is edited.
 
 use super::plan_builder::{PlanBuilder, Terms};
-use super::stored;
 use crate::controller::submissions::view::{EvalaiInfo, Standing};
-use leaderboard_api::{Attempt, RouteSlice, RunPlan, effective};
+use leaderboard_api::{Attempt, LeaderboardSpec, RouteSlice, RunPlan, effective};
 
 pub(super) fn pin(draft: &mut PlanBuilder<'_>, terms: Terms<'_>, image: String) {
     let Terms {
@@ -12,35 +11,42 @@ pub(super) fn pin(draft: &mut PlanBuilder<'_>, terms: Terms<'_>, image: String) 
         info,
     } = terms;
     let resumed = info.is_some_and(|i| i.standing == Standing::Resumed);
-    let plan = match draft.status.plan.take() {
-        // The images of contents and simulator belong to the attempt and follow the Leaderboard until its first Job is
-        // made; all else belongs to the submission.
-        Some(pinned) if draft.status.retry == 0 && draft.status.job_name.is_none() => RunPlan {
-            // The same, unless an earlier attempt had none.
-            image,
-            contents_image: leaderboard.contents.image.as_str().into(),
-            simulator_image: leaderboard.simulator.image.as_str().into(),
-            // A status that was restored may be older than the last resume.
-            earlier_attempts: pinned.earlier_attempts.max(stored::attempts_ahead(draft)),
-            ..pinned
-        },
-        Some(pinned) => pinned,
-        None => {
-            let resume =
-                resumed || draft.spec().attempt > Attempt::FIRST || draft.is_adopted() || stored::takes_up(draft, info);
-            let plan = effective::plan(leaderboard, track, draft.submission().run_id(), image, resume);
-            let plan = if draft.spec().check { first_route(plan) } else { plan };
-            RunPlan {
-                earlier_attempts: attempts_before(draft, info).max(stored::attempts_ahead(draft)),
-                submission_uid: draft.submission().metadata.uid.clone(),
-                ..plan
-            }
+    let plan = if let Some(pinned) = draft.status.plan.take() {
+        again(draft, leaderboard, pinned, image)
+    } else {
+        let resume = resumed || draft.spec().attempt > Attempt::FIRST || draft.is_adopted();
+        let plan = effective::plan(leaderboard, track, draft.submission().run_id(), image, resume);
+        let plan = if draft.spec().check { first_route(plan) } else { plan };
+        RunPlan {
+            earlier_attempts: attempts_before(draft, info),
+            submission_uid: draft.submission().metadata.uid.clone(),
+            ..plan
         }
     };
     draft.status.results_url = Some(effective::results_url(&plan.storage, &plan.run_id));
     draft.status.plan = Some(plan);
     if draft.status.times.accepted.is_none() {
         draft.status.times.accepted = Some(draft.time());
+    }
+}
+
+/// The plan of a submission that has one. A person who hands it over has it take up what is stored.
+fn again(draft: &PlanBuilder<'_>, leaderboard: &LeaderboardSpec, pinned: RunPlan, image: String) -> RunPlan {
+    let pinned = RunPlan {
+        resume: pinned.resume || draft.is_adopted(),
+        ..pinned
+    };
+    if draft.status.retry > 0 || draft.status.job_name.is_some() {
+        return pinned;
+    }
+    // The images of contents and simulator belong to the attempt and follow the Leaderboard until its first Job is made; all else
+    // belongs to the submission.
+    RunPlan {
+        // The same, unless an earlier attempt had none.
+        image,
+        contents_image: leaderboard.contents.image.as_str().into(),
+        simulator_image: leaderboard.simulator.image.as_str().into(),
+        ..pinned
     }
 }
 

@@ -3,8 +3,7 @@
 use std::time::Duration;
 
 use crate::controller::slots::turns::InLine;
-use crate::controller::submissions::foreign_runs;
-use crate::controller::submissions::other_results;
+use crate::controller::submissions::rows::Row;
 use crate::controller::submissions::view::{LogPlace, ReportDemand};
 use crate::pod::run::Stop;
 use leaderboard_api::{JobNumber, SubmissionStatus, names};
@@ -70,10 +69,8 @@ pub enum Action {
     ReleaseFinalizer,
     /// All but the slot is settled: wait for one at this place. Shows nothing new until it is known who is next.
     JoinLine(InLine),
-    /// Look whether another program runs the submission.
-    LookForForeignRun(Box<foreign_runs::Question>),
-    /// Read how many routes another program's run of the submission has.
-    ReadOtherResults(Box<other_results::Question>),
+    /// Read the row of another program that may run the submission.
+    ReadRow(Box<Row>),
     /// Create this Job.
     CreateJob(JobNumber),
     /// Delete a Job and its Pods with this grace period.

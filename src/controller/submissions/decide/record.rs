@@ -8,9 +8,8 @@ use leaderboard_api::conditions::{self, Truth};
 use leaderboard_api::reasons;
 use leaderboard_api::text::sentence;
 
-/// Shown of an end that is settled without a row: another try would be refused again.
-const SUPERSEDED: &str = "The table has a later attempt or another end of this run, and its row was left as it was. Correct the row by \
-                          hand if this end is the one that counts.";
+/// How the message begins of an end that is settled without a row: another try would be refused again.
+const SUPERSEDED: &str = "The table keeps another row of this run";
 /// Shown while the row may still turn out otherwise.
 const FOLLOWS_EVALAI: &str = "The table's row is written when EvalAI has answered, since EvalAI may still have cancelled the submission. The \
                               condition Published shows what EvalAI is waited for.";
@@ -27,7 +26,7 @@ pub(super) fn decide(draft: &mut PlanBuilder<'_>, is_shown: bool) -> Delivery {
         return without_leaderboard(draft, conditions::RECORDED);
     }
     if let Some(message) = why_without_row(draft) {
-        draft.condition(conditions::RECORDED, Truth::False, reasons::NOT_REQUIRED, message);
+        draft.condition(conditions::RECORDED, Truth::False, reasons::NOT_REQUIRED, &message);
         return Delivery::Done;
     }
     let view = draft.view.record.clone().unwrap_or_default();
@@ -58,15 +57,18 @@ pub(super) fn decide(draft: &mut PlanBuilder<'_>, is_shown: bool) -> Delivery {
 }
 
 /// Why the end has no row of its own; none if it has one, or will.
-fn why_without_row(draft: &PlanBuilder<'_>) -> Option<&'static str> {
+fn why_without_row(draft: &PlanBuilder<'_>) -> Option<String> {
     if draft.view.record.is_none() {
-        Some("")
+        Some(String::new())
     } else if draft.status.plan.is_none() {
-        Some("The submission was never accepted, so the table has no row for it.")
+        Some("The submission was never accepted, so the table has no row for it.".to_owned())
     } else if !has_row(draft) {
-        Some("The row needs a team: give spec.team.id to a submission that is not EvalAI's. A check has none.")
+        Some(
+            "The row needs a team: give spec.team.id to a submission that is not EvalAI's. A check has none."
+                .to_owned(),
+        )
     } else {
-        is_superseded(draft).then_some(SUPERSEDED)
+        superseded(draft)
     }
 }
 
@@ -98,9 +100,16 @@ pub(super) fn follow_evalai(draft: &mut PlanBuilder<'_>) {
     }
 }
 
-/// Whether the table keeps another row than that of this end: the recorder says so until it has forgotten the end, then the status.
-pub(super) fn is_superseded(draft: &PlanBuilder<'_>) -> bool {
-    let shown = draft.status.condition(conditions::RECORDED);
-    let is_shown = shown.is_some_and(|c| c.reason == reasons::NOT_REQUIRED && c.message == SUPERSEDED);
-    is_shown || draft.view.record.as_ref().is_some_and(|row| row.is_superseded)
+/// Shows that the table keeps another row than that of this end: the recorder knows until it has forgotten the end, then the status.
+pub(super) fn superseded(draft: &PlanBuilder<'_>) -> Option<String> {
+    if let Some(kept) = draft.view.record.as_ref().and_then(|row| row.superseded_by) {
+        let next = kept.saturating_add(1);
+        return Some(format!(
+            "{SUPERSEDED}, of attempt {kept}, and this end was not written there. Raise spec.attempt to {next} if the submission is to \
+             go on. Correct the row by hand if this end is the one that counts."
+        ));
+    }
+    let shown = draft.status.condition(conditions::RECORDED)?;
+    let is_shown = shown.reason == reasons::NOT_REQUIRED && shown.message.starts_with(SUPERSEDED);
+    is_shown.then(|| shown.message.to_string())
 }

@@ -352,7 +352,7 @@ fn failure_of(found: &Trouble, pod: &PodView, seconds: i64) -> Failure {
             "Build the image with a present version of its tool, and submit again.",
         ),
         Cause::Registry | Cause::Node | Cause::Host => match found.reason {
-            reasons::PREFIX_IN_USE | reasons::NOT_ISOLATED => infrastructure(found.reason, message),
+            reasons::NOT_ISOLATED => infrastructure(found.reason, message),
             reasons::PREPARING => infrastructure(reasons::START_DEADLINE, &tried),
             reason => infrastructure(reason, &tried),
         },

@@ -9,10 +9,6 @@ use leaderboard_api::{names, reasons};
 use leaderboard_runner::protocol::{Member, Side};
 
 /// What is shown should `workspace` not report it itself.
-const PREFIX_IN_USE: &str = "The run's place in the bucket holds another object's results. Apply it with attempt: 2 to take \
-                             them up, or empty the prefix.";
-
-/// The same for a Pod that was not isolated.
 const NOT_ISOLATED: &str = "The Pod was not shown to be isolated from the network, and network.enforcement is Require. Look at the log of its \
      container workspace.";
 
@@ -123,16 +119,12 @@ fn of_end(container: &ContainerView, is_init: bool) -> Option<Trouble> {
         return None;
     }
     // Another try of the same Pod would find the same; the next Pod may get another node.
-    let of_workspace = [
-        (reasons::PREFIX_IN_USE, PREFIX_IN_USE),
-        (reasons::NOT_ISOLATED, NOT_ISOLATED),
-    ];
     let own_reason = end.own_reason.as_deref().filter(|_| name == names::CONTAINER_WORKSPACE);
-    let found = of_workspace.into_iter().find(|(reason, _)| own_reason == Some(*reason));
-    if let Some((reason, usual)) = found {
+    if own_reason == Some(reasons::NOT_ISOLATED) {
+        let why = end.why.as_deref().unwrap_or(NOT_ISOLATED);
         return Some(Trouble {
             is_hopeless: true,
-            ..trouble(container, reason, end.why.as_deref().unwrap_or(usual), Cause::Host)
+            ..trouble(container, reasons::NOT_ISOLATED, why, Cause::Host)
         });
     }
     let code = || format!("it ended with code {} ({})", end.exit_code, end.reason);

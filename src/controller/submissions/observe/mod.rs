@@ -17,6 +17,7 @@ use super::decide::job_name;
 use super::external::ExternalSystems;
 use super::memory::Memory;
 use super::view::{NodeView, ObservedJob, PodView, View};
+use crate::controller::objects::uid;
 use crate::controller::slots::SlotAllocator;
 use crate::controller::stores::Stores;
 use crate::kubernetes::objects::Job;
@@ -52,8 +53,7 @@ pub fn observe(uses: Uses<'_>, submission: Arc<Submission>, is_policy_in_place: 
         // Comparing it takes longer than reading the rest.
         is_policy_in_place: may_create(&job) && leaderboard.as_deref().is_some_and(is_policy_in_place),
         not_allowed: leaderboard.as_deref().and_then(|board| uses.external.refusal(board)),
-        traces: workers.foreign_runs.observe(&submission),
-        other_routes: workers.other_results.observe(&submission),
+        row: workers.rows.get(uid(submission.as_ref())),
         job_refused: refusal(uses, &submission, &job),
         turn: uses.slots.turn(&submission, leaderboard.as_deref()),
         node: node.state,

@@ -1,12 +1,13 @@
 //! What is asked of other systems in the background: a reconcile asks, and a later one finds the answer in memory.
 
 use kube::Client;
+use kube::runtime::reflector::ObjectRef;
 
 use super::lookups::Lookups;
+use crate::ask::{self, Asker};
 use crate::controller::objects::Wake;
 use crate::controller::submissions::archive::ArchiveWorkers;
-use crate::controller::submissions::foreign_runs::ForeignRuns;
-use crate::controller::submissions::other_results::OtherResults;
+use crate::controller::submissions::rows::{self, Row};
 use crate::observability::tasks::Tasks;
 use crate::services::aws::Aws;
 use leaderboard_api::Submission;
@@ -15,8 +16,7 @@ use leaderboard_api::Submission;
 pub struct Workers {
     pub archive: ArchiveWorkers,
     pub lookups: Lookups,
-    pub foreign_runs: ForeignRuns,
-    pub other_results: OtherResults,
+    pub rows: Asker<Row>,
 }
 
 impl Workers {
@@ -25,15 +25,18 @@ impl Workers {
         Self {
             archive: ArchiveWorkers::new(aws.clone(), client.clone(), tasks.clone(), wake()),
             lookups: Lookups::start(client.clone(), tasks, wake()),
-            foreign_runs: ForeignRuns::start(aws, tasks, wake()),
-            other_results: OtherResults::start(aws, tasks, wake()),
+            rows: rows::start(aws, tasks, by_key(wake())),
         }
     }
 
     /// Drops what is known for an object that is gone, or that needs nothing more.
     pub fn forget(&self, uid: &str) {
         self.archive.forget(uid);
-        self.foreign_runs.forget(uid);
-        self.other_results.forget(uid);
+        self.rows.forget(uid);
     }
+}
+
+/// Wakes a submission by its key.
+fn by_key(wake: Wake<Submission>) -> ask::Wake {
+    Box::new(move |key| wake(ObjectRef::new(&key.name).within(&key.namespace)))
 }

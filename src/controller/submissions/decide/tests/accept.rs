@@ -208,7 +208,7 @@ fn a_leaderboard_that_names_what_it_may_not_starts_nothing_and_has_nothing_looke
             "{message}"
         );
         assert!(!creates(&plan), "{:?}", plan.actions);
-        assert!(!has(&plan, |action| matches!(action, Action::LookForForeignRun(_))));
+        assert!(!has(&plan, |action| matches!(action, Action::ReadRow(_))));
         world.view.not_allowed = None;
         assert!(creates(&world.pass()));
     }

@@ -6,15 +6,13 @@ use jiff::{SignedDuration, Timestamp};
 use k8s_openapi::apimachinery::pkg::apis::meta::v1::Time;
 use serde_json::json;
 
-use super::rules;
+use super::{foreign, rules};
 use crate::controller::submissions::decide::blame::is_crash;
 use crate::controller::submissions::decide::{Action, EvalaiUpdate, Plan, decide, job_name};
-use crate::controller::submissions::foreign_runs::{Looked, Traces, Unread};
 use crate::controller::submissions::report_digest::ReportDigest;
 use crate::controller::submissions::view::{
     ContainerView, EndView, EvalaiEnd, EvalaiInfo, EvalaiView, JobEnd, JobView, ObservedFence, ObservedJob,
-    ObservedLog, ObservedNode, ObservedReport, ObservedRoutes, ObservedTraces, PodView, RecordView, Stage, Standing,
-    Turn, View,
+    ObservedLog, ObservedNode, ObservedReport, PodView, RecordView, Stage, Standing, Turn, View,
 };
 use crate::pod::report::{Report, ReportPair};
 use crate::pod::run::Stop;
@@ -89,11 +87,6 @@ pub fn info() -> EvalaiInfo {
     }
 }
 
-/// An answer of table and bucket that was asked for at this moment.
-pub fn looked(at: Timestamp, found: Result<Traces, Unread>) -> Looked {
-    Looked { at, found }
-}
-
 /// A world, and what the last reconcile in it wanted.
 #[derive(Clone, Debug)]
 pub struct World {
@@ -114,9 +107,7 @@ impl World {
                 not_allowed: None,
                 is_policy_in_place: true,
                 // Nobody else runs it; the tests of foreign runs set it otherwise.
-                traces: ObservedTraces::Answered(Arc::new(looked(at(0), Ok(Traces::default())))),
-                // The results of another program; the tests of one that observes set it otherwise.
-                other_routes: ObservedRoutes::NotAsked,
+                row: foreign::free(1),
                 turn: Turn::Go,
                 job: ObservedJob::Absent,
                 job_refused: None,

@@ -22,8 +22,6 @@ fn a_next_step_is_added_at_the_end() {
             "{reason}: {ended}"
         );
     }
-    let taken = infrastructure(reasons::PREFIX_IN_USE, "Taken. Empty it.");
-    assert_eq!(at_the_end(taken).message, "Taken. Empty it.");
     let slow = participant(reasons::IDLE, "Slow.", &for_both("Hurry."));
     assert_eq!(at_the_end(slow).message, "Slow. Hurry.");
 }
@@ -59,7 +57,6 @@ fn a_participant_is_sent_to_nothing_that_only_hosts_can_read() {
         reasons::SCHEDULE_DEADLINE,
         reasons::JOB_DELETED,
         reasons::JOB_FAILED,
-        reasons::PREFIX_IN_USE,
         reasons::CANNOT_START,
     ]
     .map(|reason| {

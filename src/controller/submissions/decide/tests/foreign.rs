@@ -4,272 +4,290 @@ use std::sync::Arc;
 use std::time::Duration;
 
 use super::builders::*;
-use crate::controller::submissions::decide::Action;
-use crate::controller::submissions::decide::foreign::{Found, found};
-use crate::controller::submissions::foreign_runs::{Question, StoredRun, Traces, Unread};
-use crate::controller::submissions::view::{EvalaiInfo, ObservedTraces, Standing};
-use crate::services::table::ObservedRow;
+use crate::ask::{Answered, Failure, Lookup};
+use crate::controller::submissions::decide::{Action, Plan, SlotUse};
+use crate::controller::submissions::rows::{ForeignRun, Row};
+use crate::controller::submissions::view::{EvalaiInfo, JobEnd, Standing};
 use leaderboard_api::State::{Cancelled, Pending};
 use leaderboard_api::conditions::{ACCEPTED, STALLED};
-use leaderboard_api::{SubmissionStatus, names, reasons};
+use leaderboard_api::{Attempt, SubmissionStatus, names, reasons};
 
-fn row(status: &str) -> ObservedRow {
-    ObservedRow {
-        status: status.into(),
-        is_ours: false,
-        attempt: None,
+/// The question of an attempt.
+fn question(attempt: i64) -> Row {
+    Row {
+        attempt: Attempt(attempt),
+        table: leaderboard(true).spec.table.unwrap(),
+        team: "42".into(),
+        run_id: "77".parse().unwrap(),
+    }
+}
+
+fn answer(question: Row, sent_ago: u64, result: Result<Option<ForeignRun>, Failure>) -> Lookup<Row> {
+    Lookup {
+        waited: None,
+        last: Some(Answered {
+            question,
+            sent_ago: Duration::from_secs(sent_ago),
+            result: Arc::new(result),
+        }),
+    }
+}
+
+/// This was found in the table of the first attempt, by a question that was sent so many seconds ago.
+fn found(sent_ago: u64, result: Result<Option<ForeignRun>, Failure>) -> Lookup<Row> {
+    answer(question(1), sent_ago, result)
+}
+
+/// No other program runs this attempt.
+pub fn free(attempt: i64) -> Lookup<Row> {
+    answer(question(attempt), 0, Ok(None))
+}
+
+/// Another program runs it.
+fn runs() -> Lookup<Row> {
+    let run = ForeignRun {
+        status: "RUNNING".into(),
         since: Some("2026-11-20 10:00:00 UTC".into()),
-    }
+    };
+    found(0, Ok(Some(run)))
 }
 
-fn with_row(row: ObservedRow) -> Traces {
-    Traces {
-        row: Some(row),
-        ..Traces::default()
-    }
-}
-
-fn stored(newest: i64) -> StoredRun {
-    StoredRun {
-        newest: Some(at(newest)),
-        ..StoredRun::default()
-    }
-}
-
-fn with_objects(stored: StoredRun) -> Traces {
-    Traces {
-        stored,
-        ..Traces::default()
-    }
-}
-
-/// A submission of EvalAI's of which this was found.
-fn seen(traces: Traces) -> World {
+/// A submission of EvalAI's that another program runs.
+fn held() -> World {
     let mut world = World::evalai();
-    world.view.traces = ObservedTraces::Answered(Arc::new(looked(at(0), Ok(traces))));
+    world.view.row = runs();
     world
 }
 
-fn asked(world: &mut World) -> Option<Question> {
-    world.pass().actions.into_iter().find_map(|action| match action {
-        Action::LookForForeignRun(question) => Some(*question),
+/// A submission whose Pod has found results of something else below its prefix.
+fn with_prefix_in_use(mut world: World) -> World {
+    world.see(ended("workspace", 0, "PrefixInUse", 1, 5));
+    world
+}
+
+fn adopt(world: &mut World, text: &str) {
+    let annotations = world.submission().metadata.annotations.get_or_insert_default();
+    annotations.insert(names::ANNOTATION_ADOPT.into(), text.into());
+}
+
+fn asked(plan: &Plan) -> Option<&Row> {
+    plan.actions.iter().find_map(|action| match action {
+        Action::ReadRow(row) => Some(&**row),
         _ => None,
     })
 }
 
-fn resumed(second: i64) -> EvalaiInfo {
-    EvalaiInfo {
-        standing: Standing::Resumed,
-        resumed_at: Some(at(second)),
-        ..info()
-    }
-}
-
-/// What is found at second 100, and the run that it shows.
-fn each_shows(cases: impl IntoIterator<Item = (&'static str, Traces, EvalaiInfo, Option<Found>)>) {
-    for (name, traces, info, expected) in cases {
-        assert_eq!(found(&traces, &info, 100, at(100)), expected, "{name}");
-    }
+fn writes_nothing(plan: &Plan) -> bool {
+    let writes = |action: &Action| {
+        matches!(
+            action,
+            Action::UpdateEvalai(_) | Action::Record(_) | Action::CreateJob(_)
+        )
+    };
+    !has(plan, writes)
 }
 
 #[test]
-fn a_row_of_a_run_shows_that_another_program_runs_it() {
-    let by_row = |status: &str| {
-        let since = row(status).since;
-        let status = status.into();
-        Some(Found::Row { status, since })
-    };
-    let of = |status: &str| with_row(row(status));
-    let ours = ObservedRow {
-        is_ours: true,
-        ..row("RUNNING")
-    };
-    let both = |status: &str| Traces {
-        stored: stored(90),
-        ..of(status)
-    };
-    each_shows([
-        ("nothing", Traces::default(), info(), None),
-        ("a row at its start", of("SUBMITTED"), info(), by_row("SUBMITTED")),
-        ("a row of a run", of("RUNNING"), info(), by_row("RUNNING")),
-        ("one that EvalAI resumes", of("RUNNING"), resumed(50), by_row("RUNNING")),
-        ("a row with our mark", with_row(ours), info(), None),
-        ("an ended row", both("FAILED"), info(), None),
-        ("an ended row of a resumed one", both("FAILED"), resumed(80), None),
-        ("another ended row", both("CANCELLED"), info(), None),
-        ("the last ended row", both("FINISHED"), info(), None),
-    ]);
-}
-
-#[test]
-fn young_objects_show_that_another_program_runs_it() {
-    let objects = |newest, until| {
-        Some(Found::Objects {
-            newest: at(newest),
-            until: at(until),
-        })
-    };
-    let marked = with_objects(StoredRun {
-        is_ours: true,
-        ..stored(90)
-    });
-    let ended = with_objects(StoredRun {
-        has_ended: true,
-        ..stored(90)
-    });
-    let of = |newest| with_objects(stored(newest));
-    each_shows([
-        ("young objects", of(90), info(), objects(90, 190)),
-        ("old objects", of(0), info(), None),
-        ("objects of the future", of(500), info(), objects(500, 600)),
-        ("young objects with our mark", marked, info(), None),
-        ("young objects of a run that has ended", ended, info(), None),
-        ("objects from before a resume", of(79), resumed(80), None),
-        ("objects from after a resume", of(80), resumed(80), objects(80, 180)),
-    ]);
-}
-
-#[test]
-fn it_is_looked_once_before_the_first_job_and_an_answer_within_five_seconds_costs_no_write() {
+fn the_row_is_read_before_the_first_write_and_an_answer_within_five_seconds_costs_no_write() {
     let mut world = World::evalai();
-    world.view.traces = ObservedTraces::NotAsked;
-    let question = asked(&mut world).unwrap();
-    assert_eq!((question.run_id.as_str(), question.team.as_str()), ("77", "42"));
-    assert_eq!(question.table.as_ref().unwrap().name, "submissions");
-    assert_eq!(question.prefix(), "s3://results/77/");
-    world.view.traces = ObservedTraces::Asked(Duration::from_secs(2));
+    world.view.row = Lookup::default();
     let plan = world.pass();
-    assert_eq!((&plan.status, creates(&plan)), (&SubmissionStatus::default(), false));
-    world.view.traces = ObservedTraces::Asked(Duration::from_secs(5));
-    assert!(!creates(&world.pass_to(Pending, reasons::LOOKING_FOR_FOREIGN_RUN)));
-    world.view.traces = ObservedTraces::Answered(Arc::new(looked(at(0), Ok(Traces::default()))));
+    assert_eq!(asked(&plan), Some(&question(1)));
+    assert_eq!(
+        (&plan.status, writes_nothing(&plan)),
+        (&SubmissionStatus::default(), true)
+    );
+    world.view.row.waited = Some(Duration::from_secs(2));
+    let plan = world.pass();
+    assert_eq!(
+        (&plan.status, writes_nothing(&plan)),
+        (&SubmissionStatus::default(), true)
+    );
+    world.view.row.waited = Some(Duration::from_secs(5));
+    let plan = world.pass_to(Pending, reasons::FOREIGN);
+    assert_eq!(condition(&plan, ACCEPTED).0, "Unknown");
+    assert!(writes_nothing(&plan));
+    world.view.row = free(1);
     assert!(creates(&world.pass_to(Pending, reasons::PREPARING)));
-    // With its Job, and between two of them, nobody looks.
-    world.view.traces = ObservedTraces::NotAsked;
-    assert_eq!(asked(&mut world), None);
+    // With its Job, and between two of them, nobody reads it.
+    world.view.row = Lookup::default();
+    assert_eq!(asked(&world.pass()), None);
     let status = world.submission().status.as_mut().unwrap();
     (status.retry, status.job_name) = (1, None);
-    assert_eq!(asked(&mut world), None);
+    assert_eq!(asked(&world.pass()), None);
 }
 
 #[test]
-fn only_evalai_hands_a_submission_to_two_programs() {
-    let mut world = World::local();
-    world.view.traces = ObservedTraces::NotAsked;
-    // Our finalizer comes with the first Job: with it and without a status the object was restored, and is looked for.
-    world.submission().metadata.finalizers = None;
-    assert!(creates(&world.pass_to(Pending, reasons::PREPARING)));
+fn an_answer_to_another_attempt_is_none() {
+    let mut world = World::evalai();
+    let last = world.view.row.last.as_mut().unwrap();
+    last.question.attempt = Attempt(2);
+    let plan = world.pass();
+    assert!(asked(&plan).is_some() && writes_nothing(&plan));
+}
+
+#[test]
+fn only_evalai_hands_a_submission_to_two_programs_and_only_a_table_shows_it() {
+    let mut without_table = World::evalai();
+    without_table.leaderboard().table = None;
+    for mut world in [World::local(), without_table] {
+        world.view.row = Lookup::default();
+        let plan = world.pass_to(Pending, reasons::PREPARING);
+        assert!(creates(&plan) && asked(&plan).is_none());
+    }
 }
 
 #[test]
 fn what_another_program_runs_waits_and_nothing_is_written_of_it() {
-    let mut world = seen(with_row(row("RUNNING")));
+    let mut refused = held();
     // A refusal would end it, and the end would be written over the other program's.
-    world.leaderboard().agent.images = Some(vec![]);
-    world.submission().spec.image = Some("contents:1".into());
-    let plan = world.pass_to(Pending, reasons::FOREIGN);
-    assert!(!creates(&plan) && evalai_updates(&plan).is_empty());
-    assert!(!has(&plan, |a| matches!(a, Action::Record(_) | Action::AddFinalizer)));
-    assert!(
-        has(&plan, |a| matches!(a, Action::LookForForeignRun(_))),
-        "it is looked for again"
-    );
-    assert!(plan.status.plan.is_none() && plan.requeue.is_some());
-    assert_eq!(condition(&plan, ACCEPTED), ("False".into(), reasons::FOREIGN.into()));
-    let message = plan.status.message.unwrap();
-    for part in [
-        "RUNNING since 2026-11-20 10:00:00 UTC",
-        "submission_status",
-        names::ANNOTATION_ADOPT,
-    ] {
-        assert!(message.contains(part), "{message}");
+    refused.leaderboard().agent.images = Some(vec![]);
+    refused.submission().spec.image = Some("contents:1".into());
+    let mut moved = held();
+    moved.in_evalai().info.as_mut().unwrap().phase = Some(999);
+    for mut world in [refused, moved] {
+        for _ in 0..3 {
+            let plan = world.pass_to(Pending, reasons::FOREIGN);
+            assert!(writes_nothing(&plan) && !has(&plan, |a| *a == Action::AddFinalizer));
+            assert_eq!((asked(&plan), plan.slot()), (Some(&question(1)), SlotUse::Leaves));
+            assert!(plan.status.plan.is_none() && plan.requeue.is_some());
+            assert_eq!(condition(&plan, ACCEPTED), ("False".into(), reasons::FOREIGN.into()));
+            let message = plan.status.message.unwrap();
+            for part in [
+                "RUNNING since 2026-11-20 10:00:00 UTC",
+                "submission_status",
+                names::ANNOTATION_ADOPT,
+            ] {
+                assert!(message.contains(part), "{message}");
+            }
+            world.wait(3600);
+        }
     }
 }
 
 #[test]
 fn when_the_other_run_has_ended_evalai_decides_what_follows() {
-    let of = |status| ObservedTraces::Answered(Arc::new(looked(at(30), Ok(with_row(row(status))))));
-    let held = || {
-        let mut world = seen(with_row(row("RUNNING")));
+    let ended = || {
+        let mut world = held();
         world.pass_to(Pending, reasons::FOREIGN);
-        world.view.traces = of("FAILED");
         world.go_to(40);
-        world.in_evalai().read_at = Some(at(10));
+        world.view.row = found(10, Ok(None));
+        world.in_evalai().read_at = Some(at(29));
         world
     };
-    // What EvalAI has answered before may be older than the end: it is asked anew, some seconds later.
-    let mut world = held();
+    // What EvalAI answered before the row was read may be older than the end: it is asked anew.
+    let mut world = ended();
     let plan = world.pass_to(Pending, reasons::FOREIGN);
-    assert!(!creates(&plan) && !has(&plan, |a| *a == Action::ForgetEvalai));
-    assert!(plan.requeue.is_some_and(|wait| wait < Duration::from_secs(6)));
-    world.go_to(45);
-    let plan = world.pass_to(Pending, reasons::FOREIGN);
-    assert!(!creates(&plan) && has(&plan, |a| *a == Action::ForgetEvalai));
+    assert!(writes_nothing(&plan) && has(&plan, |a| *a == Action::ForgetEvalai));
     // Resumed there: what is stored is taken up.
-    let mut world = held();
+    let mut world = ended();
     world.in_evalai().info.as_mut().unwrap().standing = Standing::Resumed;
-    world.in_evalai().read_at = Some(at(45));
+    world.in_evalai().read_at = Some(at(30));
     assert!(creates(&world.pass_to(Pending, reasons::PREPARING)));
     assert!(world.status().plan.unwrap().resume);
     // Ended there: nothing is run, and the other program's row and results stay.
-    let mut world = held();
+    let mut world = ended();
     world.in_evalai().info = Some(EvalaiInfo {
         standing: Standing::Ended,
         status: "finished".into(),
         ..info()
     });
     let plan = world.pass_to(Cancelled, reasons::ENDED_IN_EVALAI);
-    assert!(!creates(&plan) && evalai_updates(&plan).is_empty() && plan.status.plan.is_none());
+    assert!(writes_nothing(&plan) && plan.status.plan.is_none());
     // The same while the row is not ended yet.
-    let mut world = held();
-    world.view.traces = of("RUNNING");
+    let mut world = ended();
+    world.view.row = runs();
     world.in_evalai().cancelled = true;
     assert!(!creates(&world.pass_to(Cancelled, reasons::ENDED_IN_EVALAI)));
 }
 
 #[test]
 fn a_person_hands_over_what_nothing_runs_any_more_and_it_takes_up_what_is_stored() {
-    let mut world = seen(with_row(row("RUNNING")));
+    let mut world = held();
     world.pass_to(Pending, reasons::FOREIGN);
-    let annotate = |world: &mut World, text: &str| {
-        let annotations = world.submission().metadata.annotations.get_or_insert_default();
-        annotations.insert(names::ANNOTATION_ADOPT.into(), text.into());
-    };
-    annotate(&mut world, "false");
+    adopt(&mut world, "false");
     world.pass_to(Pending, reasons::FOREIGN);
-    annotate(&mut world, "true");
+    adopt(&mut world, "true");
     let plan = world.pass_to(Pending, reasons::PREPARING);
-    assert!(creates(&plan) && !has(&plan, |a| matches!(a, Action::LookForForeignRun(_))));
+    assert!(creates(&plan) && asked(&plan).is_none());
     assert!(world.status().plan.unwrap().resume);
-}
-
-#[test]
-fn a_run_without_a_limit_is_left_alone_for_a_day_after_its_last_object() {
-    for (limit, seconds) in [(0, 86_400), (100, 100)] {
-        let mut world = seen(with_objects(stored(0)));
-        world.leaderboard().deadlines.run_seconds = limit;
-        world.go_to(seconds - 1);
-        world.pass_to(Pending, reasons::FOREIGN);
-        world.go_to(seconds);
-        world.in_evalai().read_at = Some(at(seconds));
-        assert!(creates(&world.pass_to(Pending, reasons::PREPARING)), "{limit}");
-    }
 }
 
 #[test]
 fn nothing_starts_while_it_is_not_known_and_a_refusal_is_a_persons_to_fix() {
     for (is_refused, stalled) in [(true, "True"), (false, "False")] {
         let why = "table rows: GetItem is not allowed".to_owned();
-        let unread = Unread { is_refused, why };
         let mut world = World::evalai();
-        world.view.traces = ObservedTraces::Answered(Arc::new(looked(at(0), Err(unread))));
+        world.view.row = found(0, Err(Failure { is_refused, why }));
         let plan = world.pass_to(Pending, reasons::FOREIGN);
-        assert!(!creates(&plan));
+        assert!(writes_nothing(&plan));
         assert_eq!(condition(&plan, STALLED).0, stalled);
         let message = plan.status.message.unwrap();
         assert!(
-            message.contains("is not known: table rows: GetItem is not allowed."),
+            message.contains("runs the submission: table rows: GetItem is not allowed."),
             "{message}"
         );
+    }
+}
+
+#[test]
+fn a_prefix_in_use_is_a_hold_and_no_end() {
+    for world in [World::local(), World::evalai()] {
+        let mut world = with_prefix_in_use(world.with_pod());
+        let plan = world.pass_to(Pending, reasons::FOREIGN);
+        assert!(writes_nothing(&plan) && has(&plan, |a| matches!(a, Action::DeleteJob { .. })));
+        assert_eq!((plan.status.retry, plan.slot()), (0, SlotUse::Leaves));
+        assert_eq!(condition(&plan, ACCEPTED), ("False".into(), reasons::FOREIGN.into()));
+        assert_eq!(condition(&plan, STALLED).0, "True");
+        assert!(plan.status.failure.is_none() && plan.status.job_name.is_none());
+        assert!(plan.status.message.unwrap().contains(names::ANNOTATION_ADOPT));
+        world.job().deleting = true;
+        assert!(!has(&world.pass(), |a| matches!(a, Action::DeleteJob { .. })), "once");
+        world.job_gone();
+        for _ in 0..3 {
+            world.wait(86_400);
+            let before = world.status();
+            let plan = world.pass_to(Pending, reasons::FOREIGN);
+            assert!(writes_nothing(&plan) && plan.slot() == SlotUse::Leaves);
+            assert_eq!(plan.status, before, "nothing is new");
+        }
+        adopt(&mut world, "true");
+        let plan = world.pass_to(Pending, reasons::PREPARING);
+        assert!(creates(&plan) && plan.status.plan.unwrap().resume);
+        assert_eq!(condition(&world.pass(), ACCEPTED).0, "True");
+    }
+}
+
+#[test]
+fn a_job_that_has_failed_by_a_prefix_in_use_is_held_back_too_and_a_higher_retry_takes_up_what_is_stored() {
+    let mut world = with_prefix_in_use(World::evalai().with_pod());
+    world.job().end = Some(JobEnd::Failed {
+        at: Some(at(9)),
+        reason: "BackoffLimitExceeded".into(),
+        message: String::new(),
+    });
+    world.submission().status.as_mut().unwrap().retry = 1;
+    world.job().name = "sub-1-r1".into();
+    let plan = world.pass_to(Pending, reasons::FOREIGN);
+    assert!(has(&plan, |a| matches!(a, Action::DeleteJob { .. })));
+    // It is handed over before the Job is gone, whose name the next one has.
+    adopt(&mut world, "true");
+    assert!(!creates(&world.pass_to(Pending, reasons::FOREIGN)));
+    world.job_gone();
+    assert!(creates(&world.pass_to(Pending, reasons::PREPARING)));
+    let status = world.status();
+    assert_eq!((status.retry, status.plan.unwrap().resume), (1, true));
+}
+
+#[test]
+fn who_cancels_what_is_held_back_ends_it() {
+    for reason in [reasons::CANCELLED, reasons::ENDED_IN_EVALAI] {
+        let mut world = with_prefix_in_use(World::evalai().with_pod());
+        world.pass_to(Pending, reasons::FOREIGN);
+        world.job_gone();
+        world.pass_to(Pending, reasons::FOREIGN);
+        world.submission().spec.cancel = reason == reasons::CANCELLED;
+        world.in_evalai().cancelled = reason == reasons::ENDED_IN_EVALAI;
+        world.pass_to(Cancelled, reason);
     }
 }

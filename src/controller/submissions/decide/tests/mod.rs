@@ -27,7 +27,6 @@ mod provoked;
 mod reading;
 mod record;
 mod restart;
-mod restored;
 mod resume;
 mod retention;
 mod rules;

@@ -28,8 +28,8 @@ pub(super) fn refused() -> World {
 /// The table has not taken the row of this end.
 fn supersede(world: &mut World) {
     world.view.record = Some(RecordView {
-        is_superseded: true,
-        error: Some("table rows already holds a later attempt or another end of submission 77".into()),
+        superseded_by: Some(3),
+        error: Some("table rows already holds attempt 3 of submission 77".into()),
         ..RecordView::default()
     });
 }
@@ -50,7 +50,7 @@ fn an_end_that_the_table_does_not_take_is_settled_and_not_written_again() {
         (shown.status.as_str(), shown.reason.as_str()),
         ("False", reasons::NOT_REQUIRED)
     );
-    for part in ["a later attempt or another end", "Correct the row by hand"] {
+    for part in ["of attempt 3", "Raise spec.attempt to 4", "Correct the row by hand"] {
         assert!(shown.message.contains(part), "{}", shown.message);
     }
     assert_eq!(plan.actions, [Action::Forget]);

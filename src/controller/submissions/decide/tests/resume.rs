@@ -1,14 +1,10 @@
 //! Higher attempts: what is kept, what is renewed, and what is not theirs.
 
-use std::sync::Arc;
-
 use serde_json::json;
 
 use super::builders::*;
 use crate::controller::submissions::decide::{Action, EvalaiUpdate};
-use crate::controller::submissions::foreign_runs::Traces;
-use crate::controller::submissions::view::{EvalaiInfo, EvalaiView, ObservedReport, ObservedTraces, Standing, Turn};
-use crate::services::table::ObservedRow;
+use crate::controller::submissions::view::{EvalaiView, ObservedReport, Standing};
 use leaderboard_api::State::{Cancelled, Failed, Finished, Pending, Resumed};
 use leaderboard_api::conditions::{FINISHED, PUBLISHED, STALLED};
 use leaderboard_api::{Attempt, JobNumber, names, reasons};
@@ -200,64 +196,4 @@ fn an_attempt_that_does_not_begin_is_shown_until_a_person_begins_it() {
     world.pass_to(Pending, reasons::PREPARING);
     let plan = world.pass();
     assert_ne!(condition(&plan, STALLED).1, said);
-}
-
-/// The status knows of one attempt; EvalAI's row names the Job of this one, and the table's row is of that one.
-fn resumed(last_job: Option<i64>, row: Option<i64>) -> World {
-    let mut world = failed();
-    world.submission().spec.attempt = Attempt(2);
-    world.pass();
-    world.job_gone();
-    let known = EvalaiInfo {
-        standing: Standing::Resumed,
-        last_attempt: last_job.map(Attempt),
-        ..info()
-    };
-    world.view.evalai = Some(EvalaiView {
-        info: Some(known),
-        ..EvalaiView::default()
-    });
-    let of = |attempt| ObservedRow {
-        status: "FAILED".into(),
-        is_ours: true,
-        attempt: Some(attempt),
-        since: None,
-    };
-    let found = Traces {
-        row: row.map(of),
-        ..Traces::default()
-    };
-    world.view.traces = ObservedTraces::Answered(Arc::new(looked(at(0), Ok(found))));
-    world
-}
-
-#[test]
-fn a_resume_counts_on_from_attempts_that_a_restored_status_does_not_know() {
-    for (last_job, row, earlier) in [
-        (None, None, 0),
-        (Some(1), Some(1), 0),
-        // A participant has written them into EvalAI's row.
-        (Some(2), None, 0),
-        (Some(9000), Some(1), 0),
-        (Some(9000), Some(2), 1),
-        (None, Some(2), 1),
-        (Some(3), Some(3), 2),
-    ] {
-        let mut world = resumed(last_job, row);
-        let counted = |world: &mut World| world.pass().status.plan.unwrap().earlier_attempts;
-        let (position, eta) = (1, None);
-        world.view.turn = Turn::Wait { position, eta };
-        for _ in 0..3 {
-            assert_eq!(counted(&mut world), earlier, "{last_job:?} {row:?}");
-        }
-        // It asks for a resume once more, while this attempt waits in line.
-        let known = world.in_evalai().info.as_mut().unwrap();
-        known.last_attempt = known.last_attempt.max(Some(Attempt(2)));
-        assert_eq!(counted(&mut world), earlier, "{last_job:?} {row:?}");
-        // EvalAI's row names the Job of this attempt too.
-        let known = world.in_evalai().info.as_mut().unwrap();
-        (known.standing, known.last_attempt) = (Standing::Wanted, Some(Attempt(2)));
-        world.view.turn = Turn::Go;
-        assert_eq!(counted(&mut world), earlier, "{last_job:?} {row:?}");
-    }
 }

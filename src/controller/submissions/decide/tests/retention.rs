@@ -3,6 +3,7 @@
 use std::time::Duration;
 
 use super::builders::*;
+use super::foreign;
 use crate::controller::submissions::decide::{Action, Plan};
 use crate::controller::submissions::view::EvalaiEnd;
 use leaderboard_api::State::{Failed, Finished};
@@ -156,6 +157,7 @@ fn a_resume_of_a_deleted_one_counts_on_in_the_table() {
     ] {
         let mut world = World::evalai();
         world.submission().spec.attempt = Attempt(attempt);
+        world.view.row = foreign::free(attempt);
         let info = world.in_evalai().info.as_mut().unwrap();
         (info.standing, info.last_attempt) = (standing, jobs.map(Attempt));
         world.pass();

@@ -187,14 +187,9 @@ fn updates_fit(view: &View, plan: &Plan) {
 
 fn status_is_whole(plan: &Plan) {
     let status = &plan.status;
-    let waits = |action: &Action| {
-        matches!(
-            action,
-            Action::JoinLine(_) | Action::AskEvalai | Action::LookForForeignRun(_)
-        )
-    };
+    let waits = |action: &Action| matches!(action, Action::JoinLine(_) | Action::AskEvalai | Action::ReadRow(_));
     if *status == SubmissionStatus::default() && plan.actions.iter().any(waits) {
-        // Nothing was written of it yet, and its place, or an answer of EvalAI, table or bucket comes first.
+        // Nothing was written of it yet, and its place, or an answer of EvalAI or the table comes first.
         return;
     }
     let state = status.state.expect("a state");

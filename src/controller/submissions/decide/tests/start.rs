@@ -294,22 +294,6 @@ fn a_crashing_init_container_shows_why_all_the_time() {
 }
 
 #[test]
-fn a_prefix_in_use_fails_at_once_and_is_not_tried_again() {
-    let mut world = World::local().with_pod();
-    let mut workspace = ended("workspace", 0, reasons::PREFIX_IN_USE, 1, 5);
-    workspace.last.as_mut().unwrap().why = Some("results/77/ holds another's. Apply it with attempt: 2.".into());
-    world.see(workspace);
-    world.pass_to(Pending, reasons::STOPPING);
-    world.job_gone();
-    let failure = world.pass_to(Failed, reasons::PREFIX_IN_USE).status.failure.unwrap();
-    assert_eq!(failure.class, Infrastructure);
-    assert_eq!(
-        failure.message,
-        "results/77/ holds another's. Apply it with attempt: 2."
-    );
-}
-
-#[test]
 fn the_start_has_no_deadline_before_the_scheduler_has_spoken() {
     let mut world = World::local().with_pod();
     world.leaderboard().deadlines.start_seconds = 1;

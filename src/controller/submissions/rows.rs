@@ -1,0 +1,193 @@
+//! The row that another program may have written of a submission, read before anything is written of it anywhere. While it shows a run,
+//! or cannot be read, it is read again every 30 s.
+
+use std::collections::HashMap;
+use std::sync::{Arc, Mutex};
+use std::time::Duration;
+
+use crate::ask::{Ask, Asker, Failure, Service, Wake};
+use crate::lock::lock;
+use crate::observability::tasks::Tasks;
+use crate::services::aws::Aws;
+use crate::services::table::{ObservedRow, Table, TableError, TableId};
+use leaderboard_api::{self as api, Attempt, RunId};
+
+/// A run of another program, as its row shows it.
+#[derive(Clone, Debug, PartialEq, Eq)]
+pub struct ForeignRun {
+    pub status: String,
+    /// Since when, as it is stored.
+    pub since: Option<String>,
+}
+
+/// Where the row of a submission would be.
+#[derive(Clone, Debug, PartialEq)]
+pub struct Row {
+    /// An attempt asks anew: another program may have begun since.
+    pub attempt: Attempt,
+    pub table: api::Table,
+    /// Id of the team, the table's partition key.
+    pub team: String,
+    pub run_id: RunId,
+}
+
+/// How long after an answer the row is read again.
+pub const AGAIN: Duration = Duration::from_secs(30);
+/// What the old pipeline's row shows of a run that has not ended.
+const UNDER_WAY: [&str; 2] = ["SUBMITTED", "RUNNING"];
+
+impl Ask for Row {
+    /// None: no other program runs the submission.
+    type Answer = Option<ForeignRun>;
+    const AT_ONCE: usize = 16;
+    const AT_ONCE_OF_A_SERVICE: usize = 4;
+    const LONGEST: Duration = Duration::from_secs(10);
+
+    fn service(&self) -> Service {
+        Service::table(&self.table)
+    }
+
+    fn again(&self, result: &Result<Self::Answer, Failure>, _failures: u32) -> Option<Duration> {
+        let is_free = matches!(result, Ok(None));
+        (!is_free).then_some(AGAIN)
+    }
+}
+
+/// Starts the task that reads.
+pub fn start(aws: &Aws, tasks: &Tasks, wake: Wake) -> Asker<Row> {
+    let tables = Arc::new(Tables {
+        aws: aws.clone(),
+        known: Mutex::default(),
+    });
+    Asker::start("rows", tasks, wake, move |row, _| {
+        let tables = Arc::clone(&tables);
+        async move { tables.read(&row).await }
+    })
+}
+
+/// Tables whose keys are known.
+struct Tables {
+    aws: Aws,
+    known: Mutex<HashMap<TableId, Table>>,
+}
+
+impl Tables {
+    async fn read(&self, row: &Row) -> Result<Option<ForeignRun>, Failure> {
+        let id = TableId::from(&row.table);
+        let known = lock(&self.known).get(&id).cloned();
+        let read = async {
+            let table = match known {
+                Some(table) => table,
+                None => Table::describe(&self.aws, &row.table).await?,
+            };
+            lock(&self.known).insert(id.clone(), table.clone());
+            table.read(&row.team, row.run_id.as_str()).await
+        };
+        match read.await {
+            Ok(found) => Ok(found.and_then(foreign_run)),
+            Err(error) => {
+                // It may have been made again with other keys.
+                lock(&self.known).remove(&id);
+                failure(&error).map_or(Ok(None), Err)
+            }
+        }
+    }
+}
+
+/// A row without an attempt is not this operator's.
+fn foreign_run(row: ObservedRow) -> Option<ForeignRun> {
+    let is_under_way = UNDER_WAY.contains(&row.status.as_str());
+    (is_under_way && !row.is_ours).then_some(ForeignRun {
+        status: row.status,
+        since: row.since,
+    })
+}
+
+/// A table that does not exist, or cannot hold such a row, holds no other program's. The Leaderboard's status shows what is wrong.
+fn failure(error: &TableError) -> Option<Failure> {
+    let is_refused = match error {
+        TableError::Missing { .. }
+        | TableError::NoSortKey { .. }
+        | TableError::OtherKeys { .. }
+        | TableError::Key { .. } => return None,
+        TableError::Denied { .. } | TableError::Refused { .. } | TableError::Stale { .. } => true,
+        TableError::Passing { .. } => false,
+    };
+    let why = error.to_string();
+    Some(Failure { is_refused, why })
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    fn row(status: &str, is_ours: bool) -> ObservedRow {
+        ObservedRow {
+            status: status.into(),
+            is_ours,
+            since: Some("2026-11-20 10:00:00 UTC".into()),
+        }
+    }
+
+    #[test]
+    fn only_a_row_of_a_run_without_our_attempt_shows_another_program() {
+        for (status, is_ours, is_foreign) in [
+            ("SUBMITTED", false, true),
+            ("RUNNING", false, true),
+            ("SUBMITTED", true, false),
+            ("RUNNING", true, false),
+            ("FINISHED", false, false),
+            ("FAILED", false, false),
+            ("CANCELLED", false, false),
+            ("", false, false),
+        ] {
+            let found = foreign_run(row(status, is_ours));
+            assert_eq!(found.is_some(), is_foreign, "{status} {is_ours}");
+        }
+    }
+
+    #[test]
+    fn only_a_table_that_can_hold_no_row_counts_as_empty() {
+        let (table, text, action) = (|| "rows".to_owned(), String::new, "GetItem");
+        let is_refused = |error| failure(&error).map(|failure| failure.is_refused);
+        assert_eq!(is_refused(TableError::NoSortKey { table: table() }), None);
+        let missing = TableError::Missing {
+            table: table(),
+            text: text(),
+        };
+        assert_eq!(is_refused(missing), None);
+        let denied = TableError::Denied {
+            table: table(),
+            action,
+            text: text(),
+        };
+        assert_eq!(is_refused(denied), Some(true));
+        let passing = TableError::Passing {
+            table: table(),
+            action,
+            text: text(),
+        };
+        assert_eq!(is_refused(passing), Some(false));
+    }
+
+    #[test]
+    fn a_row_is_read_once_unless_it_shows_a_run_or_cannot_be_read() {
+        let question = Row {
+            attempt: Attempt::FIRST,
+            table: serde_json::from_value(serde_json::json!({"name": "rows"})).unwrap(),
+            team: "42".into(),
+            run_id: "77".parse().unwrap(),
+        };
+        let run = ForeignRun {
+            status: "RUNNING".into(),
+            since: None,
+        };
+        let unread = Failure {
+            is_refused: true,
+            why: "no".into(),
+        };
+        assert_eq!(question.again(&Ok(None), 0), None);
+        assert_eq!(question.again(&Ok(Some(run)), 0), Some(AGAIN));
+        assert_eq!(question.again(&Err(unread), 9), Some(AGAIN));
+    }
+}
