@@ -99,9 +99,9 @@ pub fn child_of(leaderboard: &Leaderboard, name: String) -> ObjectMeta {
     }
 }
 
-/// A Leaderboard as metrics show it.
-pub fn board_name(namespace: Option<String>, name: &str) -> String {
-    format!("{}/{name}", namespace.unwrap_or_default())
+/// The Leaderboard that a Submission names.
+pub fn board_of(submission: &Submission) -> ObjectRef<Leaderboard> {
+    ObjectRef::new(&submission.spec.leaderboard_name).within(&submission.namespace().unwrap_or_default())
 }
 
 /// The label selector of everything the operator makes for submissions.

@@ -7,12 +7,13 @@ use kube::ResourceExt;
 use kube::runtime::reflector::ObjectRef;
 
 use super::network_policy;
-use super::slots::SlotAllocator;
+use super::objects::board_of;
 use crate::kubernetes::objects::{Job, Meta, Node, Pod};
 use crate::kubernetes::{Store, Synced};
 use leaderboard_api::{Leaderboard, Submission, names};
 
-/// Caches of the API server, filled by one task each.
+/// Caches of the API server, filled by one task each. Clones are the same.
+#[derive(Clone)]
 pub struct Stores {
     pub leaderboards: Store<Leaderboard>,
     pub submissions: Store<Submission>,
@@ -27,6 +28,7 @@ pub struct Stores {
 }
 
 /// The nodes of the cluster.
+#[derive(Clone)]
 pub struct Nodes {
     pub store: Store<Node>,
     /// Whether what `store` shows can be relied on.
@@ -36,9 +38,7 @@ pub struct Nodes {
 impl Stores {
     /// The Leaderboard that a Submission names.
     pub fn leaderboard_for(&self, submission: &Submission) -> Option<Arc<Leaderboard>> {
-        let namespace = submission.namespace().unwrap_or_default();
-        let reference = ObjectRef::new(&submission.spec.leaderboard_name).within(&namespace);
-        self.leaderboards.get(&reference)
+        self.leaderboards.get(&board_of(submission))
     }
 
     /// The youngest Pod of a Job.
@@ -56,20 +56,11 @@ impl Stores {
         self.pods.indexed(&job.metadata.uid)
     }
 
-    /// All Submissions of a namespace.
-    pub fn submissions_of(&self, namespace: &str) -> Vec<Arc<Submission>> {
+    /// All Submissions of a Leaderboard.
+    pub fn submissions_for(&self, board: &ObjectRef<Leaderboard>) -> Vec<Arc<Submission>> {
         let mut all = self.submissions.state();
-        all.retain(|submission| submission.metadata.namespace.as_deref() == Some(namespace));
+        all.retain(|one| one.spec.leaderboard_name == board.name && one.metadata.namespace == board.namespace);
         all
-    }
-
-    /// Takes all that is there into the lines for slots.
-    pub fn fill(&self, slots: &SlotAllocator) {
-        slots.start(
-            &self.leaderboards.state(),
-            &self.jobs.state(),
-            &self.submissions.state(),
-        );
     }
 
     /// Whether the policy that a Leaderboard's present spec asks for is seen to be there.

@@ -26,7 +26,7 @@ pub use call::{CallError, call, call_within};
 pub use feed::{WatchEvent, WatchEvents};
 pub use item::{Item, Malformed, Watchable};
 pub use namespaces::Namespaces;
-pub use store::{Index, Store, Tally};
+pub use store::{Index, Store};
 pub use uncached::spawn_uncached;
 pub use watch::{Shape, Synced, Unreadable, Watch, spawn_watch};
 pub use write::{Writer, Writes, Written};

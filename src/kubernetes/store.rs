@@ -13,9 +13,6 @@ use super::Watchable;
 /// By what objects are looked up besides their names, if at all.
 pub type Index<K> = fn(&K) -> Option<String>;
 
-/// Receives each change of a cache: what was there before, and what is there now. Keeps sums, so that nobody walks through all.
-pub type Tally<K> = Arc<dyn Fn(Option<&K>, Option<&K>) + Send + Sync>;
-
 /// Reads a cache. Clones are the same one.
 pub struct Store<K>(Arc<Shared<K>>);
 
@@ -39,7 +36,6 @@ pub struct Ended;
 pub(super) struct Writer<K> {
     store: Store<K>,
     ready: watch::Sender<bool>,
-    tallies: Vec<Tally<K>>,
 }
 
 /// Namespace and name in one.
@@ -61,17 +57,6 @@ impl<K> Clone for Store<K> {
 }
 
 impl<K: Watchable> Store<K> {
-    /// A cache that holds these and never changes.
-    #[cfg(test)]
-    pub(crate) fn of(objects: impl IntoIterator<Item = K>, index: Index<K>) -> Self {
-        let mut writer = Writer::new(index, Vec::new());
-        for object in objects {
-            writer.put(object);
-        }
-        writer.is_complete();
-        writer.store
-    }
-
     /// The object of this name.
     pub fn get(&self, reference: &ObjectRef<K>) -> Option<Arc<K>> {
         self.by_key(&key(reference.namespace.as_deref(), &reference.name))
@@ -120,7 +105,7 @@ impl<K: Watchable> Store<K> {
 }
 
 impl<K: Watchable> Writer<K> {
-    pub(super) fn new(index: Index<K>, tallies: Vec<Tally<K>>) -> Self {
+    pub(super) fn new(index: Index<K>) -> Self {
         let (sender, ready) = watch::channel(false);
         let cache = Cache {
             by_key: HashMap::new(),
@@ -134,7 +119,6 @@ impl<K: Watchable> Writer<K> {
         Self {
             store: Store(Arc::new(shared)),
             ready: sender,
-            tallies,
         }
     }
 
@@ -164,7 +148,6 @@ impl<K: Watchable> Writer<K> {
             all.push(Arc::clone(&object));
         }
         drop(cache);
-        self.tally(before.as_deref(), Some(&object));
         (object, before)
     }
 
@@ -174,12 +157,7 @@ impl<K: Watchable> Writer<K> {
         let before = cache.by_key.remove(key)?;
         cache.leave(&before, self.store.0.index);
         drop(cache);
-        self.tally(Some(&before), None);
         Some(before)
-    }
-
-    fn tally(&self, before: Option<&K>, now: Option<&K>) {
-        self.tallies.iter().for_each(|tally| tally(before, now));
     }
 
     /// The keys for which this does not hold.
@@ -206,6 +184,40 @@ mod tests {
     use super::super::objects::Pod;
     use super::*;
 
+    /// Caches that tests fill.
+    impl<K: Watchable> Store<K> {
+        /// A cache that holds these.
+        pub(crate) fn of(objects: impl IntoIterator<Item = K>, index: Index<K>) -> Self {
+            let mut writer = Writer::new(index);
+            for object in objects {
+                writer.put(object);
+            }
+            writer.is_complete();
+            writer.store
+        }
+
+        /// An empty cache, and what makes it complete.
+        pub(crate) fn unlisted() -> (Self, watch::Sender<bool>) {
+            let Writer { store, ready } = Writer::new(|_| None);
+            (store, ready)
+        }
+
+        pub(crate) fn put(&self, object: K) {
+            self.writer().put(object);
+        }
+
+        pub(crate) fn remove(&self, object: &K) {
+            self.writer().remove(&key_of(object));
+        }
+
+        fn writer(&self) -> Writer<K> {
+            Writer {
+                store: self.clone(),
+                ready: watch::channel(true).0,
+            }
+        }
+    }
+
     fn owner(pod: &Pod) -> Option<String> {
         pod.metadata.owner_references.first().map(|owner| owner.uid.to_string())
     }
@@ -218,7 +230,7 @@ mod tests {
 
     #[test]
     fn the_index_follows_an_object_that_is_replaced_or_removed() {
-        let mut writer = Writer::new(owner, Vec::new());
+        let mut writer = Writer::new(owner);
         let store = writer.store().clone();
         let uids = |value: &str| {
             let mut uids: Vec<_> = store
@@ -244,24 +256,5 @@ mod tests {
         writer.remove("n/a");
         assert!(writer.remove("n/a").is_none() && store.is_empty());
         assert!(store.read().by_index.is_empty(), "nothing is left of what is gone");
-    }
-
-    #[test]
-    fn a_tally_receives_what_each_change_replaces() {
-        let received = Arc::new(std::sync::Mutex::new(Vec::new()));
-        let notes = Arc::clone(&received);
-        let uid = |pod: Option<&Pod>| pod.map(|pod| pod.metadata.uid.to_string());
-        let tally: Tally<Pod> = Arc::new(move |before, now| notes.lock().unwrap().push((uid(before), uid(now))));
-        let mut writer = Writer::new(owner, vec![tally]);
-        writer.put(pod("a", "1", "job-1"));
-        writer.put(pod("a", "2", "job-1"));
-        writer.remove("n/a");
-        writer.remove("n/a");
-        let (one, two) = (|| Some("1".to_owned()), || Some("2".to_owned()));
-        assert_eq!(
-            *received.lock().unwrap(),
-            [(None, one()), (one(), two()), (two(), None)],
-            "what is not there has no end"
-        );
     }
 }

@@ -16,7 +16,7 @@ use super::feed::{Feed, WatchEvents};
 use super::item::{Item, Watchable};
 use super::objects::Texts;
 use super::source::{self, Source, is_refusal};
-use super::store::{Index, Store, Tally, Writer, key_of};
+use super::store::{Index, Store, Writer, key_of};
 use crate::lock::lock;
 use crate::observability::Observability;
 use crate::observability::metrics::WatchMetrics;
@@ -74,7 +74,6 @@ pub struct Shape<K> {
     /// Drops what is never read, before an object is cached.
     pub trim: fn(&mut K),
     pub index: Index<K>,
-    pub tallies: Vec<Tally<K>>,
 }
 
 impl<K> Default for Shape<K> {
@@ -82,7 +81,6 @@ impl<K> Default for Shape<K> {
         Self {
             trim: |_| {},
             index: |_| None,
-            tallies: Vec::new(),
         }
     }
 }
@@ -122,10 +120,10 @@ impl<K: Watchable> Watch<K> {
 pub fn spawn_watch<K: Watchable>(
     apis: Vec<Api<Item<K>>>,
     config: Config,
-    Shape { trim, index, tallies }: Shape<K>,
+    Shape { trim, index }: Shape<K>,
     telemetry: &Observability,
 ) -> Watch<K> {
-    let writer = Writer::<K>::new(index, tallies);
+    let writer = Writer::<K>::new(index);
     let watch = Watch {
         store: writer.store().clone(),
         synced: Synced::default(),

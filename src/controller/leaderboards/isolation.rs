@@ -16,7 +16,7 @@ use kube::{Api, Client, ResourceExt};
 use super::state::{Applied, Entry, Found, LeaderboardState, POLICY_AGAIN, Policy, RESYNC, SOONEST};
 use crate::controller::network_policy::{is_in_place, network_policy};
 use crate::controller::objects::{Wake, key_of, uid_of};
-use crate::controller::slots::SlotAllocator;
+use crate::controller::slots::Slots;
 use crate::controller::stores::Stores;
 use crate::kubernetes::objects::Pod;
 use crate::kubernetes::{WatchEvents, call};
@@ -34,7 +34,7 @@ pub struct Policies<'a> {
     pub client: &'a Client,
     pub stores: &'a Stores,
     pub state: &'a LeaderboardState,
-    pub slots: &'a SlotAllocator,
+    pub slots: &'a Slots,
     pub wake: &'a Wake<Leaderboard>,
 }
 
@@ -95,7 +95,7 @@ pub(super) async fn keep(policies: Policies<'_>, leaderboard: &Leaderboard, now:
     if policy == Policy::InPlace && last.is_some_and(|last| last.has_failed()) {
         // An apply that changes nothing is no event.
         let reference = ObjectRef::from_obj(leaderboard);
-        policies.slots.wake_pending(&reference);
+        policies.slots.wake(&reference);
         (policies.wake)(reference);
     }
     policy

@@ -6,7 +6,6 @@
 
 pub mod claims;
 pub mod decide;
-mod images;
 pub mod isolation;
 pub mod looks;
 pub mod operator;
@@ -25,15 +24,16 @@ use std::time::Duration;
 
 use jiff::Timestamp;
 use kube::runtime::events::Recorder;
+use kube::runtime::reflector::ObjectRef;
 use tokio::sync::mpsc::UnboundedSender;
 use tokio::time::Instant;
 
 use super::objects::{key_of, uid_of, version, version_number};
 use super::settings::Settings;
-use super::slots::SlotAllocator;
+use super::slots::Slots;
 use super::writes::{apply_status, set_finalizer};
+use crate::controller::census::Census;
 use crate::controller::submissions::external::ExternalSystems;
-use crate::controller::submissions::team_use::Teams;
 use crate::kubernetes::{CallError, Writer};
 use crate::observability::metrics::leader::{self, Gauge, Samples};
 use decide::{LeaderboardPlan, LeaderboardView, decide};
@@ -53,8 +53,7 @@ pub struct Uses<'a> {
     pub writer: &'a Writer,
     pub recorder: &'a Recorder,
     pub settings: &'a Settings,
-    pub slots: &'a SlotAllocator,
-    pub teams: &'a Teams,
+    pub slots: &'a Slots,
     pub external: &'a ExternalSystems,
     pub looks: &'a UnboundedSender<Look>,
 }
@@ -187,17 +186,18 @@ fn observe(
     probe: &Probe,
     now: Timestamp,
 ) -> LeaderboardView {
-    let (counts, in_use) = uses.slots.census(leaderboard);
     let (stores, hub) = (uses.policies.stores, &uses.external.hub);
     let key = key_of(leaderboard.as_ref());
+    let submissions = stores.submissions_for(&ObjectRef::from_obj(leaderboard.as_ref()));
+    let census = Census::of(submissions.iter().map(AsRef::as_ref));
     LeaderboardView {
         now,
         leaderboard: Arc::clone(leaderboard),
         all: stores.leaderboards.state(),
-        counts,
-        gpu_use: uses.teams.gpu_use(leaderboard),
-        in_use,
-        image_note: images::note(leaderboard, &stores.submissions_of(&key.namespace)),
+        counts: census.counts,
+        gpu_use: census.gpu_use(),
+        in_use: census.in_use,
+        image_note: census.image_note(),
         pods: isolation::pods_left(stores, leaderboard),
         policy,
         measured: isolation::measured(uses.policies.state, leaderboard),

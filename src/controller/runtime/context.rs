@@ -12,13 +12,12 @@ use crate::controller::leaderboards::state::LeaderboardState;
 use crate::controller::leaderboards::{self, probe};
 use crate::controller::objects::Wake;
 use crate::controller::settings::Settings;
-use crate::controller::slots::SlotAllocator;
+use crate::controller::slots::Slots;
 use crate::controller::stores::Stores;
 use crate::controller::submissions::external::ExternalSystems;
 use crate::controller::submissions::memory::Memory;
 use crate::controller::submissions::observe::causes::Causes;
 use crate::controller::submissions::observe::workers::Workers;
-use crate::controller::submissions::team_use::Teams;
 use crate::controller::submissions::{act, observe};
 use crate::kubernetes::Writer;
 use crate::kubernetes::objects::Pod;
@@ -37,8 +36,7 @@ pub struct Context {
     pub memory: Memory,
     pub workers: Workers,
     pub causes: Causes,
-    pub teams: Teams,
-    pub slots: Arc<SlotAllocator>,
+    pub slots: Arc<Slots>,
     pub leaderboards: LeaderboardState,
     pub looks: UnboundedSender<Look>,
     pub external: ExternalSystems,
@@ -83,7 +81,6 @@ impl Context {
             recorder: &self.recorder,
             settings: &self.settings,
             slots: &self.slots,
-            teams: &self.teams,
             external: &self.external,
             looks: &self.looks,
         }

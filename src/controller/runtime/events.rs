@@ -16,7 +16,8 @@ use tokio::sync::mpsc;
 use super::Shared;
 use super::queue::{Class, Key, Queue, urgency};
 use super::watches::Watches;
-use crate::controller::objects::{Wake, key_of};
+use crate::controller::objects::{Wake, board_of, key_of};
+use crate::controller::slots;
 use crate::controller::stores::Stores;
 use crate::kubernetes::objects::{Job, Pod};
 use crate::kubernetes::{Store, WatchEvent};
@@ -44,7 +45,7 @@ pub(super) fn of_submissions(watches: &Watches, reports: Reports, shared: &Arc<S
         let store = store.clone();
         move |object| Some(ranked(&store, object, urgency))
     };
-    let (of_row, of_turn) = (by_store(urgency::of_answer), by_store(urgency::of_submission));
+    let of_row = by_store(urgency::of_answer);
     let of_evalai = by_store(urgency::of_evalai);
     let of_evalai = move |change| match change {
         Changed::Submission(key) => of_evalai(reference(&key)),
@@ -59,16 +60,24 @@ pub(super) fn of_submissions(watches: &Watches, reports: Reports, shared: &Arc<S
         mapped(watches.pods.subscribe(), of_pod(Arc::clone(shared))),
         mapped(received(reports.rows), move |key| of_row(reference(&key))),
         mapped(received(reports.evalai), of_evalai),
-        mapped(shared.context.slots.woken(), of_turn),
     ])
     .boxed()
 }
 
 /// Puts a Submission into the queue that has an answer from S3, or of the API server.
 pub(super) fn waking(queue: &Arc<Queue>, submissions: &Store<Submission>) -> Wake<Submission> {
+    waking_as(urgency::of_answer, queue, submissions)
+}
+
+/// Puts a Submission into the queue, as urgent as this.
+pub(super) fn waking_as(
+    urgency: fn(&Submission) -> Class,
+    queue: &Arc<Queue>,
+    submissions: &Store<Submission>,
+) -> Wake<Submission> {
     let (queue, submissions) = (Arc::clone(queue), submissions.clone());
     Box::new(move |object| {
-        let (object, class) = ranked(&submissions, object, urgency::of_answer);
+        let (object, class) = ranked(&submissions, object, urgency);
         queue.add(&object, class);
     })
 }
@@ -87,7 +96,7 @@ pub(super) fn of_leaderboards(watches: &Watches, shared: &Arc<Shared>) -> Events
     let slots = Arc::clone(&shared.context.slots);
     let of_policy = move |event: WatchEvent<NetworkPolicy>| {
         let board = Stores::leaderboard_of_policy(&event.object)?;
-        slots.wake_pending(&board);
+        slots.wake(&board);
         Some((board, Class::Urgent))
     };
     select_all([
@@ -100,16 +109,22 @@ pub(super) fn of_leaderboards(watches: &Watches, shared: &Arc<Shared>) -> Events
 fn of_submission(
     shared: Arc<Shared>,
 ) -> impl FnMut(WatchEvent<Submission>) -> Option<(ObjectRef<Submission>, Class)> + Send {
-    let mut marks = Marks::default();
+    let (mut marks, mut counted) = (Marks::default(), Marks::default());
     move |event| {
         let (object, queues) = (event.object.as_ref(), &shared.queues);
-        if shared.context.slots.submission(object, event.is_gone) {
-            let namespace = object.namespace().unwrap_or_default();
-            let board = ObjectRef::<Leaderboard>::new(&object.spec.leaderboard_name).within(&namespace);
+        let (board, slots) = (board_of(object), &shared.context.slots);
+        if event.is_gone || counted.moved(object, &slots::mark(object)) {
+            slots.changed(&board);
+        }
+        // One that is being deleted waits for its last submission; of the others the walk of the gauges compares the counts.
+        let known = shared.context.stores.leaderboards.get(&board);
+        if known.is_some_and(|known| known.metadata.deletion_timestamp.is_some()) {
             queues.leaderboards.add(&board, Class::Refresh);
         }
         if event.is_gone {
             marks.forget(object);
+            counted.forget(object);
+            slots.leaves(object);
             queues.submissions.forget(&Key::from(&ObjectRef::from_obj(object)));
             shared.forget(&key_of(object));
             return None;
@@ -124,7 +139,9 @@ fn of_job(shared: Arc<Shared>) -> impl FnMut(WatchEvent<Job>) -> Option<(ObjectR
     let mut marks = Marks::default();
     move |event| {
         let job = event.object.as_ref();
-        shared.context.slots.job(job, event.is_gone);
+        if let Some(board) = Stores::leaderboard_of(&job.metadata) {
+            shared.context.slots.changed(&board);
+        }
         let owner = Stores::owner_of(&job.metadata).filter(|_| marks.job_has_news(job, event.is_gone));
         owner.map(|owner| (owner, urgency::of_job(job, event.is_gone)))
     }
@@ -136,22 +153,20 @@ fn of_leaderboard(
     let (mut marks, mut standings) = (Marks::default(), Marks::default());
     move |event| {
         let (object, slots) = (event.object.as_ref(), &shared.context.slots);
-        slots.leaderboard(object, event.is_gone);
         let reference = ObjectRef::from_obj(object);
+        slots.changed(&reference);
         if event.is_gone {
             marks.forget(object);
             standings.forget(object);
             shared.queues.leaderboards.forget(&Key::from(&reference));
             shared.forget(&key_of(object));
-            slots.wake_pending(&reference);
+            slots.wake(&reference);
             return None;
         }
         let stands_otherwise = standings.moved(object, &standing(object));
         let is_news = marks.moved(object, &own_fields(object, names::FINALIZER_LEADERBOARD));
-        if is_news {
-            slots.wake_live(&reference);
-        } else if stands_otherwise {
-            slots.wake_pending(&reference);
+        if is_news || stands_otherwise {
+            slots.wake(&reference);
         }
         is_news.then_some((reference, Class::Urgent))
     }

@@ -1,17 +1,19 @@
-//! What the leader shows of what is there: one walk over the caches every 15 s.
+//! What the leader shows of what is there: one walk over the caches every 15 s. It wakes each Leaderboard whose status has other counts.
 
-use std::collections::BTreeMap;
+use std::collections::{BTreeMap, HashMap};
 use std::sync::Arc;
 use std::time::Duration;
 
 use jiff::Timestamp;
 use kube::ResourceExt;
+use kube::runtime::reflector::ObjectRef;
 
 use super::Shared;
 use super::queue::{Class, Queue};
 use super::reconciles::{LEADERBOARD, SUBMISSION};
+use crate::controller::census::Census;
 use crate::controller::leaderboards::{self, operator};
-use crate::controller::objects::board_name;
+use crate::controller::objects::{board_of, key_of};
 use crate::controller::submissions::decide::awaits_publication;
 use crate::observability::Observability;
 use crate::observability::metrics::OTHERS;
@@ -52,7 +54,9 @@ pub(super) fn walk(shared: &Shared, now: Timestamp) -> Samples {
     boards.retain(|board| operator::is_ours(board, us));
     let submissions = context.stores.submissions.state();
     show_states(&mut samples, &submissions);
-    show_boards(&mut samples, &boards, &submissions, now);
+    for board in show_boards(&mut samples, &boards, &submissions, now) {
+        shared.queues.leaderboards.add(&board, Class::Refresh);
+    }
     for board in &boards {
         leaderboards::show_limits(&mut samples, context.for_leaderboards(), board);
     }
@@ -108,6 +112,7 @@ fn standing(submission: &Submission) -> [&'static str; 3] {
 /// What is summed up of the Submissions of a Leaderboard.
 #[derive(Default)]
 struct OfBoard {
+    census: Census,
     pending_since: Option<Timestamp>,
     unpublished_since: Option<Timestamp>,
     slots_in_use: i64,
@@ -115,34 +120,38 @@ struct OfBoard {
     holders: BTreeMap<(Timestamp, String), i64>,
 }
 
-/// How each Leaderboard stands, how long its submissions have waited, and what they use.
+/// How each Leaderboard stands, how long its submissions have waited, and what they use. Returns those whose status has other counts.
 fn show_boards(
     samples: &mut Samples,
     leaderboards: &[Arc<Leaderboard>],
     submissions: &[Arc<Submission>],
     now: Timestamp,
-) {
-    let mut boards = BTreeMap::new();
-    for leaderboard in leaderboards {
-        let name = board_name(leaderboard.namespace(), &leaderboard.name_any());
-        let ready = leaderboard.condition(conditions::READY);
-        let is_ready = ready.is_some_and(|ready| ready.status == "True");
-        samples.set(&leader::READY, [&name], i64::from(is_ready));
-        boards.insert(name, OfBoard::default());
-    }
+) -> Vec<ObjectRef<Leaderboard>> {
+    let known = |leaderboard| (ObjectRef::from_obj(leaderboard), (leaderboard, OfBoard::default()));
+    let mut boards: HashMap<_, _> = leaderboards.iter().map(AsRef::as_ref).map(known).collect();
     for submission in submissions {
-        let name = board_name(submission.namespace(), &submission.spec.leaderboard_name);
-        if let Some(board) = boards.get_mut(&name) {
+        if let Some((_, board)) = boards.get_mut(&board_of(submission)) {
             board.add(submission, now);
         }
     }
-    for (name, board) in &boards {
-        board.show(samples, name, now);
+    let mut stale = Vec::new();
+    for (reference, (leaderboard, board)) in boards {
+        let name = key_of(leaderboard).to_string();
+        let ready = leaderboard.condition(conditions::READY);
+        let is_ready = ready.is_some_and(|ready| ready.status == "True");
+        samples.set(&leader::READY, [&name], i64::from(is_ready));
+        board.show(samples, &name, now);
+        let counts = leaderboard.status.as_ref().and_then(|status| status.counts);
+        if counts != Some(board.census.counts) {
+            stale.push(reference);
+        }
     }
+    stale
 }
 
 impl OfBoard {
     fn add(&mut self, submission: &Submission, now: Timestamp) {
+        self.census.add(submission);
         self.add_holder(submission, now);
         let status = submission.status.as_ref();
         self.slots_in_use += i64::from(status.is_some_and(SubmissionStatus::has_slot));

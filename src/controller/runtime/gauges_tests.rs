@@ -264,7 +264,10 @@ async fn a_walk_shows_the_leaderboards_that_this_installation_drives() {
         .queues
         .submissions
         .add(&ObjectRef::<Submission>::new("one").within("one"), Class::New);
+    let ready = |found: &Shared| found.queues.leaderboards.depth().iter().sum::<usize>();
+    assert_eq!(ready(&shared), 0);
     let found = walk(&shared, now());
+    assert_eq!(ready(&shared), 1, "its status has no count yet of the one that waits");
     assert_eq!(lines(&found, "ready"), ["leaderboard=one/a 0"]);
     assert_eq!(lines(&found, "oldest_pending_seconds"), ["leaderboard=one/a 600"]);
     assert_eq!(lines(&found, "slots_in_use"), ["leaderboard=one/a 0"]);

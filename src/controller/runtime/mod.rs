@@ -29,6 +29,7 @@ use super::leaderboards::looks::{self, Look};
 use super::leaderboards::state::LeaderboardState;
 use super::leaderboards::{isolation, operator};
 use super::settings::Settings;
+use super::slots::Slots;
 use crate::bridge::{self, Scope, pollers};
 use crate::controller::submissions::external::ExternalSystems;
 use crate::controller::submissions::memory::Memory;
@@ -52,7 +53,7 @@ use crate::services::table;
 use backoff::BackoffMap;
 use context::Context;
 use leader::{Leader, Leadership};
-use queue::Class;
+use queue::{Class, urgency};
 use reconciles::Queues;
 use watches::Watches;
 
@@ -248,7 +249,9 @@ impl Parts {
     ) -> Context {
         let fence = fence.clone();
         let (aws, client, tasks) = (&self.aws, &self.client, &self.telemetry.tasks);
-        let answered = || events::waking(&queues.submissions, &self.watches.submissions.store);
+        let submissions = &self.watches.submissions.store;
+        let answered = || events::waking(&queues.submissions, submissions);
+        let turned = events::waking_as(urgency::of_submission, &queues.submissions, submissions);
         let boards = Arc::clone(&queues.leaderboards);
         let context = Context {
             client: client.clone(),
@@ -258,8 +261,7 @@ impl Parts {
             memory: Memory::default(),
             workers: Workers::start(aws, client, tasks, answered),
             causes: self.causes(queues),
-            teams: self.watches.teams.clone(),
-            slots: Arc::default(),
+            slots: Arc::new(Slots::new(self.watches.stores(), turned)),
             leaderboards: LeaderboardState::default(),
             looks,
             external,
@@ -269,7 +271,8 @@ impl Parts {
             traces: self.telemetry.traces.clone(),
             wake: Box::new(move |board| boards.add(&board, Class::Refresh)),
         };
-        context.stores.fill(&context.slots);
+        let slots = Arc::clone(&context.slots);
+        tasks.stay("slots", async move { slots.keep().await });
         for pod in context.stores.pods.state() {
             context.measured(&pod);
         }

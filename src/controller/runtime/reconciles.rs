@@ -18,7 +18,7 @@ use super::queue::{After, Class, Limits, Queue, Turn, urgency};
 use crate::backoff::jittered;
 use crate::controller::leaderboards::{self, Reconciled, operator};
 use crate::controller::objects::{span_of, uid_of};
-use crate::controller::slots::SlotAllocator;
+use crate::controller::slots::Slots;
 use crate::controller::submissions::act::{ActError, act};
 use crate::controller::submissions::decide::{SlotUse, decide};
 use crate::controller::submissions::observe::observe;
@@ -185,7 +185,7 @@ async fn limited<T>(work: impl Future<Output = Result<T, ReconcileError>>) -> Re
 }
 
 /// Does with the slot what was decided. One that stays in line renews its place in `act`.
-fn settle(slots: &SlotAllocator, submission: &Submission, slot: SlotUse) {
+fn settle(slots: &Slots, submission: &Submission, slot: SlotUse) {
     match slot {
         SlotUse::Holds => slots.starts(submission),
         SlotUse::Waits => {}

@@ -17,7 +17,7 @@ use crate::kubernetes::Namespaces;
 use crate::observability::shutdown::Stop;
 
 /// All that runs in a leader without Leaderboards, in the order of names.
-const TASKS: [&str; 18] = [
+const TASKS: [&str; 19] = [
     "events of Jobs",
     "events of Pods",
     "gauges",
@@ -29,6 +29,7 @@ const TASKS: [&str; 18] = [
     "policies",
     "reconciles",
     "rows",
+    "slots",
     "sweep",
     "watch of jobs",
     "watch of leaderboards",

@@ -1,6 +1,5 @@
 //! The watches of a controller: what each kind's cache holds, and what is summed up as it changes.
 
-use std::sync::Arc;
 use std::time::Duration;
 
 use k8s_openapi::api::networking::v1::NetworkPolicy;
@@ -12,9 +11,8 @@ use super::leader::Leader;
 use crate::controller::objects::children_selector;
 use crate::controller::settings::Settings;
 use crate::controller::stores::{Nodes, Stores, owner_uid};
-use crate::controller::submissions::team_use::Teams;
 use crate::kubernetes::objects::{Job, Node, Pod};
-use crate::kubernetes::{Namespaces, Shape, Tally, Watch, Watchable, spawn_watch};
+use crate::kubernetes::{Namespaces, Shape, Watch, Watchable, spawn_watch};
 use crate::observability::Observability;
 use crate::page::Reads;
 use leaderboard_api::{Leaderboard, Submission};
@@ -33,18 +31,10 @@ fn all<K: Watchable<Scope = NamespaceResourceScope>>(
     spawn_watch(namespaces.apis(client), config, shape, telemetry)
 }
 
-/// What is kept of Submissions in sums.
-fn tallies(teams: &Teams) -> Vec<Tally<Submission>> {
-    let teams = teams.clone();
-    vec![Arc::new(move |before, now| teams.changed(before, now))]
-}
-
 /// The caches, and what they are filled from.
 pub(super) struct Watches {
     pub(super) leaderboards: Watch<Leaderboard>,
     pub(super) submissions: Watch<Submission>,
-    /// What the cache of Submissions adds up to.
-    pub(super) teams: Teams,
     pub(super) jobs: Watch<Job>,
     pub(super) pods: Watch<Pod>,
     pub(super) policies: Watch<NetworkPolicy>,
@@ -56,19 +46,13 @@ impl Watches {
     pub(super) fn start(client: &Client, settings: &Settings, telemetry: &Observability) -> Self {
         let namespaces = &settings.namespaces;
         let children = || Config::default().labels(&children_selector());
-        let teams = Teams::default();
-        let submissions = Shape {
-            tallies: tallies(&teams),
-            ..Shape::default()
-        };
         let pods = Shape {
             index: owner_uid,
             ..Shape::default()
         };
         Self {
             leaderboards: all(namespaces, client, Config::default(), Shape::default(), telemetry),
-            submissions: all(namespaces, client, Config::default(), submissions, telemetry),
-            teams,
+            submissions: all(namespaces, client, Config::default(), Shape::default(), telemetry),
             jobs: all(namespaces, client, children(), Shape::default(), telemetry),
             pods: all(namespaces, client, children(), pods, telemetry),
             policies: all(namespaces, client, children(), Shape::default(), telemetry),

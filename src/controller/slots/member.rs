@@ -1,35 +1,91 @@
-//! What of a Submission, as the watch shows it, counts for the others of its Leaderboard: all of it, and nothing else. Pure.
+//! What of a Submission, as the cache shows it, counts for the others of its Leaderboard. Pure.
+
+use std::borrow::Cow;
 
 use jiff::Timestamp;
 
-use leaderboard_api::{JobNumber, State, Submission, SubmissionStatus, conditions, names, reasons};
+use super::turns::{Past, RUNS};
+use leaderboard_api::{Attempt, JobNumber, Submission, SubmissionStatus, names};
 
-pub(super) struct Member {
-    pub(super) name: String,
-    pub(super) team: String,
-    pub(super) track: String,
-    /// The Job that runs or is to run next.
-    pub(super) number: JobNumber,
-    pub(super) stand: Stand,
+#[derive(Debug)]
+pub(super) struct Member<'a> {
+    pub(super) uid: &'a str,
+    pub(super) team: Cow<'a, str>,
+    track: &'a str,
+    /// The one that runs or is to run next.
+    pub(super) attempt: Attempt,
+    pub(super) has_slot: bool,
+    /// It has come to its end, and no other attempt is requested.
+    pub(super) is_over: bool,
     /// It starts nothing any more.
     pub(super) is_leaving: bool,
-    /// A change of its Leaderboard may let it start.
-    pub(super) is_pending: bool,
     /// When its present or last run began.
-    pub(super) began: Option<Timestamp>,
+    began: Option<Timestamp>,
     /// When a run ended that has begun.
-    pub(super) ended: Option<Timestamp>,
-    pub(super) state: State,
-    /// It is live, or its end is not yet published and recorded.
-    pub(super) needs_leaderboard: bool,
-    pub(super) kind: Kind,
+    ended: Option<Timestamp>,
 }
 
-#[derive(Clone, Copy, PartialEq, Eq)]
-pub(super) enum Kind {
-    OfTeam,
-    /// It is in no count and no estimate.
-    Check,
+impl<'a> Member<'a> {
+    /// `has_job`: whether it owns a Job of this name. A Job has a slot although the status may not name it.
+    pub(super) fn of(submission: &'a Submission, has_job: impl FnOnce(&str) -> bool) -> Self {
+        let (meta, spec) = (&submission.metadata, &submission.spec);
+        let name = meta.name.as_deref().unwrap_or_default();
+        let status = submission.status.as_ref();
+        let is_over = is_over(submission);
+        let number = match status.filter(|status| !status.has_ended()) {
+            Some(status) => JobNumber {
+                attempt: submission.present_attempt(),
+                retry: status.retry,
+            },
+            None => JobNumber::first(spec.attempt),
+        };
+        let times = status.map(|status| &status.times).filter(|_| !spec.check);
+        let began = times.and_then(|times| times.scheduled.as_ref().or(times.started.as_ref()));
+        // What never ran shows nothing of how long a run takes.
+        let ended = times.and_then(|times| times.started.as_ref().and(times.finished.as_ref()));
+        Self {
+            uid: meta.uid.as_deref().unwrap_or_default(),
+            team: if spec.check {
+                check_team(name).into()
+            } else {
+                submission.team().unwrap_or_default().into()
+            },
+            track: status
+                .and_then(|status| status.track.as_deref())
+                .or(spec.track.as_deref())
+                .unwrap_or_default(),
+            attempt: number.attempt,
+            has_slot: status.is_some_and(SubmissionStatus::has_slot) || !is_over && has_job(&names::job(name, number)),
+            is_over,
+            is_leaving: is_over || spec.cancel || meta.deletion_timestamp.is_some(),
+            began: began.map(|time| time.0),
+            ended: ended.map(|time| time.0),
+        }
+    }
+
+    /// Adds when its team was last served, and how long its run took if that has ended.
+    pub(super) fn note(&self, past: &mut Past) {
+        let Some(began) = self.began else { return };
+        match past.served.get_mut(&*self.team) {
+            Some(served) => *served = began.max(*served),
+            None => _ = past.served.insert(self.team.to_string(), began),
+        }
+        if let Some(ended) = self.ended {
+            let run = (ended, ended.duration_since(began).as_secs().max(0));
+            let runs = past.runs.entry(self.track.to_owned()).or_default();
+            runs.push(run);
+            if runs.len() >= 4 * RUNS {
+                runs.sort_by_key(|run| std::cmp::Reverse(*run));
+                runs.truncate(RUNS);
+            }
+        }
+    }
+}
+
+/// It has come to its end, and no other attempt is requested.
+pub(super) fn is_over(submission: &Submission) -> bool {
+    let status = submission.status.as_ref();
+    status.is_some_and(|status| status.has_ended() && !status.is_followed_by(submission.spec.attempt))
 }
 
 /// The team as which a check stands in line: its own, so that no limit of a team holds it up.
@@ -37,87 +93,7 @@ pub fn check_team(name: &str) -> String {
     format!("check/{name}")
 }
 
-/// What its status shows of it.
-#[derive(Clone, Copy, PartialEq, Eq)]
-pub(super) enum Stand {
-    /// It has no slot, and may want one.
-    Idle,
-    HasSlot,
-    /// It has come to its end, and no other attempt is requested.
-    Over,
-}
-
-impl Member {
-    pub(super) fn of(submission: &Submission) -> Self {
-        let spec = &submission.spec;
-        let none = SubmissionStatus::default();
-        let status = submission.status.as_ref().unwrap_or(&none);
-        let name = submission.metadata.name.clone().unwrap_or_default();
-        let is_finished = status.has_ended();
-        let known = submission.present_attempt();
-        let is_over = is_finished && !status.is_followed_by(spec.attempt);
-        let number = if is_finished && !is_over {
-            JobNumber::first(spec.attempt)
-        } else {
-            JobNumber {
-                attempt: known,
-                retry: status.retry,
-            }
-        };
-        let times = &status.times;
-        let began = times.scheduled.as_ref().or(times.started.as_ref());
-        // What never ran shows nothing of how long a run takes.
-        let ended = times.started.as_ref().and(times.finished.as_ref());
-        let is_deleting = submission.metadata.deletion_timestamp.is_some();
-        let own = spec.check.then(|| check_team(&name));
-        Self {
-            team: own.unwrap_or_else(|| submission.team().unwrap_or_default().to_owned()),
-            track: status.track.clone().or(spec.track.clone()).unwrap_or_default(),
-            number,
-            name,
-            stand: match status {
-                _ if is_over => Stand::Over,
-                // Between two tries it keeps its slot: it lost its Job to the infrastructure and is about to get another.
-                status if !is_finished && status.has_run() => Stand::HasSlot,
-                _ => Stand::Idle,
-            },
-            is_leaving: is_over || spec.cancel || is_deleting,
-            is_pending: !is_over && waits_for_leaderboard(status),
-            began: began.filter(|_| !spec.check).map(|time| time.0),
-            ended: ended.filter(|_| !spec.check).map(|time| time.0),
-            state: status.state_of_conditions(),
-            needs_leaderboard: needs_leaderboard(status),
-            kind: if spec.check { Kind::Check } else { Kind::OfTeam },
-        }
-    }
-
-    /// Name of the Job that runs or is to run next.
-    pub(super) fn job(&self) -> String {
-        names::job(&self.name, self.number)
-    }
-
-    /// Whether what is known of past runs stays right by adding what is new here.
-    pub(super) fn adds_to(&self, old: &Self) -> bool {
-        let same_run = |new: Option<Timestamp>, old: Option<Timestamp>| old.is_none() || old == new;
-        old.began.is_none()
-            || (self.team == old.team
-                && self.track == old.track
-                && same_run(self.began, old.began)
-                && same_run(self.ended, old.ended))
-    }
-
-    pub(super) fn ran_as(&self, old: &Self) -> bool {
-        (&self.team, &self.track, self.began, self.ended) == (&old.team, &old.track, old.began, old.ended)
-    }
-}
-
-fn needs_leaderboard(status: &SubmissionStatus) -> bool {
-    let waits = |type_: &str| status.condition(type_).is_some() && !status.is_delivered(type_);
-    !status.has_ended() || waits(conditions::PUBLISHED) || waits(conditions::RECORDED)
-}
-
-/// Whether a change of its Leaderboard may let it start: it has no Job, or the one that it asked for may not be made.
-fn waits_for_leaderboard(status: &SubmissionStatus) -> bool {
-    let held = [reasons::NOT_ISOLATED];
-    status.job_name.is_none() || status.reason.as_deref().is_some_and(|reason| held.contains(&reason))
+/// What of a Submission counts for the others, as a text: what leaves it as it was concerns nobody else.
+pub fn mark(submission: &Submission) -> String {
+    format!("{:?}", Member::of(submission, |_| false))
 }

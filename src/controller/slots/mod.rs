@@ -1,216 +1,158 @@
-//! Who may start: one owner of the slots of each Leaderboard.
+//! Who may start: the slots of each Leaderboard, worked out from the caches.
 //!
 //! A submission joins the line of its Leaderboard when all but the slot is settled (`Action::JoinLine`), and the answer wakes
-//! it. A granted slot is a reservation until the watch shows its Job, or until it turns out that none comes. Fed by the watches
-//! of Submissions, Jobs and Leaderboards and by the reconciles. No call here waits for anything: the next in line does not depend
-//! on a bucket, a token or another Leaderboard. The order of the line is `turns`, which is pure.
+//! it. Remembered is only who stands in line, and whom a slot is reserved for until the cache shows its Job; all else is read anew
+//! from the caches (`line`). A reservation ends also with its submission, with a plan that creates no Job, and with a pause or other limits.
+//! No call here waits for anything: the next in line does not depend on a bucket, a token or another Leaderboard. The order of the line is
+//! `turns`, which is pure.
 
 mod line;
 mod member;
 pub mod turns;
 
-pub use member::check_team;
-
-use std::collections::HashMap;
-use std::sync::{Arc, Mutex};
+use std::collections::{HashMap, HashSet};
+use std::sync::Mutex;
 use std::time::Duration;
 
-use futures::{Stream, StreamExt, stream};
-use kube::ResourceExt;
 use kube::runtime::reflector::ObjectRef;
 use tokio::sync::Notify;
 use tokio::time::Instant;
 
-use crate::controller::objects::uid;
-use crate::controller::slots::turns::{InLine, Limits, Turn};
-use crate::kubernetes::objects::Job;
+use crate::controller::objects::{Wake, board_of, uid};
+use crate::controller::stores::Stores;
 use crate::lock::lock;
-use leaderboard_api::leaderboard::Counts;
-use leaderboard_api::{Leaderboard, Submission};
+use leaderboard_api::{Leaderboard, Submission, SubmissionStatus};
 use line::Line;
 use member::Member;
+pub use member::{check_team, mark};
+use turns::{InLine, Limits, Turn};
 
-/// Namespace and name of a Leaderboard: one that is deleted and made again has the same line.
-type Key = (String, String);
+/// Slots are worked out once in this time at most: an event must not cost a look at all of thousands that wait.
+const EVERY: Duration = Duration::from_millis(100);
 
 /// The lines of all Leaderboards.
-#[derive(Default)]
-pub struct SlotAllocator {
-    lines: Mutex<Lines>,
-    /// There may be somebody to wake.
+pub struct Slots {
+    stores: Stores,
+    wake: Wake<Submission>,
+    lines: Mutex<HashMap<ObjectRef<Leaderboard>, Line>>,
     changed: Notify,
 }
 
-#[derive(Default)]
-struct Lines {
-    /// The caches were taken in whole. Before, nobody knows which slots are free.
-    is_synced: bool,
-    by_board: HashMap<Key, Line>,
-    woken: Vec<ObjectRef<Submission>>,
-}
-
-impl SlotAllocator {
-    /// Takes in what the caches show when a process begins to lead. Before this no slot is granted.
-    pub fn start(&self, leaderboards: &[Arc<Leaderboard>], jobs: &[Arc<Job>], submissions: &[Arc<Submission>]) {
-        for object in leaderboards {
-            self.leaderboard(object, false);
+impl Slots {
+    /// `wake` is for those whose turn has changed.
+    pub fn new(stores: Stores, wake: Wake<Submission>) -> Self {
+        Self {
+            stores,
+            wake,
+            lines: Mutex::default(),
+            changed: Notify::new(),
         }
-        for object in jobs {
-            self.job(object, false);
-        }
-        for object in submissions {
-            self.submission(object, false);
-        }
-        lock(&self.lines).is_synced = true;
-        self.changed.notify_one();
     }
 
-    /// The watch shows a Leaderboard.
-    pub fn leaderboard(&self, object: &Leaderboard, is_gone: bool) {
-        self.change(&key_of(object), |line| {
-            line.set_limits((!is_gone).then(|| limits(object)));
-        });
-    }
-
-    /// The watch shows a Job. It has a slot although its Submission's status may not name it.
-    pub fn job(&self, object: &Job, is_gone: bool) {
-        let meta = &object.metadata;
-        let Some(board) = &meta.labels.leaderboard else {
+    /// Grants slots. Before the caches have listed all, nobody knows which are free.
+    pub async fn keep(&self) {
+        let (submissions, jobs) = (&self.stores.submissions, &self.stores.jobs);
+        if tokio::try_join!(submissions.wait_until_ready(), jobs.wait_until_ready()).is_err() {
+            // The task of a watch is gone, which ends the process.
             return;
-        };
-        let key = (meta.namespace().to_owned(), board.to_string());
-        // Ours is the first; somebody may have added another.
-        if let Some(owner) = meta.owner_references.first() {
-            self.change(&key, |line| line.job(&owner.uid, &meta.name, is_gone));
+        }
+        loop {
+            self.changed.notified().await;
+            let began = Instant::now();
+            self.allocate();
+            tokio::time::sleep(EVERY.max(began.elapsed())).await;
         }
     }
 
-    /// The watch shows a Submission. Returns whether the counts of its Leaderboard have changed.
-    pub fn submission(&self, object: &Submission, is_gone: bool) -> bool {
-        let uid = object.uid().unwrap_or_default();
-        self.change(&board_of(object), |line| {
-            line.member(&uid, (!is_gone).then(|| Member::of(object)))
-        })
+    /// Works out the lines that have changed.
+    fn allocate(&self) {
+        let jobs = self.stores.jobs.state();
+        // Ours is the first owner; somebody may have added another.
+        let owned = jobs
+            .iter()
+            .filter_map(|job| Some((&*job.metadata.owner_references.first()?.uid, &*job.metadata.name)));
+        let owned: HashSet<(&str, &str)> = owned.collect();
+        let mut lines = lock(&self.lines);
+        for (board, line) in lines.iter_mut().filter(|(_, line)| line.is_dirty) {
+            let Some(leaderboard) = self.stores.leaderboards.get(board) else {
+                continue;
+            };
+            let all = self.stores.submissions_for(board);
+            let members = all
+                .iter()
+                .map(|one| Member::of(one, |job| owned.contains(&(uid(&**one), job))));
+            for name in line.allocate(limits(&leaderboard), members) {
+                (self.wake)(ObjectRef::new(&name).within(board.namespace.as_deref().unwrap_or_default()));
+            }
+        }
+        lines.retain(|_, line| !line.is_empty());
     }
 
     /// Whether a submission without a Job may start now. Grants nothing.
     pub fn turn(&self, submission: &Submission, leaderboard: Option<&Leaderboard>) -> Turn {
-        let Some(leaderboard) = leaderboard else {
+        let Some(limits) = leaderboard.map(limits) else {
             return Turn::NotInLine;
         };
-        if limits(leaderboard) == Limits::default() {
+        // Between two Jobs it keeps its slot.
+        let has_slot = submission.status.as_ref().is_some_and(SubmissionStatus::has_slot);
+        if limits == Limits::default() || has_slot && (!limits.paused || submission.spec.check) {
             return Turn::Go;
         }
         let lines = lock(&self.lines);
-        let line = lines.by_board.get(&board_of(submission));
-        let uid = submission.metadata.uid.as_deref().unwrap_or_default();
-        line.map_or(Turn::NotInLine, |line| line.turn(uid, submission.present_attempt()))
+        let line = lines.get(&board_of(submission));
+        line.map_or(Turn::NotInLine, |line| {
+            line.turn(uid(submission), submission.present_attempt(), limits)
+        })
     }
 
     /// A submission waits for nothing but a slot. It is woken by the answer, and by each change of it.
     pub fn join(&self, submission: &Submission, place: InLine) {
-        let attempt = submission.present_attempt();
-        self.change(&board_of(submission), |line| line.join(attempt, place));
+        self.change(submission, |line| line.join(submission.present_attempt(), place));
     }
 
     /// The Job is about to be created, or exists.
     pub fn starts(&self, submission: &Submission) {
-        self.change(&board_of(submission), |line| line.starts(uid(submission)));
+        self.change(submission, |line| line.starts(uid(submission)));
     }
 
     /// It was to start, and that failed: a pause or a lower limit may take the slot back again.
     pub fn did_not_start(&self, submission: &Submission) {
-        self.change(&board_of(submission), |line| line.did_not_start(uid(submission)));
+        self.change(submission, |line| line.did_not_start(uid(submission)));
     }
 
-    /// It waits for something else, or has come to its end: its place and its reservation are free.
+    /// It waits for something else, has come to its end or is gone: its place and its reservation are free.
     pub fn leaves(&self, submission: &Submission) {
-        self.change(&board_of(submission), |line| line.leaves(uid(submission)));
+        self.change(submission, |line| line.leaves(uid(submission)));
     }
 
-    /// The Leaderboard stands otherwise: wakes those that may have waited for that.
-    pub fn wake_pending(&self, board: &ObjectRef<Leaderboard>) {
-        self.wake(board, Line::pending);
-    }
-
-    /// The Leaderboard's spec has changed: wakes all that have not ended.
-    pub fn wake_live(&self, board: &ObjectRef<Leaderboard>) {
-        self.wake(board, Line::live);
-    }
-
-    fn wake(&self, board: &ObjectRef<Leaderboard>, whom: fn(&Line) -> Vec<String>) {
-        let key = (board.namespace.clone().unwrap_or_default(), board.name.clone());
-        let mut lines = lock(&self.lines);
-        let names: Vec<String> = lines.by_board.get(&key).map(whom).unwrap_or_default();
-        lines
-            .woken
-            .extend(names.iter().map(|name| ObjectRef::new(name).within(&key.0)));
-        self.changed.notify_one();
-    }
-
-    /// How many Submissions of a Leaderboard there are by state, and how many still need it.
-    pub fn census(&self, leaderboard: &Leaderboard) -> (Counts, usize) {
-        let lines = lock(&self.lines);
-        lines
-            .by_board
-            .get(&key_of(leaderboard))
-            .map(Line::census)
-            .unwrap_or_default()
-    }
-
-    /// The submissions whose turn has changed, as they change. At most half of the time goes into it, so that a burst of
-    /// thousands that join is worked out together and not one by one.
-    pub fn woken(self: &Arc<Self>) -> impl Stream<Item = ObjectRef<Submission>> + Send + use<> {
-        let woken = stream::unfold((Arc::clone(self), Duration::ZERO), async |(slots, took)| {
-            if took > Duration::from_millis(1) {
-                tokio::time::sleep(took).await;
-            }
-            slots.changed.notified().await;
-            let began = Instant::now();
-            let woken = slots.allocate();
-            let took = began.elapsed();
-            Some((stream::iter(woken), (slots, took)))
-        });
-        woken.flatten()
-    }
-
-    /// Grants what is free. Returns those that have to know.
-    fn allocate(&self) -> Vec<ObjectRef<Submission>> {
-        let mut lines = lock(&self.lines);
-        let mut woken = std::mem::take(&mut lines.woken);
-        if !lines.is_synced {
-            return woken;
+    /// The caches show something else of a Leaderboard, of one of its Submissions or of their Jobs.
+    pub fn changed(&self, board: &ObjectRef<Leaderboard>) {
+        if let Some(line) = lock(&self.lines).get_mut(board) {
+            line.is_dirty = true;
+            self.changed.notify_one();
         }
-        for ((namespace, _), line) in lines.by_board.iter_mut().filter(|(_, line)| line.is_dirty) {
-            let names = line.allocate();
-            woken.extend(names.iter().map(|name| ObjectRef::new(name).within(namespace)));
-        }
-        woken
     }
 
-    fn change<T>(&self, key: &Key, change: impl FnOnce(&mut Line) -> T) -> T {
+    /// The Leaderboard stands otherwise: wakes all that have not ended. Each may have waited for that, and how long it may take has changed.
+    pub fn wake(&self, board: &ObjectRef<Leaderboard>) {
+        let all = self.stores.submissions_for(board);
+        for submission in all.iter().filter(|submission| !member::is_over(submission)) {
+            (self.wake)(ObjectRef::from_obj(submission.as_ref()));
+        }
+    }
+
+    fn change(&self, submission: &Submission, change: impl FnOnce(&mut Line)) {
         let mut lines = lock(&self.lines);
-        let line = lines.by_board.entry(key.clone()).or_default();
-        let result = change(line);
+        let board = board_of(submission);
+        let line = lines.entry(board.clone()).or_default();
+        change(line);
         if line.is_dirty {
             self.changed.notify_one();
         }
         if line.is_empty() {
-            lines.by_board.remove(key);
+            lines.remove(&board);
         }
-        result
     }
-}
-
-fn key_of(leaderboard: &Leaderboard) -> Key {
-    (leaderboard.namespace().unwrap_or_default(), leaderboard.name_any())
-}
-
-fn board_of(submission: &Submission) -> Key {
-    (
-        submission.namespace().unwrap_or_default(),
-        submission.spec.leaderboard_name.clone(),
-    )
 }
 
 fn limits(leaderboard: &Leaderboard) -> Limits {

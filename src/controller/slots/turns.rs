@@ -6,7 +6,7 @@
 //! then the older; those of one second stand in the order of their names. A check of the Leaderboard goes before all teams, and
 //! starts while the Leaderboard is paused; it takes a slot as any other.
 
-use std::collections::{BTreeMap, HashMap, VecDeque};
+use std::collections::{BTreeSet, HashMap, VecDeque};
 
 use jiff::Timestamp;
 use leaderboard_api::Eta;
@@ -80,7 +80,9 @@ type Rank<'a> = (bool, usize, usize, Option<Timestamp>, Timestamp, &'a str);
 
 /// The teams in line.
 struct Teams<'a> {
-    waiting: BTreeMap<&'a str, VecDeque<&'a InLine>>,
+    /// The next one first.
+    ranked: BTreeSet<Rank<'a>>,
+    waiting: HashMap<&'a str, VecDeque<&'a InLine>>,
     load: HashMap<&'a str, usize>,
     picked: HashMap<&'a str, usize>,
     picks: usize,
@@ -135,44 +137,41 @@ impl<'a> Teams<'a> {
         for team in &past.occupied {
             *load.entry(team).or_default() += 1;
         }
-        let mut waiting: BTreeMap<&str, VecDeque<&InLine>> = BTreeMap::new();
+        let mut waiting: HashMap<&str, VecDeque<&InLine>> = HashMap::new();
         for each in line {
             waiting.entry(&each.team).or_default().push_back(each);
         }
-        Self {
+        let mut teams = Self {
+            ranked: BTreeSet::new(),
             waiting,
             load,
             picked: HashMap::new(),
             picks: 0,
             served: &past.served,
-        }
+        };
+        teams.ranked = teams.waiting.keys().filter_map(|team| teams.rank(team)).collect();
+        teams
     }
 
     /// The next one, and how many of its team run or were picked before it.
     fn pick(&mut self) -> Option<(&'a InLine, usize)> {
-        // A set ordered by rank would save the scan; the number of teams in line is small.
-        let (.., team) = self
-            .waiting
-            .iter()
-            .filter_map(|(team, line)| self.rank(team, line))
-            .min()?;
-        let line = self.waiting.get_mut(team)?;
-        let pick = line.pop_front()?;
-        if line.is_empty() {
-            self.waiting.remove(team);
-        }
+        let (.., team) = self.ranked.pop_first()?;
+        let pick = self.waiting.get_mut(team)?.pop_front()?;
         self.picks += 1;
         self.picked.insert(team, self.picks);
         let load = self.load.entry(team).or_default();
         let running = *load;
         *load += 1;
+        // A pick changes the rank of no other team.
+        self.ranked.extend(self.rank(team));
         Some((pick, running))
     }
 
-    fn rank(&self, team: &'a str, line: &VecDeque<&InLine>) -> Option<Rank<'a>> {
+    /// None: nobody of it is in line.
+    fn rank(&self, team: &'a str) -> Option<Rank<'a>> {
         let load = self.load.get(team).copied().unwrap_or(0);
         let picked = self.picked.get(team).copied().unwrap_or(0);
-        let first = line.front()?;
+        let first = self.waiting.get(team)?.front()?;
         Some((
             !first.is_check,
             load,

@@ -22,7 +22,7 @@ use super::spans;
 use super::view::{LogPlace, View};
 use crate::controller::objects::{key_of, log_span_of, uid};
 use crate::controller::settings::Settings;
-use crate::controller::slots::SlotAllocator;
+use crate::controller::slots::Slots;
 use crate::controller::stores::Stores;
 use crate::controller::writes::{apply_status, patch_by, set_finalizer};
 use crate::kubernetes::objects::{Job, Meta, Pod};
@@ -45,7 +45,7 @@ pub struct Uses<'a> {
     pub stores: &'a Stores,
     pub memory: &'a Memory,
     pub workers: &'a Workers,
-    pub slots: &'a SlotAllocator,
+    pub slots: &'a Slots,
     pub external: &'a ExternalSystems,
     pub metrics: &'a Metrics,
     pub traces: &'a Traces,

@@ -20,5 +20,4 @@ pub mod report_digest;
 mod result_texts;
 pub mod rows;
 pub mod spans;
-pub mod team_use;
 pub mod view;

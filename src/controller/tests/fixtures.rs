@@ -25,12 +25,12 @@ use crate::controller::leaderboards::state::LeaderboardState;
 use crate::controller::objects::Wake;
 use crate::controller::runtime::context::Context;
 use crate::controller::settings::Settings;
+use crate::controller::slots::Slots;
 use crate::controller::stores::{Stores, owner_uid};
 use crate::controller::submissions::external::ExternalSystems;
 use crate::controller::submissions::memory::Memory;
 use crate::controller::submissions::observe::causes::Causes;
 use crate::controller::submissions::observe::workers::Workers;
-use crate::controller::submissions::team_use::Teams;
 use crate::kubernetes::objects::{Job, Owner, Pod};
 use crate::kubernetes::{Namespaces, Writer};
 use crate::kubernetes::{Store, Synced};
@@ -108,20 +108,17 @@ pub async fn surroundings(cluster: Cluster, endpoint: &str) -> Surroundings {
     let tasks = Tasks::new(stopped);
     let (answering, answered) = mpsc::unbounded_channel();
     let (waking, woken) = mpsc::unbounded_channel();
-    let teams = Teams::default();
-    for submission in &cluster.submissions {
-        teams.changed(None, Some(submission));
-    }
     let (looks, wanted) = mpsc::unbounded_channel();
+    let stores = stores(cluster);
+    let (turning, _) = mpsc::unbounded_channel();
     let context = Context {
         writer: Writer::new(client.clone(), || true),
         settings: settings(),
-        stores: stores(cluster),
+        slots: Arc::new(Slots::new(stores.clone(), noting(&turning))),
+        stores,
         memory: Memory::default(),
         workers: Workers::start(&aws, &client, &tasks, || noting(&answering)),
         causes: Causes::default(),
-        teams,
-        slots: Arc::default(),
         leaderboards: LeaderboardState::default(),
         looks,
         external: external(&aws, &tasks),
@@ -132,7 +129,6 @@ pub async fn surroundings(cluster: Cluster, endpoint: &str) -> Surroundings {
         client,
         aws,
     };
-    context.stores.fill(&context.slots);
     Surroundings {
         context,
         requests,
@@ -166,7 +162,8 @@ pub fn settings() -> Settings {
     }
 }
 
-fn stores(cluster: Cluster) -> Stores {
+/// Caches that show this; a test may change what they show.
+pub fn stores(cluster: Cluster) -> Stores {
     let policies_synced = Synced::default();
     policies_synced.set(true);
     Stores {

@@ -36,7 +36,6 @@ const BOARD: &str = "carla";
 /// Far longer than anything here takes.
 const LIMIT: Duration = Duration::from_mins(3);
 /// A controller that has written nothing during so long has nothing more to write. Nobody can wait for what does not come.
-/// It is longer than the controller waits with a Leaderboard's counts.
 const QUIET: Duration = Duration::from_secs(7);
 /// The audit log of the API server is read this often.
 const LOOK: Duration = Duration::from_millis(200);

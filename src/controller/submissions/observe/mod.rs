@@ -18,7 +18,7 @@ use super::external::ExternalSystems;
 use super::memory::Memory;
 use super::view::{NodeView, ObservedJob, PodView, View};
 use crate::controller::objects::uid;
-use crate::controller::slots::SlotAllocator;
+use crate::controller::slots::Slots;
 use crate::controller::stores::Stores;
 use crate::kubernetes::objects::Job;
 use causes::Causes;
@@ -31,7 +31,7 @@ pub struct Uses<'a> {
     pub stores: &'a Stores,
     pub memory: &'a Memory,
     pub workers: &'a Workers,
-    pub slots: &'a SlotAllocator,
+    pub slots: &'a Slots,
     pub causes: &'a Causes,
     pub external: &'a ExternalSystems,
 }
