@@ -9,7 +9,7 @@ use super::plan::{Action, EvalaiUpdate};
 use super::plan_builder::{PlanBuilder, after, seconds};
 use super::reading::{self, Reading};
 use super::record::{self, record_end, superseded};
-use super::{accept, log, retention, stop};
+use super::{accept, foreign, log, retention, stop};
 use crate::controller::submissions::view::{EvalaiEnd, EvalaiView, ObservedJob};
 use leaderboard_api::conditions::{self, Truth};
 use leaderboard_api::text::sentence;
@@ -170,8 +170,10 @@ fn publish(draft: &mut PlanBuilder<'_>, log_left: Option<Duration>) -> Delivery 
     let is_overtaken = is_evalais && is_overtaken(draft);
     // One that was deleted before its end is ended there all the same: EvalAI counts it against its team until then.
     let is_ours = draft.spec().evalai.is_some() && (is_overtaken || !is_of_another_phase(draft));
-    if !is_ours || (is_evalais && !is_overtaken) || draft.observes() {
-        draft.condition(conditions::PUBLISHED, Truth::False, reasons::NOT_REQUIRED, "");
+    let is_held = is_ours && foreign::is_held(draft);
+    if !is_ours || is_held || (is_evalais && !is_overtaken) || draft.observes() {
+        let message = if is_held { foreign::NOT_WRITTEN } else { "" };
+        draft.condition(conditions::PUBLISHED, Truth::False, reasons::NOT_REQUIRED, message);
         return Delivery::Done;
     }
     if draft.status.is_delivered(conditions::PUBLISHED) {

@@ -15,6 +15,9 @@ use leaderboard_api::{names, reasons};
 
 /// The reason of `workspace` for a prefix that holds results of something else.
 const PREFIX_IN_USE: &str = "PrefixInUse";
+/// Why an end of what was held back is written to no other system.
+pub(super) const NOT_WRITTEN: &str = "Nothing is written of this end, because another program may run the submission. If none does, \
+                                      cancel it in EvalAI.";
 /// How soon the Job of a submission that is held back is looked at again.
 const SOON: Duration = Duration::from_secs(15);
 
@@ -72,11 +75,9 @@ fn show_reading(draft: &mut PlanBuilder<'_>) {
 
 /// Another program ends its run in EvalAI first and in the row then: EvalAI decides by an answer that is newer than the row.
 fn awaits_evalai(draft: &mut PlanBuilder<'_>, answer: &Answered<Row>) -> bool {
-    let accepted = draft.status.condition(conditions::ACCEPTED);
-    let was_held = accepted.is_some_and(|c| c.reason == reasons::FOREIGN && c.status == "False");
     let read_at = draft.view.evalai.as_ref().and_then(|evalai| evalai.read_at);
     let sent = draft.now().checked_sub(answer.sent_ago).unwrap_or(draft.now());
-    if !was_held || read_at.is_some_and(|at| at >= sent) {
+    if !is_held(draft) || read_at.is_some_and(|at| at >= sent) {
         return false;
     }
     draft.keeps_status();
@@ -124,10 +125,15 @@ fn adoption() -> String {
     )
 }
 
+/// Whether the submission is held back, or was when it ended here: its row in EvalAI and in the table may be another program's.
+pub(super) fn is_held(draft: &PlanBuilder<'_>) -> bool {
+    let accepted = draft.status.condition(conditions::ACCEPTED);
+    accepted.is_some_and(|c| c.status == "False" && c.reason == reasons::FOREIGN)
+}
+
 /// Whether a Pod of the submission has found results of something else below the prefix, and nobody has handed it over since.
 fn is_held_by_prefix(draft: &PlanBuilder<'_>) -> bool {
-    let accepted = draft.status.condition(conditions::ACCEPTED);
-    draft.status.plan.is_some() && accepted.is_some_and(|c| c.status == "False" && c.reason == reasons::FOREIGN)
+    draft.status.plan.is_some() && is_held(draft)
 }
 
 /// The words of the Pod's `workspace`, if it has found results of something else below the prefix.

@@ -1,6 +1,7 @@
 //! The row of an end in the table, which follows EvalAI's word.
 
 use super::after::{Delivery, cannot_be_read, without_leaderboard};
+use super::foreign;
 use super::plan::{Action, TableUpdate};
 use super::plan_builder::PlanBuilder;
 use super::reading::{self, Reading};
@@ -60,6 +61,8 @@ pub(super) fn decide(draft: &mut PlanBuilder<'_>, is_shown: bool) -> Delivery {
 fn why_without_row(draft: &PlanBuilder<'_>) -> Option<String> {
     if draft.view.record.is_none() {
         Some(String::new())
+    } else if foreign::is_held(draft) {
+        Some(foreign::NOT_WRITTEN.to_owned())
     } else if draft.status.plan.is_none() {
         Some("The submission was never accepted, so the table has no row for it.".to_owned())
     } else if !has_row(draft) {

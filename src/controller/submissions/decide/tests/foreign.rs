@@ -9,7 +9,7 @@ use crate::controller::submissions::decide::{Action, Plan, SlotUse};
 use crate::controller::submissions::rows::{ForeignRun, Row};
 use crate::controller::submissions::view::{EvalaiInfo, JobEnd, Standing};
 use leaderboard_api::State::{Cancelled, Pending};
-use leaderboard_api::conditions::{ACCEPTED, STALLED};
+use leaderboard_api::conditions::{ACCEPTED, PUBLISHED, RECORDED, STALLED};
 use leaderboard_api::{Attempt, SubmissionStatus, names, reasons};
 
 /// The question of an attempt.
@@ -280,14 +280,30 @@ fn a_job_that_has_failed_by_a_prefix_in_use_is_held_back_too_and_a_higher_retry_
 }
 
 #[test]
-fn who_cancels_what_is_held_back_ends_it() {
-    for reason in [reasons::CANCELLED, reasons::ENDED_IN_EVALAI] {
-        let mut world = with_prefix_in_use(World::evalai().with_pod());
-        world.pass_to(Pending, reasons::FOREIGN);
-        world.job_gone();
-        world.pass_to(Pending, reasons::FOREIGN);
-        world.submission().spec.cancel = reason == reasons::CANCELLED;
-        world.in_evalai().cancelled = reason == reasons::ENDED_IN_EVALAI;
-        world.pass_to(Cancelled, reason);
+fn who_cancels_what_is_held_back_ends_it_and_nothing_is_written_of_it() {
+    for reason in [reasons::CANCELLED, reasons::DELETED, reasons::ENDED_IN_EVALAI] {
+        let mut held_by_prefix = with_prefix_in_use(World::evalai().with_pod());
+        held_by_prefix.pass_to(Pending, reasons::FOREIGN);
+        held_by_prefix.job_gone();
+        for mut world in [held(), held_by_prefix] {
+            world.pass_to(Pending, reasons::FOREIGN);
+            world.submission().spec.cancel = reason == reasons::CANCELLED;
+            world.in_evalai().cancelled = reason == reasons::ENDED_IN_EVALAI;
+            if reason == reasons::DELETED {
+                world.delete();
+            }
+            let plans = [world.pass_to(Cancelled, reason), world.pass()];
+            for plan in &plans {
+                assert!(writes_nothing(plan), "{reason}: {:?}", plan.actions);
+            }
+            for type_ in [PUBLISHED, RECORDED] {
+                let shown = condition(&plans[1], type_);
+                assert_eq!(
+                    shown,
+                    ("False".into(), reasons::NOT_REQUIRED.into()),
+                    "{reason} {type_}"
+                );
+            }
+        }
     }
 }
