@@ -201,13 +201,17 @@ fn publish(draft: &mut PlanBuilder<'_>, log_left: Option<Duration>) -> Delivery 
 /// Shows that EvalAI has cancelled a result that it had, as a host's re-run does. State, score and row stay.
 fn note_late_cancel(draft: &mut PlanBuilder<'_>) {
     let listed = draft.view.evalai.as_ref().and_then(|evalai| evalai.cancelled_as_of);
-    let published = draft.status.times.published.as_ref();
-    // The status has whole seconds. An older list shows what the result has replaced.
-    let is_later = listed
-        .zip(published)
-        .is_some_and(|(listed, published)| listed > after(published.0, 1));
-    if is_later && draft.is_successful() && draft.status.is_true(conditions::PUBLISHED) {
+    let (Some(listed), Some(published)) = (listed, draft.status.times.published.as_ref()) else {
+        return;
+    };
+    if !draft.is_successful() || !draft.status.is_true(conditions::PUBLISHED) {
+        return;
+    }
+    // The status has whole seconds. An older list shows what the result has replaced, and the next one wakes for no id a second time.
+    if listed > after(published.0, 1) {
         draft.condition(conditions::PUBLISHED, Truth::False, reasons::CANCELLED_IN_EVALAI, "");
+    } else {
+        draft.requeue_in(AGAIN);
     }
 }
 

@@ -328,6 +328,7 @@ fn a_result_that_evalai_cancels_later_is_shown_as_cancelled_there_and_stays() {
         "True",
         "the list may be older than the result"
     );
+    assert!(plan.requeue.is_some(), "the next list decides");
     world.in_evalai().cancelled_as_of = listed.checked_add(SignedDuration::from_secs(2)).ok();
     let plan = world.pass();
     assert_eq!(
