@@ -129,6 +129,9 @@ fn an_agent_that_is_killed_after_its_end_is_done_when_it_is_started_again() {
     first.kill_without_a_word();
     let mut second = agent(&pod, &[RUNS]);
     assert_eq!((second.code(), has_run(&pod)), (0, false), "{}", second.stderr());
-    assert_eq!(pod.files(AGENT), ["agent-1.done", "agent-1.start0"]);
+    // The kill may fall into the copy of the torn file, and leaves its temporary file.
+    let mut files = pod.files(AGENT);
+    files.retain(|name| !name.starts_with('.'));
+    assert_eq!(files, ["agent-1.done", "agent-1.start0"]);
     assert_eq!(fs::read_to_string(pod.checkpoint()).unwrap(), format!("{ENDED}\n"));
 }
