@@ -1,0 +1,31 @@
+# (file, definition) -> crate: what leaves its file before the file moves.
+S='src/controller/submissions/'; L='src/controller/leaderboards/'
+MOVES={}
+def mv(f,crate,*names):
+    for n in names: MOVES[(f,n)]=crate
+mv('src/services/mod.rs','base','ObjectKey')
+mv('src/pod/ownlog.rs','contract','OWN_LOG','WORKSPACE_LOG','CONTENTS_LOG')
+mv('src/pod/workspace.rs','contract','WorkspaceReason','WorkspaceVerdict','NotAVerdict','VERDICT_SCHEMA','VERDICT_BYTES')
+mv('src/services/aws.rs','contract','ENV_CHECKSUMS')
+mv(S+'pod_layout.rs','contract','LOGS_VOLUME','SHM_VOLUME')
+mv('src/services/table/read.rs','contract','ObservedRow')
+mv('src/pod/run.rs','evaluation','results_format')
+mv('src/pod/places.rs','evaluation','Pace')
+mv('src/pod/upload.rs','evaluation','Object')
+mv(S+'pod_layout.rs','evaluation','CARLA_ROOT','SCENARIO_RUNNER_ROOT','LEADERBOARD_ROOT','python_path')
+mv('crates/runner/src/graphics.rs','protocol','ADAPTER','INDEX','Needs','NotANeed')
+mv('src/controller/objects.rs','pod-spec','child_of','owner_reference')
+mv('src/services/token.rs','root','TokenSource','entry')
+mv('src/services/token.rs','aws','secret_text','reason')
+mv(L+'claims.rs','policy','Claims')
+mv(L+'reach.rs','policy','Unreachable')
+mv(L+'standing.rs','policy','EvalaiStanding')
+mv(L+'state.rs','policy','Policy')
+mv(L+'isolation.rs','policy','condition','shown')
+mv('src/bridge/ingest.rs','policy','Outcome')
+mv(S+'foreign_runs.rs','policy','AGAIN','Looked','ObservedTraces','Question','StoredRun','Traces','Unread','question','ForeignRun','Row')
+mv(S+'rows.rs','policy','AGAIN','ForeignRun','Row','UNDER_WAY')
+mv(S+'other_results.rs','policy','Answer','ObservedRoutes','Question','Routes')
+mv(S+'questions.rs','policy','Question','Observed')
+mv('src/ask/mod.rs','policy','Ask','Failure','Lookup','Answered')
+mv('src/ask/service.rs','policy','Service')
