@@ -24,7 +24,7 @@ use serde_json::json;
 use tokio::time::timeout;
 
 use super::bridge::{LIMIT, StandIn};
-use super::scale::player::{Player, Props, ROUTES};
+use super::scale::player::ROUTES;
 use super::world::{HOST, NODE, PARTICIPANT, ROUTE, World, ago, running};
 
 #[tokio::test(flavor = "multi_thread", worker_threads = 2)]
@@ -96,15 +96,7 @@ async fn a_result_that_a_hosts_rerun_cancels_in_evalai_is_shown_so() {
 /// A submission whose result EvalAI has.
 async fn finishes(world: &World) -> (u64, String) {
     let (pk, name) = world.submit("lb", 1).await;
-    let seed = &evalai_stand_in::Config::in_memory().unwrap().0.seed;
-    let player = Player::start(Props {
-        client: world.client.clone(),
-        namespace: world.namespace.clone(),
-        s3: world.aws.aws.s3(None, Some(&world.aws.endpoint)),
-        bucket: world.bucket.clone(),
-        period: Duration::from_millis(500),
-        labels: seed.challenges[0].phases[0].splits[0].schema.labels.clone(),
-    });
+    let player = world.play(Duration::from_millis(500));
     let runs = |status: &SubmissionStatus| status.progress.as_ref().is_some_and(|progress| progress.done > 0);
     world.until(&name, "a route is done", runs).await;
     player.fall_the_curtain();

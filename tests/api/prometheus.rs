@@ -10,7 +10,6 @@ use std::net::SocketAddr;
 use std::path::Path;
 use std::time::Duration;
 
-use evalai_stand_in::Config;
 use leaderboard_api::{State, SubmissionStatus, conditions, names};
 use serde_json::{Value, json};
 use tokio::process::Child;
@@ -18,7 +17,7 @@ use tokio::process::Child;
 use super::boards::make_table;
 use super::bridge::eventually;
 use super::process::operator;
-use super::scale::player::{Player, Props, ROUTES};
+use super::scale::player::ROUTES;
 use super::world::World;
 use crate::support::apiserver;
 use crate::support::tools::loopback;
@@ -140,15 +139,7 @@ async fn live(world: &World, queue: &str) {
         json!({"challenge_pk": "1", "phase_pk": "1", "submission_pk": pk, "submitted_image_uri": "r/team-a:1"});
     world.aws.send(queue, &message.to_string()).await;
     let name = names::submission(i64::try_from(pk).unwrap());
-    let (config, _) = Config::in_memory().unwrap();
-    let player = Player::start(Props {
-        client: world.client.clone(),
-        namespace: world.namespace.clone(),
-        s3: world.aws.aws.s3(None, Some(&world.aws.endpoint)),
-        bucket: world.bucket.clone(),
-        period: Duration::from_secs(1),
-        labels: config.seed.challenges[0].phases[0].splits[0].schema.labels.clone(),
-    });
+    let player = world.play(Duration::from_secs(1));
     let runs = |status: &SubmissionStatus| status.state == Some(State::Running);
     world.until(&name, "it runs", runs).await;
     player.fall_the_curtain();

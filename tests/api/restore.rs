@@ -22,8 +22,8 @@ use serde::de::DeserializeOwned;
 use serde_json::{Value, json};
 
 use super::boards::make_table;
-use super::scale::player::{Player, Props, ROUTES};
-use super::world::{World, running};
+use super::scale::player::ROUTES;
+use super::world::{World, labels, running};
 use crate::support::apiserver::server;
 
 /// Routes that what still runs has done.
@@ -175,18 +175,7 @@ async fn local_submission(world: &World, name: &str) {
 
 /// Plays both runs to a good end.
 async fn finish(world: &World, names: [&str; 2]) {
-    let labels = evalai_stand_in::Config::in_memory().unwrap().0.seed.challenges[0].phases[0].splits[0]
-        .schema
-        .labels
-        .clone();
-    let player = Player::start(Props {
-        client: world.client.clone(),
-        namespace: world.namespace.clone(),
-        s3: world.aws.aws.s3(None, Some(&world.aws.endpoint)),
-        bucket: world.bucket.clone(),
-        period: Duration::from_millis(500),
-        labels,
-    });
+    let player = world.play(Duration::from_millis(500));
     let runs = |status: &SubmissionStatus| status.progress.as_ref().is_some_and(|progress| progress.done > 0);
     for name in names {
         world.until(name, "a route is done", runs).await;
@@ -224,12 +213,8 @@ async fn report(world: &World, run: &str, name: &str, done: u32) {
             )
         ))
         .await;
-    let labels = evalai_stand_in::Config::in_memory().unwrap().0.seed.challenges[0].phases[0].splits[0]
-        .schema
-        .labels
-        .clone();
     let score = f64::from(done) * 100.0 / f64::from(ROUTES);
-    let accuracies: BTreeMap<_, _> = labels.iter().map(|label| (label.clone(), score)).collect();
+    let accuracies: BTreeMap<_, _> = labels().into_iter().map(|label| (label, score)).collect();
     let is_final = done == ROUTES;
     let report = Report {
         schema: SCHEMA,

@@ -3,6 +3,7 @@
 #![cfg(test)]
 
 use std::sync::Arc;
+use std::time::Duration;
 
 use evalai_stand_in::model::{FileState, User};
 use evalai_stand_in::submissions::{NewSubmission, create, rerun};
@@ -32,6 +33,7 @@ use tokio::time::timeout;
 
 use super::bridge::{LIMIT, StandIn};
 use super::objects::merge;
+use super::scale::player::{Player, Props};
 use crate::support::apiserver;
 
 /// A line of the routes file.
@@ -40,6 +42,12 @@ pub(super) const ROUTE: &str = r#"<waypoint x="4711.25" y="-815.5" z="1.0"/>"#;
 pub(super) const NODE: &str = "node-of-failures";
 pub(super) const HOST: &str = "local-host-token";
 pub(super) const PARTICIPANT: &str = "local-team-a-token";
+
+/// Metrics of a result in the first challenge of the stand-in.
+pub(super) fn labels() -> Vec<String> {
+    let (config, _) = Config::in_memory().unwrap();
+    config.seed.challenges[0].phases[0].splits[0].schema.labels.clone()
+}
 
 /// The whole controller between a real API server and both stand-ins.
 pub(super) struct World {
@@ -106,6 +114,18 @@ impl World {
         K::DynamicType: Default,
     {
         Api::namespaced(self.client.clone(), &self.namespace)
+    }
+
+    /// Plays the rest of the cluster, with so long between two reports.
+    pub(super) fn play(&self, period: Duration) -> Player {
+        Player::start(Props {
+            client: self.client.clone(),
+            namespace: self.namespace.clone(),
+            s3: self.aws.aws.s3(None, Some(&self.aws.endpoint)),
+            bucket: self.bucket.clone(),
+            period,
+            labels: labels(),
+        })
     }
 
     /// Starts a controller that stops when the sender goes.
