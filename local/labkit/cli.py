@@ -88,6 +88,11 @@ def parser() -> argparse.ArgumentParser:
     one_file = commands.add_parser("install-yaml", help="print one file that installs the operator without Helm")
     one_file.add_argument("more", nargs="*", metavar="ARGUMENT", help="for `helm template`: -- --set a=b")
     commands.add_parser("version", help="print the version of programs and chart; fails where they differ")
+    account = commands.add_parser(
+        "owner",
+        help="write the account on GitHub that publishes the project, wherever it stands; prints the changed files",
+    )
+    account.add_argument("name", metavar="NAME")
     manifest = commands.add_parser("krew-manifest", help="print the manifest by which krew installs the plugin")
     manifest.add_argument("base", metavar="URL", help="the folder from which the archives are downloaded")
     manifest.add_argument("archives", nargs="+", type=Path, metavar="ARCHIVE", help="the plugin for each machine")
@@ -164,6 +169,8 @@ def run(settings: Settings, arguments: argparse.Namespace) -> int:
             print(chartrender.one_file(helm, chartrender.folder(settings.repository), arguments.more), end="")
         case "version":
             print(release.version(settings.repository))
+        case "owner":
+            print("\n".join(release.set_owner(settings.repository, arguments.name)))
         case "krew-manifest":
             print(release.krew_manifest(settings.repository, arguments.base, arguments.archives))
         case "image":

@@ -3,6 +3,7 @@
 import hashlib
 import json
 import re
+import subprocess
 import tomllib
 from collections.abc import Mapping, Sequence
 from pathlib import Path
@@ -39,6 +40,42 @@ def version(repository: Path) -> str:
 
 def shares(member: Path) -> bool:
     return bool(tomllib.loads((member / "Cargo.toml").read_text())["package"]["version"] == {"workspace": True})
+
+
+def owner(repository: Path) -> str:
+    """The account on GitHub whose repository and registry the project is published in."""
+    cargo = tomllib.loads((repository / "Cargo.toml").read_text())
+    found = re.fullmatch(
+        r"https://github\.com/([\w.-]+)/leaderboard-operator", cargo["workspace"]["package"]["repository"]
+    )
+    if found is None:
+        raise LabError("Cargo.toml: repository is not https://github.com/OWNER/leaderboard-operator")
+    return found[1]
+
+
+def owned(name: str) -> re.Pattern[str]:
+    """Where an account stands in a text: in an image, an address, the name of a team or of the repository."""
+    own = re.escape(name)
+    return re.compile(rf"(?<=ghcr\.io/){own}(?=[/#`])|(?:(?<=github\.com/)|(?<=[@ ])){own}(?=/leaderboard-operator)")
+
+
+def set_owner(repository: Path, name: str) -> list[str]:
+    """Writes another account wherever the present one stands; returns the files that it has changed."""
+    if not re.fullmatch(r"[A-Za-z0-9](?:-?[A-Za-z0-9])*", name):
+        raise LabError(f"{name} is no account of GitHub: it has letters, digits and single hyphens")
+    pattern, changed = owned(owner(repository)), []
+    files = subprocess.run(["git", "ls-files", "-z"], cwd=repository, check=True, capture_output=True, text=True)
+    for file in filter(None, files.stdout.split("\0")):
+        path = repository / file
+        if path.is_symlink() or not path.is_file() or b"\0" in (content := path.read_bytes()):
+            continue
+        text = content.decode(errors="surrogateescape")
+        # An image's name is in lower case.
+        new = pattern.sub(lambda at: name.lower() if at.string[: at.start()].endswith("ghcr.io/") else name, text)
+        if new != text:
+            path.write_bytes(new.encode(errors="surrogateescape"))
+            changed.append(file)
+    return changed
 
 
 def archive(release: str, platform: str) -> str:

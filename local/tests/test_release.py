@@ -1,6 +1,7 @@
 """The version in its three places, and the manifest of krew."""
 
 import re
+import subprocess
 import tempfile
 import tomllib
 import unittest
@@ -41,6 +42,52 @@ class Version(unittest.TestCase):
                 release.version(repository(folder, chart, member))
         with tempfile.TemporaryDirectory() as folder:
             self.assertEqual(release.version(repository(folder, same)), "1.2.3")
+
+
+class Owner(unittest.TestCase):
+    """The account that publishes the project stands in one place, Cargo.toml, and one command writes it elsewhere."""
+
+    def test_no_file_names_another_account(self) -> None:
+        own = {release.owner(REPOSITORY), "${OWNER,,}", "$GITHUB_REPOSITORY"}
+        files = subprocess.run(["git", "ls-files", "-z"], cwd=REPOSITORY, check=True, capture_output=True, text=True)
+        found = {}
+        for file in filter(None, files.stdout.split("\0")):
+            if file == "local/tests/test_release.py":
+                continue
+            text = (REPOSITORY / file).read_text(errors="replace") if (REPOSITORY / file).is_file() else ""
+            names = re.findall(
+                r"github\.com/([\w.$-]+)/leaderboard-operator|ghcr\.io/([\w${},.-]+)/(?:leaderboard|chart|challenge|stand)",
+                text,
+            )
+            if names:
+                found[file] = {"".join(name) for name in names}
+        self.assertGreater(len(found), 5)
+        self.assertEqual({file: names - own for file, names in found.items() if names - own}, {})
+
+    def test_the_command_changes_every_place(self) -> None:
+        with tempfile.TemporaryDirectory() as folder:
+            root = Path(folder)
+            subprocess.run(["git", "init", "--quiet", folder], check=True)
+            (root / "Cargo.toml").write_text(
+                '[workspace.package]\nrepository = "https://github.com/OWNER/leaderboard-operator"\n'
+            )
+            (root / "a.md").write_text(
+                "ghcr.io/OWNER/charts `ghcr.io/OWNER` --repo OWNER/leaderboard-operator @OWNER/leaderboard-operator-x\nOWNER_KEY\n"
+            )
+            (root / "b.md").write_text("const OWNER: &str;\n")
+            subprocess.run(["git", "-C", folder, "add", "--all"], check=True)
+            self.assertEqual(release.set_owner(root, "Acme-AI"), ["Cargo.toml", "a.md"])
+            self.assertEqual(release.owner(root), "Acme-AI")
+            self.assertEqual(
+                (root / "a.md").read_text(),
+                "ghcr.io/acme-ai/charts `ghcr.io/acme-ai` --repo Acme-AI/leaderboard-operator"
+                " @Acme-AI/leaderboard-operator-x\nOWNER_KEY\n",
+            )
+
+    def test_a_name_that_is_none_is_refused(self) -> None:
+        for name in ("", "-a", "a/b", "a b", "a--b"):
+            with self.subTest(name), self.assertRaisesRegex(LabError, "no account"):
+                release.set_owner(REPOSITORY, name)
 
 
 class Krew(unittest.TestCase):
