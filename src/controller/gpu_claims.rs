@@ -1,4 +1,4 @@
-//! The ResourceClaimTemplate of a Leaderboard whose pairs claim their GPU. Pure; the reconcile of the Leaderboard applies it, and its
+//! The ResourceClaimTemplate of a Leaderboard whose workers claim their GPU. Pure; the reconcile of the Leaderboard applies it, and its
 //! Jobs name it.
 //!
 //! Its name holds the hash of what it asks for: a template cannot be edited under the Jobs that are running.
@@ -20,7 +20,7 @@ pub fn resource() -> ApiResource {
     ApiResource::from_gvk(&GroupVersionKind::gvk("resource.k8s.io", "v1", "ResourceClaimTemplate"))
 }
 
-/// What gives the pairs of a Leaderboard their GPUs.
+/// What gives the workers of a Leaderboard their GPUs.
 pub fn source(spec: &LeaderboardSpec) -> GpuSource<'_> {
     spec.gpu.as_ref().map_or(GpuSource::None, leaderboard_api::Gpu::source)
 }

@@ -69,7 +69,7 @@ impl PairSeen {
     fn read(status: &std::path::Path, pair: Pair) -> Self {
         Self {
             agent: Progress::read(status, pair.agent()),
-            simulator: Progress::read(status, pair.simulator()),
+            simulator: Progress::read(status, pair.host()),
         }
     }
 

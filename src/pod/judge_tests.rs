@@ -177,7 +177,7 @@ pub(super) mod seen_on_a_volume {
         assert!(text(&gathered, "evalai/stdout.txt").starts_with("Initializing"));
         assert!(!gathered.objects.contains_key(MERGED));
 
-        put_status(volume.folder.path(), Side::Simulator, 1, Mark::Start(0));
+        put_status(volume.folder.path(), Side::Host, 1, Mark::Start(0));
         put_checkpoint(volume.folder.path(), 1, &checkpoint(0, 1, 2));
         let (gathered, seen) = volume.round();
         assert_eq!(
@@ -407,9 +407,9 @@ pub(super) mod seen_on_a_volume {
         let mut volume = Volume::new();
         let folder = volume.folder.path().to_owned();
         for (side, mark) in [
-            (Side::Simulator, Mark::Start(0)),
-            (Side::Simulator, Mark::Crash(0)),
-            (Side::Simulator, Mark::Crash(1)),
+            (Side::Host, Mark::Start(0)),
+            (Side::Host, Mark::Crash(0)),
+            (Side::Host, Mark::Crash(1)),
             (Side::Agent, Mark::Crash(0)),
         ] {
             put_status(&folder, side, 1, mark);

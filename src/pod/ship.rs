@@ -91,7 +91,7 @@ impl Shipper {
         a_day: u64,
     ) -> Self {
         let agents = Pair::first(pairs).map(|pair| (agent_log(pair), format!("{run_id}/{}", pair.agent())));
-        let simulators = Pair::first(pairs).map(|pair| (console(pair), format!("{run_id}/{}", pair.simulator())));
+        let simulators = Pair::first(pairs).map(|pair| (console(pair), format!("{run_id}/{}", pair.host())));
         let streams: BTreeMap<String, String> = agents
             .chain(simulators)
             .chain([

@@ -176,8 +176,8 @@ impl Run<'_> {
         let hit = match kill.kind {
             Kind::Agent => self.kubelet.kill_command(kill.of(Side::Agent)),
             Kind::AgentContainer => self.kubelet.kill(Name::Of(kill.of(Side::Agent))).await,
-            Kind::Simulator => self.kubelet.kill_command(kill.of(Side::Simulator)),
-            Kind::SimulatorContainer => self.kubelet.kill(Name::Of(kill.of(Side::Simulator))).await,
+            Kind::Simulator => self.kubelet.kill_command(kill.of(Side::Host)),
+            Kind::SimulatorContainer => self.kubelet.kill(Name::Of(kill.of(Side::Host))).await,
             Kind::Logcopy => self.kubelet.kill(Name::Logcopy).await,
             Kind::PodLost | Kind::PodEvicted => {
                 self.lose_pod(kill).await?;

@@ -38,7 +38,7 @@ impl std::fmt::Display for Name {
 pub fn members() -> impl Iterator<Item = Member> {
     (1..=PAIRS)
         .filter_map(Pair::new)
-        .flat_map(|pair| [Side::Simulator, Side::Agent].map(|side| Member { side, pair }))
+        .flat_map(|pair| [Side::Host, Side::Agent].map(|side| Member { side, pair }))
 }
 
 /// Whether all agents report that they are done.
@@ -160,7 +160,7 @@ impl<'a> Kubelet<'a> {
     fn mount(&self, member: Member) {
         let status = self.places().status().join(member.to_string());
         let own = match member.side {
-            Side::Simulator => self.path("simulator"),
+            Side::Host => self.path("simulator"),
             Side::Agent => self.path(&format!("agent/agent{}", member.pair)),
         };
         for folder in [status, own] {
@@ -333,7 +333,7 @@ impl<'a> Kubelet<'a> {
     /// Routes that were begun on each pair's simulators, in their order. A simulator writes its log itself, so that no line is
     /// lost with a runner.
     pub fn begun(&self) -> Vec<Vec<String>> {
-        let simulators = members().filter(|member| member.side == Side::Simulator);
+        let simulators = members().filter(|member| member.side == Side::Host);
         simulators.map(|member| begun(&self.log(Name::Of(member)))).collect()
     }
 

@@ -81,10 +81,10 @@ async fn all_crash(kubelet: &mut Kubelet<'_>) {
         let members = members().filter(move |member| member.side == side);
         members.map(move |member| StatusFile::Of(member, mark))
     };
-    for file in of(Side::Simulator, Mark::Start(0)) {
+    for file in of(Side::Host, Mark::Start(0)) {
         kubelet.until_has(file).await;
     }
-    let simulators: Vec<Name> = members().filter(|m| m.side == Side::Simulator).map(Name::Of).collect();
+    let simulators: Vec<Name> = members().filter(|m| m.side == Side::Host).map(Name::Of).collect();
     for name in &simulators {
         kubelet.signal(*name, Signal::SIGSTOP);
     }

@@ -114,7 +114,7 @@ impl Submission {
             .env_remove("RESUME")
             .env_remove("CHALLENGE_FORMAT");
         match member.side {
-            Side::Simulator => self.simulator(&mut command, member, &places),
+            Side::Host => self.simulator(&mut command, member, &places),
             Side::Agent => self.agent(&mut command, member, &places),
         }
         command

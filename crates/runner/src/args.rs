@@ -96,7 +96,7 @@ pub enum Role {
 impl Job {
     pub fn member(&self) -> Member {
         let side = match self.role {
-            Role::Simulator { .. } => Side::Simulator,
+            Role::Simulator { .. } => Side::Host,
             Role::Agent { .. } => Side::Agent,
         };
         Member { side, pair: self.pair }
@@ -155,7 +155,7 @@ pub fn parse(arguments: impl IntoIterator<Item = OsString>) -> Result<Request, U
     let side = match first.to_str() {
         Some("--version" | "-V") => return Ok(Request::Version),
         Some("--help" | "-h" | "help") => return Ok(Request::Help),
-        Some("simulator") => Side::Simulator,
+        Some("simulator") => Side::Host,
         Some("agent") => Side::Agent,
         Some("keep") => return keep(arguments).map(Request::Keep),
         _ => return Err(UsageError::Subcommand(first)),
@@ -200,7 +200,7 @@ fn keep(mut arguments: impl Iterator<Item = OsString>) -> Result<Kept, UsageErro
 
 fn role(side: Side, options: &mut Options) -> Result<Role, UsageError> {
     Ok(match side {
-        Side::Simulator => Role::Simulator {
+        Side::Host => Role::Simulator {
             port: options
                 .required::<std::num::NonZeroU16>("--port", "a port from 1 to 65535")?
                 .get(),

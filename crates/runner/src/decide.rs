@@ -125,7 +125,7 @@ pub(crate) fn next(side: Side, phase: Phase, seen: &Seen) -> Action {
     match (side, phase) {
         (_, Phase::Opening) => opening(side, seen),
         (_, Phase::Booting) => booting(seen),
-        (Side::Simulator, Phase::Running) => simulator_running(seen),
+        (Side::Host, Phase::Running) => simulator_running(seen),
         (Side::Agent, Phase::Running) => agent_running(seen),
     }
 }
@@ -134,7 +134,7 @@ fn opening(side: Side, seen: &Seen) -> Action {
     if seen.own_done {
         return Action::End(Cause::AlreadyDone);
     }
-    if side == Side::Simulator && seen.peer_done {
+    if side == Side::Host && seen.peer_done {
         return Action::End(Cause::PeerDone);
     }
     if seen.own_started {
@@ -147,7 +147,7 @@ fn opening(side: Side, seen: &Seen) -> Action {
         return Action::Skip(Skip::CatchUp);
     }
     match side {
-        Side::Simulator => Action::Launch,
+        Side::Host => Action::Launch,
         Side::Agent if seen.peer_started => Action::Launch,
         Side::Agent if seen.overdue => Action::End(Cause::NotReady),
         Side::Agent => Action::Wait,
@@ -257,7 +257,7 @@ const SIMULATOR_DONE: Conclusion = Conclusion {
 /// What the end means, once every process has ended. `complete`: the agent's checkpoint has its global record, or all its routes.
 pub(crate) fn conclude(side: Side, cause: Cause, complete: bool, seen: &Seen) -> Conclusion {
     let silent = |hold, code| Conclusion { mark: None, hold, code };
-    let hold = |hold| if side == Side::Simulator { hold } else { Hold::Free };
+    let hold = |hold| if side == Side::Host { hold } else { Hold::Free };
     match cause {
         Cause::Terminated => silent(Hold::Free, CODE_TERMINATED),
         Cause::Mute => silent(Hold::Free, CODE_MUTE),
@@ -283,7 +283,7 @@ pub(crate) fn conclude(side: Side, cause: Cause, complete: bool, seen: &Seen) ->
                 cause,
                 Cause::NotReady | Cause::CannotStart(_) | Cause::NodeRefused | Cause::NoProcess
             );
-            if side == Side::Simulator && seen.peer_done {
+            if side == Side::Host && seen.peer_done {
                 SIMULATOR_DONE
             } else if side == Side::Agent && ran && complete {
                 Conclusion {
@@ -332,10 +332,10 @@ pub(crate) fn leave(side: Side, conclusion: Conclusion, seen: &Seen, over: bool)
         code: CODE_OVER,
     };
     match (hold, side) {
-        (Hold::Peer, Side::Simulator) if seen.peer_done => Leave::Hold(SIMULATOR_DONE),
+        (Hold::Peer, Side::Host) if seen.peer_done => Leave::Hold(SIMULATOR_DONE),
         // Exit 0, since after another code the container would be restarted for nothing.
         (Hold::Peer, _) if seen.stored => Leave::Exit(CODE_OVER),
-        (Hold::Peer, Side::Simulator) if seen.cancel => Leave::Hold(cancelled),
+        (Hold::Peer, Side::Host) if seen.cancel => Leave::Hold(cancelled),
         (Hold::Peer, Side::Agent) if seen.cancel => Leave::Exit(CODE_OVER),
         (Hold::Peer, _) => exit_or_wait(seen.peer_crashed || seen.peer_done || over, code),
         (Hold::Flush, _) if seen.cancel && !seen.stored && !over => Leave::Hold(cancelled),

@@ -60,13 +60,13 @@ impl Pair {
         usize::from(self.0).saturating_sub(1)
     }
 
-    /// Its simulator's container.
-    pub const fn simulator(self) -> Member {
-        let side = Side::Simulator;
+    /// The container with the host's image.
+    pub const fn host(self) -> Member {
+        let side = Side::Host;
         Member { side, pair: self }
     }
 
-    /// Its agent's container.
+    /// The container with the participant's image.
     pub const fn agent(self) -> Member {
         let side = Side::Agent;
         Member { side, pair: self }
@@ -93,9 +93,9 @@ impl FromStr for Pair {
 /// The two containers of a pair.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, PartialOrd, Ord, Hash)]
 pub enum Side {
-    /// Runs the simulator's server.
-    Simulator,
-    /// Runs the participant's agent.
+    /// Runs the host's image, such as a simulator's server.
+    Host,
+    /// Runs the participant's image.
     Agent,
 }
 
@@ -104,15 +104,15 @@ impl Side {
     #[must_use]
     pub const fn peer(self) -> Self {
         match self {
-            Self::Simulator => Self::Agent,
-            Self::Agent => Self::Simulator,
+            Self::Host => Self::Agent,
+            Self::Agent => Self::Host,
         }
     }
 
     /// `simulator` or `agent`, as in container and file names.
     pub const fn name(self) -> &'static str {
         match self {
-            Self::Simulator => "simulator",
+            Self::Host => "simulator",
             Self::Agent => "agent",
         }
     }
@@ -146,7 +146,7 @@ impl Member {
     /// Parses `simulator-<n>` or `agent-<n>`.
     pub fn parse(text: &str) -> Option<Self> {
         let (side, pair) = text.split_once('-')?;
-        let side = [Side::Simulator, Side::Agent]
+        let side = [Side::Host, Side::Agent]
             .into_iter()
             .find(|known| known.name() == side)?;
         Some(Self {
@@ -286,7 +286,7 @@ impl Progress {
 /// All status files that are there for the pairs 1 to `pairs`, for a reader that reports or stores them. A member's files
 /// beyond the first round it has not crashed in are left out.
 pub fn present(root: &Path, pairs: u16) -> Vec<StatusFile> {
-    let members = Pair::first(pairs.into()).flat_map(|pair| [pair.simulator(), pair.agent()]);
+    let members = Pair::first(pairs.into()).flat_map(|pair| [pair.host(), pair.agent()]);
     let mut files = Vec::new();
     for member in members {
         let crashes = Progress::read(root, member).crashes;
@@ -327,7 +327,7 @@ mod tests {
     #[test]
     fn every_file_is_read_back_from_its_folder_and_name() {
         let agent = member(Side::Agent, 12);
-        let simulator = member(Side::Simulator, 1);
+        let simulator = member(Side::Host, 1);
         let cases = [
             (
                 StatusFile::Of(simulator, Mark::Start(0)),
@@ -407,7 +407,7 @@ mod tests {
     fn creating_twice_is_fine_and_present_lists_what_is_valid() {
         let root = tempfile::tempdir().unwrap();
         let files = [
-            StatusFile::Of(member(Side::Simulator, 1), Mark::Start(0)),
+            StatusFile::Of(member(Side::Host, 1), Mark::Start(0)),
             StatusFile::Of(member(Side::Agent, 1), Mark::Crash(0)),
             StatusFile::Of(member(Side::Agent, 1), Mark::Start(1)),
             StatusFile::Of(member(Side::Agent, 2), Mark::Done),

@@ -89,7 +89,7 @@ const fn what(end: &End<'_>) -> What {
 }
 
 fn reason(end: &End<'_>) -> String {
-    let of = |simulator: &str, agent: &str| if end.side == Side::Simulator { simulator } else { agent }.to_owned();
+    let of = |simulator: &str, agent: &str| if end.side == Side::Host { simulator } else { agent }.to_owned();
     match end.cause {
         Cause::Terminated => "the container was ended from outside".to_owned(),
         Cause::AlreadyDone => "the pair was done before this container began".to_owned(),
@@ -221,7 +221,7 @@ mod tests {
             ),
             (
                 End {
-                    side: Side::Simulator,
+                    side: Side::Host,
                     cause: Cause::NotReady,
                     ..END
                 },

@@ -196,7 +196,7 @@ impl Runner {
     /// Until the server, or the agent's simulator, is late. An agent grants its simulator the time to say so first.
     fn ready_left(&self) -> Option<Duration> {
         let limit = match (self.me.side, self.phase) {
-            (Side::Simulator, Phase::Booting) => self.job.ready,
+            (Side::Host, Phase::Booting) => self.job.ready,
             (Side::Agent, Phase::Opening) => self.job.ready + self.job.peer,
             _ => return None,
         };
@@ -275,7 +275,7 @@ impl Runner {
     /// Nobody crashes so often: an agent has made the files itself, and its simulator must not answer for it.
     fn too_many_crashes(&mut self) -> Cause {
         let of_peer = StatusFile::Of(self.me.peer(), Mark::Crash(MAX_ROUNDS - 1));
-        if self.me.side == Side::Simulator && of_peer.exists(&self.job.status) {
+        if self.me.side == Side::Host && of_peer.exists(&self.job.status) {
             return Cause::PeerCrashed;
         }
         self.mute("the status folder holds more crashes than can be counted".to_owned())

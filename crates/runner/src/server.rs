@@ -169,7 +169,7 @@ fn holds(pid: u32, sockets: &HashSet<&str>) -> bool {
 /// Whether an agent of this Pod may have begun: not before a simulator was ready. Until then a taken port is no agent's doing.
 pub(crate) fn may_agents_run(status: &Path) -> bool {
     let is_ready =
-        |file: &StatusFile| matches!(file, StatusFile::Of(member, Mark::Start(_)) if member.side == Side::Simulator);
+        |file: &StatusFile| matches!(file, StatusFile::Of(member, Mark::Start(_)) if member.side == Side::Host);
     protocol::present(status, Pair::MAX).iter().any(is_ready)
 }
 

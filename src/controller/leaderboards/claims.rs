@@ -1,4 +1,4 @@
-//! The ResourceClaimTemplate of a Leaderboard whose pairs claim their GPU: applied, never edited, and deleted when no Job needs it.
+//! The ResourceClaimTemplate of a Leaderboard whose workers claim their GPU: applied, never edited, and deleted when no Job needs it.
 //!
 //! Called by the probe. What stays of a Leaderboard that no longer claims is deleted with it.
 
@@ -17,7 +17,7 @@ use crate::kubernetes::{CallError, call};
 /// How the template of a Leaderboard stands.
 #[derive(Clone, Debug, Default, PartialEq, Eq)]
 pub enum Claims {
-    /// Its pairs claim nothing.
+    /// Its workers claim nothing.
     #[default]
     NotRequired,
     InPlace,

@@ -107,8 +107,8 @@ fn of_attempt(new: &SubmissionStatus) -> Vec<(&'static str, Value)> {
         ("leaderboard.retries", Value::Number(new.retry.into())),
     ];
     if let Some(progress) = &new.progress {
-        found.push(("leaderboard.routes.done", Value::Number(progress.done.into())));
-        found.push(("leaderboard.routes.total", Value::Number(progress.total.into())));
+        found.push(("leaderboard.done", Value::Number(progress.done.into())));
+        found.push(("leaderboard.total", Value::Number(progress.total.into())));
     }
     if let Some(failure) = &new.failure {
         found.push(("leaderboard.failure.class", Value::Word(failure.class.as_str())));

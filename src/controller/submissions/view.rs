@@ -139,7 +139,7 @@ pub struct PodView {
     /// When its first agent started.
     pub agent_started: Option<Timestamp>,
     pub logcopy_running: bool,
-    /// When the last of its agents and simulators ended, once all of them have ended well.
+    /// When the last container of its workers ended, once all of them have ended well.
     pub run_ended: Option<Timestamp>,
     pub containers: Vec<ContainerView>,
     /// Why the kubelet ended it as a whole: reason and message, for example `Evicted`.
@@ -225,7 +225,7 @@ pub struct EndView {
     /// When this life of it began.
     pub began: Option<Timestamp>,
     pub at: Option<Timestamp>,
-    /// What the runner of a simulator or agent reported. An agent can forge its own.
+    /// What the runner reported. An agent can forge its own.
     pub verdict: Option<Verdict>,
     /// The reason that a container of the host's reported, such as `PrefixInUse`.
     pub own_reason: Option<String>,
@@ -245,7 +245,7 @@ impl EndView {
 pub enum Stage {
     /// Its agents may still run.
     Live,
-    /// Its agents and simulators had ended.
+    /// The containers of its workers had ended.
     RunEnded,
     /// The Job had ended, or was gone.
     JobEnded,

@@ -187,7 +187,7 @@ impl Rounds {
         let mut folders = vec![status.clone(), self.tree.path().join("agent")];
         for pair in Pair::first(self.pairs()) {
             folders.push(self.tree.path().join(agent_folder(pair)));
-            folders.extend([pair.simulator(), pair.agent()].map(|member| status.join(member.to_string())));
+            folders.extend([pair.host(), pair.agent()].map(|member| status.join(member.to_string())));
         }
         // Without a watch the period is all there is.
         let _ = blocking(move || folders.iter().for_each(|folder| _ = watch.add(folder))).await;

@@ -254,11 +254,11 @@ fn flat(value: &Value) -> String {
         Value::String(text) => text.clone(),
         Value::Array(items) => items.iter().map(flat).collect::<Vec<_>>().join(", "),
         Value::Object(fields) => {
-            let pairs: Vec<_> = fields
+            let refused: Vec<_> = fields
                 .iter()
                 .map(|(name, value)| format!("{name}: {}", flat(value)))
                 .collect();
-            pairs.join("; ")
+            refused.join("; ")
         }
         Value::Null => String::new(),
         other => other.to_string(),

@@ -137,9 +137,9 @@ pub struct StoredResult {
     pub prefix: String,
     /// The report that was decided on.
     pub report: ContentId,
-    /// Routes that it counts.
+    /// Units of work that it counts.
     pub done: u32,
-    /// The metrics over the routes so far are wanted, where it has them.
+    /// The metrics over the work so far are wanted, where it has them.
     pub so_far: bool,
     pub patience: Patience,
 }
@@ -230,7 +230,7 @@ pub struct SubmissionState {
     pub end: Option<Ended>,
     /// When partial results were last taken.
     pub partial_at: Option<Timestamp>,
-    /// Routes of the partial results that were last answered.
+    /// Units of work in the partial results that were last answered.
     pub partial_done: Option<u32>,
     /// Why what the bucket holds of an end cannot be read.
     pub unread: Option<String>,

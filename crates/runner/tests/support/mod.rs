@@ -65,7 +65,7 @@ pub const fn member(side: Side) -> Member {
     }
 }
 
-pub const SIMULATOR: Member = member(Side::Simulator);
+pub const SIMULATOR: Member = member(Side::Host);
 pub const AGENT: Member = member(Side::Agent);
 
 /// Below what the kernel gives away by itself: a Pod has its ports to itself, and here other programs connect.

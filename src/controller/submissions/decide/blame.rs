@@ -1,8 +1,8 @@
-//! Whose fault the last crash of a pair was: one table over both containers. Pure.
+//! Whose fault the last crash of a worker was: one table over both containers. Pure.
 //!
-//! Called by `crashes`. The simulator's container is the host's own, so its verdict, and what the kubelet reports of it, decide.
-//! An agent's processes can replace or suppress the agent's verdict; it therefore only names the agent's fault more closely. Both
-//! ends are matched by their round. Where the simulator's end of a round is missing, it is waited for, and then the agent is the
+//! Called by `crashes`. No participant's program runs in the host's container, so its verdict, and what the kubelet reports of it,
+//! decide. An agent's processes can replace or suppress the agent's verdict; it therefore only names the agent's fault more closely.
+//! Both ends are matched by their round. Where the host's end of a round is missing, it is waited for, and then the agent is the
 //! cause.
 
 use jiff::Timestamp;
@@ -25,7 +25,7 @@ const OF_PROCESSES: [&str; 3] = [
     "failed to create new os thread",
 ];
 
-/// The last crash of a pair.
+/// The last crash of a worker.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 pub(super) struct Crash {
     pub(super) cause: EndReason,
@@ -37,45 +37,45 @@ pub(super) struct Crash {
 
 /// The table. `None`: neither side has crashed; whether their Pod is lost is not judged here.
 pub(super) fn last_crash(
-    simulator: Option<&ContainerView>,
+    host: Option<&ContainerView>,
     agent: Option<&ContainerView>,
     now: Timestamp,
 ) -> Option<Crash> {
-    if let Some(crash) = from_outside(simulator, agent) {
+    if let Some(crash) = from_outside(host, agent) {
         return Some(crash);
     }
     let agent = agent.and_then(|container| {
         let end = container.last.as_ref()?;
-        let is_its = is_crash(end) || is_false_claim(simulator, container, end);
+        let is_its = is_crash(end) || is_false_claim(host, container, end);
         is_its.then(|| (end, crash(of_agent(container, end), end)))
     });
-    let own_end = simulator.and_then(|container| {
+    let own_end = host.and_then(|container| {
         let end = container.last.as_ref()?;
         (!lacked_processes(container, end)).then_some(end)
     });
-    // A simulator that was ended from outside explains its own round, and nothing else.
+    // A host's container that was ended from outside explains its own round, and nothing else.
     let explains = |end: &&EndView| match what(end) {
         Some(What::Cancelled) => false,
-        Some(What::Stopped) => agent.is_some_and(|(agent, _)| order(simulator, end, agent) == Order::SameRound),
+        Some(What::Stopped) => agent.is_some_and(|(agent, _)| order(host, end, agent) == Order::SameRound),
         Some(What::Finished) => true,
         _ => end.exit_code != 0,
     };
     match (own_end.filter(explains), agent) {
         (None, None) => None,
         (Some(end), None) if what(end) == Some(What::Finished) => None,
-        (Some(end), None) => Some(of_simulator_alone(simulator, end, now)),
-        (None, Some((_, blamed))) => Some(of_agent_alone(simulator, blamed, now)),
-        (Some(end), Some((agent, blamed))) => Some(match order(simulator, end, agent) {
-            Order::SameRound => of_both(simulator, end, blamed),
-            Order::AgentIsLater => of_agent_alone(simulator, blamed, now),
-            Order::SimulatorIsLater => of_simulator_alone(simulator, end, now),
+        (Some(end), None) => Some(of_host_alone(host, end, now)),
+        (None, Some((_, blamed))) => Some(of_agent_alone(host, blamed, now)),
+        (Some(end), Some((agent, blamed))) => Some(match order(host, end, agent) {
+            Order::SameRound => of_both(host, end, blamed),
+            Order::AgentIsLater => of_agent_alone(host, blamed, now),
+            Order::HostIsLater => of_host_alone(host, end, now),
         }),
     }
 }
 
 /// Both sides were ended in one round, and by no process of the Pod: its sandbox was made anew, or its node started again. An agent can end
-/// itself in whatever way, but not its simulator so.
-fn from_outside(simulator: Option<&ContainerView>, agent: Option<&ContainerView>) -> Option<Crash> {
+/// itself in whatever way, but not its host so.
+fn from_outside(host: Option<&ContainerView>, agent: Option<&ContainerView>) -> Option<Crash> {
     fn ended(container: &ContainerView) -> Option<&EndView> {
         let end = container.last.as_ref()?;
         let goes_on = container.running || container.waiting.is_some();
@@ -87,11 +87,11 @@ fn from_outside(simulator: Option<&ContainerView>, agent: Option<&ContainerView>
         };
         (is_it && !end.is_start_error()).then_some(end)
     }
-    let (own, agent) = (ended(simulator?)?, ended(agent?)?);
+    let (own, agent) = (ended(host?)?, ended(agent?)?);
     (by_times_and_rounds(own, agent) == Order::SameRound).then(|| crash(EndReason::EndedFromOutside, own))
 }
 
-/// Whether the kubelet could not start a simulator again that has run in this Pod, for want of processes. That is no failure of its own:
+/// Whether the kubelet could not start a host's container again that has run in this Pod, for want of processes. That is no failure of its own:
 /// it is waited for, and an agent that ends meanwhile is the cause.
 pub(super) fn lacked_processes(container: &ContainerView, end: &EndView) -> bool {
     !is_of_first_life(container) && is_start_without_process(end)
@@ -117,24 +117,24 @@ pub(super) fn is_crash(end: &EndView) -> bool {
     end.exit_code != 0 && !is_asked_for
 }
 
-/// Whether an agent reports that it was asked to end, and it was not: its simulator had to end because of it, or the kubelet starts it
-/// again, which it does in no Pod that is being ended. Where the simulator was ended from outside, too, the agent may be right.
-fn is_false_claim(simulator: Option<&ContainerView>, agent: &ContainerView, end: &EndView) -> bool {
+/// Whether an agent reports that it was asked to end, and it was not: its host had to end because of it, or the kubelet starts it
+/// again, which it does in no Pod that is being ended. Where the host was ended from outside, too, the agent may be right.
+fn is_false_claim(host: Option<&ContainerView>, agent: &ContainerView, end: &EndView) -> bool {
     if end.exit_code == 0 {
         return false;
     }
-    let own_end = simulator.and_then(|container| container.last.as_ref());
+    let own_end = host.and_then(|container| container.last.as_ref());
     let goes_on = agent.running || agent.waiting.is_some();
     match own_end.map(|own| (own, what(own))) {
         Some((_, Some(What::Stopped | What::Cancelled))) => false,
-        Some((own, Some(What::PeerCrashed))) => goes_on || order(simulator, own, end) == Order::SameRound,
+        Some((own, Some(What::PeerCrashed))) => goes_on || order(host, own, end) == Order::SameRound,
         _ => goes_on,
     }
 }
 
-/// Whether a crash was a failure of the simulator itself, which it was not if its Pod was being ended.
-pub(super) fn is_simulators_own(simulator: Option<&ContainerView>, crash: &Crash) -> bool {
-    let was_ended = simulator.and_then(|container| what(container.last.as_ref()?)) == Some(What::Stopped);
+/// Whether a crash was a failure of the host's container itself, which it was not if its Pod was being ended.
+pub(super) fn is_hosts_own(host: Option<&ContainerView>, crash: &Crash) -> bool {
+    let was_ended = host.and_then(|container| what(container.last.as_ref()?)) == Some(What::Stopped);
     let is_its = matches!(
         crash.cause,
         EndReason::SimulatorCrashed
@@ -154,12 +154,12 @@ fn what(end: &EndView) -> Option<What> {
 enum Order {
     SameRound,
     AgentIsLater,
-    SimulatorIsLater,
+    HostIsLater,
 }
 
-fn order(simulator: Option<&ContainerView>, end: &EndView, agent: &EndView) -> Order {
+fn order(host: Option<&ContainerView>, end: &EndView, agent: &EndView) -> Order {
     // A runner writes a verdict as soon as it begins, so this life never began, and the one that runs now is another.
-    let is_replaced = end.verdict.is_none() && simulator.is_some_and(|container| container.running);
+    let is_replaced = end.verdict.is_none() && host.is_some_and(|container| container.running);
     if is_replaced {
         return Order::AgentIsLater;
     }
@@ -173,32 +173,32 @@ fn by_times_and_rounds(end: &EndView, agent: &EndView) -> Order {
     }
     let round = |end: &EndView| end.verdict.as_ref().and_then(|verdict| verdict.round);
     match round(end).zip(round(agent)) {
-        Some((simulator, agent)) if agent > simulator => Order::AgentIsLater,
-        Some((simulator, agent)) if agent < simulator => Order::SimulatorIsLater,
+        Some((host, agent)) if agent > host => Order::AgentIsLater,
+        Some((host, agent)) if agent < host => Order::HostIsLater,
         // An agent without a round is of an older version, or has replaced its verdict.
         _ => Order::SameRound,
     }
 }
 
-fn of_both(simulator: Option<&ContainerView>, end: &EndView, blamed: Crash) -> Crash {
+fn of_both(host: Option<&ContainerView>, end: &EndView, blamed: Crash) -> Crash {
     match what(end) {
         Some(What::PeerCrashed | What::Finished) => blamed,
-        _ => crash(of_simulator(simulator, end), end),
+        _ => crash(of_host(host, end), end),
     }
 }
 
-fn of_simulator_alone(simulator: Option<&ContainerView>, end: &EndView, now: Timestamp) -> Crash {
+fn of_host_alone(host: Option<&ContainerView>, end: &EndView, now: Timestamp) -> Crash {
     match what(end) {
         Some(What::PeerCrashed) => Crash {
             is_settled: !is_awaited(end.at, now),
             ..crash(EndReason::Unseen, end)
         },
-        _ => crash(of_simulator(simulator, end), end),
+        _ => crash(of_host(host, end), end),
     }
 }
 
-fn of_agent_alone(simulator: Option<&ContainerView>, blamed: Crash, now: Timestamp) -> Crash {
-    if simulator.is_none_or(cannot_be_started) {
+fn of_agent_alone(host: Option<&ContainerView>, blamed: Crash, now: Timestamp) -> Crash {
+    if host.is_none_or(cannot_be_started) {
         return Crash {
             cause: EndReason::SimulatorNotStarted,
             ..blamed
@@ -212,10 +212,10 @@ fn of_agent_alone(simulator: Option<&ContainerView>, blamed: Crash, now: Timesta
 
 /// Whether the kubelet cannot start it. The pause after a crash is none: its last end counts then. One that has run is not kept away by
 /// its own fault where the Pod lacks processes.
-fn cannot_be_started(simulator: &ContainerView) -> bool {
+fn cannot_be_started(host: &ContainerView) -> bool {
     let is_refused = |(reason, words): &(String, String)| reason != "CrashLoopBackOff" && !is_of_processes(words);
-    let never_ran = simulator.last.is_none() && simulator.restarts == 0;
-    !simulator.running && (never_ran || simulator.waiting.as_ref().is_some_and(is_refused))
+    let never_ran = host.last.is_none() && host.restarts == 0;
+    !host.running && (never_ran || host.waiting.as_ref().is_some_and(is_refused))
 }
 
 /// Whether the other side's end may still be seen. A clock that was set back does not prolong this.
@@ -232,8 +232,8 @@ fn crash(cause: EndReason, end: &EndView) -> Crash {
     }
 }
 
-fn of_simulator(simulator: Option<&ContainerView>, end: &EndView) -> EndReason {
-    let is_first = simulator.is_none_or(is_of_first_life);
+fn of_host(host: Option<&ContainerView>, end: &EndView) -> EndReason {
+    let is_first = host.is_none_or(is_of_first_life);
     match what(end) {
         // The agents can use up the Pod's processes once they run.
         Some(What::NoProcess) if !is_first => EndReason::NoProcess,

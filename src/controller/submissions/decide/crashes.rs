@@ -1,4 +1,4 @@
-//! Crashes of pairs: counting them, and the failure that they come to once they are too many.
+//! Crashes of workers: counting them, and the failure that they come to once they are too many.
 //!
 //! Called by `live`, `failure` and `end`. Whose fault a crash was is decided by `blame`.
 
@@ -16,7 +16,7 @@ use crate::controller::submissions::report_digest::{ReportDigest, clamp};
 use crate::controller::submissions::view::{ContainerView, PodView};
 use leaderboard_api::{EndReason, Failure, LastEnd, PairState, PairStatus, SubmissionStatus, reasons};
 
-/// Counts the crashes of each pair and remembers the last one: its Pod may be gone when the cause is looked for.
+/// Counts the crashes of each worker and remembers the last one: its Pod may be gone when the cause is looked for.
 pub(super) fn note(status: &mut SubmissionStatus, pod: &PodView, now: Timestamp) {
     let ids: BTreeSet<i32> = pod.containers.iter().filter_map(|c| pair_of(&c.name)).collect();
     for id in ids {
@@ -24,9 +24,9 @@ pub(super) fn note(status: &mut SubmissionStatus, pod: &PodView, now: Timestamp)
         let counted = its.map(count).max().unwrap_or(0);
         let crash = last_crash(pod, id, now);
         if counted > 0 || crash.is_some() {
-            let simulator = pair_with(id).and_then(|pair| container(pod, pair.simulator()));
+            let host = pair_with(id).and_then(|pair| container(pod, pair.host()));
             let pair = pair_entry(status, id);
-            pair.simulator_failed |= crash.is_some_and(|crash| blame::is_simulators_own(simulator, &crash));
+            pair.simulator_failed |= crash.is_some_and(|crash| blame::is_hosts_own(host, &crash));
             take(pair, counted, crash);
         }
     }
@@ -51,13 +51,13 @@ fn take(pair: &mut PairStatus, counted: i32, crash: Option<Crash>) {
 }
 
 /// Ends of a container that were crashes. One that has ended counts at once, not only when it is started again. The kubelet also counts
-/// how often it could not start a simulator, whose runner knows its rounds.
+/// how often it could not start a host's container, whose runner knows its rounds.
 fn count(container: &ContainerView) -> i32 {
     let Some(last) = container.last.as_ref() else {
         return container.restarts;
     };
-    let is_simulator = Member::parse(&container.name).is_some_and(|member| member.side == Side::Simulator);
-    if is_simulator && blame::lacked_processes(container, last) {
+    let is_host = Member::parse(&container.name).is_some_and(|member| member.side == Side::Host);
+    if is_host && blame::lacked_processes(container, last) {
         return 0;
     }
     let is_crash = blame::is_crash(last);
@@ -65,7 +65,7 @@ fn count(container: &ContainerView) -> i32 {
         .restarts
         .saturating_add(i32::from(is_crash && !container.has_next_life()));
     let round = last.verdict.as_ref().and_then(|verdict| verdict.round);
-    match round.filter(|_| is_simulator) {
+    match round.filter(|_| is_host) {
         Some(round) => ends.min(clamp(round).saturating_add(i32::from(is_crash))),
         None => ends,
     }
@@ -73,7 +73,7 @@ fn count(container: &ContainerView) -> i32 {
 
 fn last_crash(pod: &PodView, id: i32, now: Timestamp) -> Option<Crash> {
     let pair = pair_with(id)?;
-    blame::last_crash(container(pod, pair.simulator()), container(pod, pair.agent()), now)
+    blame::last_crash(container(pod, pair.host()), container(pod, pair.agent()), now)
 }
 
 fn pair_with(id: i32) -> Option<Pair> {
@@ -174,7 +174,7 @@ fn of_pair(pair: &PairStatus, cause: EndReason, node: Option<&str>) -> Failure {
     };
     let failure = if let Some((reason, what)) = of_node(id, &times, cause, node) {
         infrastructure(reason, &what)
-    } else if let Some(what) = of_simulator(cause) {
+    } else if let Some(what) = of_host(cause) {
         let what = format!("The simulator of pair {id} failed {times}: {what}.");
         infrastructure(reasons::SIMULATION_CRASHED, &what)
     } else {
@@ -219,8 +219,8 @@ fn of_node(id: i32, times: &str, cause: EndReason, node: Option<&str>) -> Option
     }
 }
 
-/// What a simulator did, if it was the cause.
-fn of_simulator(cause: EndReason) -> Option<&'static str> {
+/// What the host's container did, if it was the cause.
+fn of_host(cause: EndReason) -> Option<&'static str> {
     match cause {
         EndReason::SimulatorCrashed => Some("it crashed"),
         EndReason::SimulatorNotReady => Some("it was not ready in time"),

@@ -1,7 +1,7 @@
 //! Full disks: from the kubelet's words of an eviction to a failure, and its class. Pure.
 //!
 //! Called by `live` and `end`. Only what was measured of agents alone is evidence against them, by the kubelet or, on the volume of the logs,
-//! by `logcopy`. The Pod's own account, and a volume that others write to as well, hold what CARLA saves and its core dumps; such an end
+//! by `logcopy`. The Pod's own account, and a volume that others write to as well, hold what the host's programs save and their core dumps; such an end
 //! is counted by team.
 
 use serde_json::Value;

@@ -78,7 +78,7 @@ pub(super) fn decide(draft: &mut PlanBuilder<'_>, job_end: Option<&JobEnd>) {
     failed(draft, found);
 }
 
-/// Finishes a run whose agents and simulators have ended well and whose complete results are stored and count: nothing that its
+/// Finishes a run whose workers have ended well and whose complete results are stored and count: nothing that its
 /// Pod still does can change them. Returns whether it did. Every other end waits for the Job.
 pub(super) fn of_complete_run(draft: &mut PlanBuilder<'_>) -> bool {
     let view = draft.view;

@@ -1,7 +1,7 @@
 //! Failures: from what was observed of Jobs, Pods and results to a class, a reason and one sentence.
 //!
 //! Called by the stages of `decide`. The class shows whose failure it is; only a participant's is charged. Those of crashed
-//! pairs are in `crashes`.
+//! workers are in `crashes`.
 
 use super::next_steps::{Steps, for_both, infrastructure_for_participants, of_infrastructure, of_participant};
 use crate::controller::submissions::report_digest::{ReportDigest, clamp};
@@ -117,7 +117,7 @@ pub(super) fn not_eligible(report: &ReportDigest, pairs: &[PairStatus]) -> Failu
     charged(reasons::NOT_ELIGIBLE, &what)
 }
 
-/// Results that name a crash of the simulation. The agent writes them, and knows its score by then, so a crash that no simulator had is
+/// Results that name a crash of the simulation. The agent writes them, and knows its score by then, so a crash that no host's container had is
 /// its own. Evaluators repeat the route of a crash; one that does not keeps its record over the Jobs of an attempt.
 fn named_crash(report: &ReportDigest, pairs: &[PairStatus]) -> Failure {
     let named = report.pairs.iter().filter(|pair| pair.names_crash);

@@ -79,10 +79,10 @@ fn places(status: &SubmissionStatus, pod: Option<&PodView>) -> Vec<LogPlace> {
     let Some(pair) = u16::try_from(id).ok().and_then(Pair::new) else {
         return Vec::new();
     };
-    let (agent, simulator) = (pair.agent().to_string(), pair.simulator().to_string());
+    let (agent, host) = (pair.agent().to_string(), pair.host().to_string());
     let on_node = |container: &str| pod.and_then(|pod| on_node(pod, container));
     let found = match failure.reason.as_str() {
-        reasons::SIMULATION_CRASHED => vec![on_node(&simulator), Some(stored(&simulator, console(pair)))],
+        reasons::SIMULATION_CRASHED => vec![on_node(&host), Some(stored(&host, console(pair)))],
         reasons::START_DEADLINE => vec![pod.and_then(trouble::failing_before_agents).and_then(on_node)],
         reasons::RESULTS_NOT_STORED | reasons::JOB_FAILED => vec![
             on_node(names::CONTAINER_LOGCOPY),
@@ -102,7 +102,7 @@ fn places(status: &SubmissionStatus, pod: Option<&PodView>) -> Vec<LogPlace> {
     found.into_iter().flatten().collect()
 }
 
-/// The first pair that has not done all its routes: a failure of the whole run is most likely explained by its log.
+/// The first worker that has not done all its work: a failure of the whole run is most likely explained by its log.
 fn unfinished(status: &SubmissionStatus) -> i32 {
     let mut pairs = status.pairs.iter();
     pairs.find(|pair| pair.done < pair.total).map_or(1, |pair| pair.id)

@@ -1,8 +1,8 @@
-//! Infrastructure failures that an agent can provoke: it can crash its simulator, store more than its time allows, fill a disk, use up its
+//! Infrastructure failures that an agent can provoke: it can crash its host's container, store more than its time allows, fill a disk, use up its
 //! node, or be an image that no node takes. They are charged to nobody, so each further Job has to be earned.
 //!
 //! Called by `end`. An attempt alone decides, and no earlier one: the first such failure gets another Job, on another node where there is
-//! one. After a further one a Job follows only if the Job before it has finished a route.
+//! one. After a further one a Job follows only if the Job before it has finished a unit of work.
 
 use super::plan_builder::PlanBuilder;
 use crate::controller::submissions::report_digest::clamp;
@@ -31,7 +31,7 @@ pub(super) fn is_one(found: &Failure) -> bool {
     found.class == FailureClass::Infrastructure && !is_of_hosts && REASONS.contains(&found.reason.as_str())
 }
 
-/// Whether the rule leaves another Job: `before` has the routes that were stored when the failed Job was due, None for the attempt's first
+/// Whether the rule leaves another Job: `before` has the units that were stored when the failed Job was due, None for the attempt's first
 /// such failure; `stored` those that are stored by now.
 pub(super) fn may_go_on(found: &Failure, before: Option<i32>, stored: i32) -> bool {
     !is_one(found) || before.is_none_or(|before| stored > before)
@@ -60,7 +60,7 @@ pub(super) fn explained(draft: &PlanBuilder<'_>, found: Failure) -> Failure {
     }
 }
 
-/// Routes of the attempt that are stored. What an earlier attempt has reached counts among them.
+/// Units of the attempt that are stored. What an earlier attempt has reached counts among them.
 fn stored(draft: &PlanBuilder<'_>) -> i32 {
     let reached = draft.status.progress.as_ref().map_or(0, |progress| progress.done);
     draft.view.report.ours().map_or(reached, |report| clamp(report.done))

@@ -9,6 +9,7 @@ use jiff::Timestamp;
 use super::plan_builder::after;
 use crate::controller::submissions::view::{ContainerView, PodView};
 use leaderboard_api::{Deadlines, names};
+use leaderboard_runner::protocol::Member;
 
 /// How a container waits that the kubelet has not come to yet.
 const NOT_BEGUN: [&str; 3] = ["", "ContainerCreating", "PodInitializing"];
@@ -51,8 +52,8 @@ pub(super) fn waiting(pod: &PodView) -> Vec<&str> {
         Some(next) if is_before_its_pull(next) => vec![&next.name],
         Some(_) => Vec::new(),
         None => {
-            let of_pairs = pod.containers.iter().filter(|container| is_of_pair(&container.name));
-            let waiting = of_pairs.filter(|container| is_before_its_pull(container));
+            let of_workers = pod.containers.iter().filter(|container| Member::parse(&container.name).is_some());
+            let waiting = of_workers.filter(|container| is_before_its_pull(container));
             waiting.map(|container| container.name.as_str()).collect()
         }
     }
@@ -74,10 +75,6 @@ fn last_begun(pod: &PodView) -> Option<Timestamp> {
     let first_lives = pod.containers.iter().filter(|container| container.restarts == 0);
     let begun = first_lives.filter_map(|container| container.began.or_else(|| container.last.as_ref()?.began));
     begun.max()
-}
-
-fn is_of_pair(name: &str) -> bool {
-    ["agent-", "simulator-"].iter().any(|start| name.starts_with(start))
 }
 
 /// Whether the kubelet goes on to the next one.

@@ -1,4 +1,4 @@
-//! What a report shows of a run: progress, score, pairs, and what its host should know of scores and logs.
+//! What a report shows of a run: progress, score, workers, and what its host should know of scores and logs.
 
 use super::plan_builder::PlanBuilder;
 use crate::controller::submissions::report_digest::{ReportDigest, clamp};

@@ -207,7 +207,7 @@ fn stage(pod: &PodView) -> &'static str {
         end.is_some_and(|l| l.exit_code == 0)
     };
     if pod.logcopy_running {
-        "images are pulled, simulators and agents start"
+        "images are pulled, its containers start"
     } else if ended(names::CONTAINER_CONTENTS) {
         "logcopy starts"
     } else if ended(names::CONTAINER_WORKSPACE) {

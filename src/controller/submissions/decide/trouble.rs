@@ -1,6 +1,6 @@
 //! Why a container of a Pod does not start: from Kubernetes' words to a reason, a sentence, and whose fault it is.
 //!
-//! Called by `start`. `words` has the words themselves. Agents and simulators that started and crashed are judged by `failure`, not here.
+//! Called by `start`. `words` has the words themselves. Those of workers that started and crashed are judged by `failure`, not here.
 
 use super::words::{self, Cause};
 use crate::controller::submissions::view::{ContainerView, PodView};

@@ -11,8 +11,8 @@ use leaderboard_api::names;
 const DISK: &str = "ephemeral-storage";
 /// Request and limit of an agent. What its image holds does not count.
 const AGENT: [&str; 2] = ["2Gi", "20Gi"];
-/// Of a simulator.
-const SIMULATOR: [&str; 2] = ["2Gi", "10Gi"];
+/// Of a host's container.
+const HOST: [&str; 2] = ["2Gi", "10Gi"];
 /// What the volumes usually hold.
 const VOLUMES_REQUEST: &str = "1Gi";
 /// What the volumes of the private contents may hold, which have no limit of their own.
@@ -24,18 +24,18 @@ const CONTENTS_BYTES: u64 = 10 << 30;
 /// gets none of ours either, since the sum would be the limit of both.
 pub(super) fn fill(pod: &mut Value, logs: u64) {
     let mut nothing = Vec::new();
-    let pairs = pod["containers"].as_array_mut().unwrap_or(&mut nothing);
+    let workers = pod["containers"].as_array_mut().unwrap_or(&mut nothing);
     let is_unlimited = |container: &Value| names_disk(container, "requests") && !names_disk(container, "limits");
-    let unlimited = pairs.iter().any(is_unlimited);
-    for container in pairs.iter_mut().filter(|container| !is_settled(container)) {
+    let unlimited = workers.iter().any(is_unlimited);
+    for container in workers.iter_mut().filter(|container| !is_settled(container)) {
         let is_agent = container["name"].as_str().is_some_and(names::is_agent_container);
-        let [request, limit] = if is_agent { AGENT } else { SIMULATOR };
+        let [request, limit] = if is_agent { AGENT } else { HOST };
         set(container, "requests", request);
         if !unlimited {
             set(container, "limits", limit);
         }
     }
-    let limited = pairs.iter().any(|container| names_disk(container, "limits"));
+    let limited = workers.iter().any(|container| names_disk(container, "limits"));
     let init = pod["initContainers"].as_array_mut().into_iter().flatten();
     for logcopy in init.filter(|container| container["name"] == names::CONTAINER_LOGCOPY && !is_settled(container)) {
         set(logcopy, "requests", VOLUMES_REQUEST);

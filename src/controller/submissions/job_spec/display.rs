@@ -59,7 +59,7 @@ fn is_on_x11(input: &JobInput<'_>) -> bool {
 /// Takes what its image sets of a screen from a simulator that draws on none. A Pod cannot remove a variable, so the runner does; what
 /// the host sets stays.
 pub(super) fn settle(container: &mut Value, spec: &LeaderboardSpec) {
-    let is_simulator = member(container).is_some_and(|member| member.side == Side::Simulator);
+    let is_simulator = member(container).is_some_and(|member| member.side == Side::Host);
     if !is_simulator || spec.simulator.display != Display::Offscreen {
         return;
     }

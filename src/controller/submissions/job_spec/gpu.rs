@@ -35,7 +35,7 @@ pub(super) fn variables(source: GpuSource<'_>, member: Member) -> Vec<EnvVar> {
         GpuSource::Claim(_) => Some(NO_DEVICE),
     };
     let devices = devices.map(|devices| variable(DEVICES, devices));
-    let index = (member.side == Side::Simulator).then(|| variable(INDEX, &index));
+    let index = (member.side == Side::Host).then(|| variable(INDEX, &index));
     devices
         .into_iter()
         .chain([variable(CAPABILITIES, "all")])
@@ -56,7 +56,7 @@ pub(super) fn resources(
     };
     match (source, member.side) {
         (GpuSource::None, _) | (GpuSource::NodeIndex(_), Side::Agent) => hosts,
-        (GpuSource::PerContainer(resource), _) | (GpuSource::NodeIndex(resource), Side::Simulator) => {
+        (GpuSource::PerContainer(resource), _) | (GpuSource::NodeIndex(resource), Side::Host) => {
             is_requested(hosts.unwrap_or_default(), resource)
         }
         (GpuSource::Claim(_), _) => {

@@ -16,7 +16,7 @@ pub fn gpus(spec: &LeaderboardSpec, track: Option<&Track>, plan: &RunPlan) -> i6
     let of_simulator = effective::resources(simulators, spec.simulator.resources.as_ref());
     let of_agent = effective::resources(agents, spec.agent.resources.as_ref());
     let of_pair = |pair: Pair| {
-        [(pair.simulator(), &of_simulator), (pair.agent(), &of_agent)].map(|(member, hosts)| {
+        [(pair.host(), &of_simulator), (pair.agent(), &of_agent)].map(|(member, hosts)| {
             let resources = gpu::resources(source, member, hosts.clone());
             json!({"name": member.to_string(), "resources": resources})
         })

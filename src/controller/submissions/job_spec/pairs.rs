@@ -32,7 +32,7 @@ fn port(pair: Pair) -> usize {
 pub(super) fn simulator(input: &JobInput<'_>, pair: Pair) -> Container {
     let (spec, deadlines) = (&input.spec().simulator, input.deadlines());
     let own = input.track().and_then(|track| track.simulator.as_ref());
-    let member = pair.simulator();
+    let member = pair.host();
     let name = member.to_string();
     let (version, gpus) = (input.plan.leaderboard_version, source(input.spec()));
     let flags = [

@@ -64,11 +64,11 @@ fn agent_started(status: &PodStatus) -> Option<jiff::Timestamp> {
     agents.flat_map(started_times).min()
 }
 
-/// The simulators leave once the final report is stored; logcopy's farewell and the kubelet's last word come seconds later.
+/// The hosts' containers leave once the final report is stored; logcopy's farewell and the kubelet's last word come seconds later.
 fn run_ended(pod: &Pod) -> Option<jiff::Timestamp> {
     let containers = pod.spec.containers.iter();
-    let of_pairs = containers.filter(|c| ["agent-", "simulator-"].iter().any(|start| c.name.starts_with(start)));
-    let ends: Option<Vec<jiff::Timestamp>> = of_pairs
+    let of_workers = containers.filter(|c| Member::parse(&c.name).is_some());
+    let ends: Option<Vec<jiff::Timestamp>> = of_workers
         .map(|wanted| {
             let mut statuses = pod.status.container_statuses.iter();
             let end = statuses.find(|s| s.name == wanted.name)?.state.ended()?;
