@@ -8,7 +8,7 @@ use std::collections::BTreeMap;
 use std::path::PathBuf;
 use std::sync::Arc;
 
-use leaderboard_results::{Checkpoint, Files, Merged, Plan, Refusal, Slice, Strictness};
+use leaderboard_results::{Checkpoint, Files, Merged, Plan, Refusal, Slice, Strictness, read_worker};
 use leaderboard_runner::protocol::{KEPT_CHECKPOINT, Pair, Progress};
 
 use super::keys::{EVALAI, MERGED, checkpoint_path};
@@ -20,6 +20,23 @@ use leaderboard_api::{PairState, Verify};
 
 /// The merged file under EvalAI's name.
 const METADATA: &str = "evalai/metadata.json";
+
+/// Why a plan cannot be evaluated, and what to do.
+#[derive(thiserror::Error, Clone, Debug, PartialEq, Eq)]
+#[error("{problem}. {next_step}")]
+pub struct Refused {
+    pub problem: String,
+    pub next_step: String,
+}
+
+impl From<Refusal> for Refused {
+    fn from(refusal: Refusal) -> Self {
+        Self {
+            problem: refusal.to_string(),
+            next_step: refusal.next_step().to_owned(),
+        }
+    }
+}
 
 /// The plan of the results, from the plan of the run.
 pub fn results_plan(run: &Run) -> Result<Plan, Refusal> {
@@ -49,6 +66,12 @@ pub fn results_plan(run: &Run) -> Result<Plan, Refusal> {
     }
     plan.check()?;
     Ok(plan)
+}
+
+/// An error if the plan of a run contradicts itself.
+pub fn check(run: &Run) -> Result<(), Refused> {
+    results_plan(run)?;
+    Ok(())
 }
 
 /// Its last whole copy, which the agent's runner keeps.
@@ -115,13 +138,62 @@ enum ReadOutcome {
 /// Results by their keys below the run's prefix.
 pub type Objects = BTreeMap<String, Object>;
 
+/// The results so far in numbers.
+#[derive(Clone, Debug, Default, PartialEq)]
+pub struct Summary {
+    /// Units of work done.
+    pub done: u32,
+    /// Over the units done so far; over all of them once `is_complete`.
+    pub score: Option<f64>,
+    /// Mean route completion in percent, over the same routes.
+    pub route_completion: Option<f64>,
+    /// Mean infraction penalty, 0 to 1, over the same routes.
+    pub infraction_penalty: Option<f64>,
+    /// No unit of the plan is missing.
+    pub is_complete: bool,
+    /// Every evaluator has come to its regular end.
+    pub has_ended: bool,
+    /// The results count.
+    pub eligible: bool,
+    /// How the run ended, in the words of its evaluators.
+    pub ended_as: String,
+    /// Scores that do not follow from what was recorded, one sentence each.
+    pub warnings: Vec<String>,
+}
+
+impl From<&Merged> for Summary {
+    fn from(merged: &Merged) -> Self {
+        let within = |most: f64, value: Option<f64>| value.filter(|value| (0.0..=most).contains(value));
+        Self {
+            done: merged.done,
+            score: within(100.0, merged.score.or(merged.partial_score)),
+            route_completion: within(100.0, merged.route_completion()),
+            infraction_penalty: within(1.0, merged.infraction_penalty()),
+            is_complete: merged.is_final,
+            has_ended: merged.pairs.iter().all(|pair| pair.ended),
+            eligible: merged.eligible,
+            ended_as: merged.ended_as().to_owned(),
+            warnings: merged.warnings.clone(),
+        }
+    }
+}
+
+/// What EvalAI gets as a result.
+#[derive(Clone, Debug, PartialEq, Eq)]
+pub struct Texts {
+    /// JSON of the metrics; zeros until the results are complete.
+    pub results: String,
+    /// The same with the metrics so far; `None` before the first unit, and once the results are complete.
+    pub partial_results: Option<String>,
+}
+
 /// What one round found.
 #[derive(Clone, Debug)]
 pub struct Gathered {
-    /// The last good merge, without its text; `None` before the first checkpoint.
-    pub merged: Option<Arc<Merged>>,
-    /// EvalAI's short texts, of the same merge; `metadata.json` is only in `objects`.
-    pub files: Arc<Files>,
+    /// The last good merge; `None` before the first checkpoint.
+    pub merged: Option<Arc<Summary>>,
+    /// EvalAI's short texts, of the same merge.
+    pub texts: Arc<Texts>,
     /// The last good checkpoints, the merged file and EvalAI's texts, as they are to be stored.
     pub objects: Objects,
     /// Each pair from its status files.
@@ -145,14 +217,13 @@ impl Gathered {
 
     /// Whether nothing is missing: judged by the plan and the last good files, whatever the agents report.
     pub fn is_complete(&self) -> bool {
-        self.unmerged.is_none() && self.merged.as_ref().is_some_and(|merged| merged.is_final)
+        self.unmerged.is_none() && self.merged.as_ref().is_some_and(|merged| merged.is_complete)
     }
 
     /// Whether every evaluator has come to its regular end. One whose simulator crashed in its last route has a record of each
     /// and has not: it will repeat that route, as long as it is restarted.
     pub fn has_ended(&self) -> bool {
-        let merged = self.merged.as_ref();
-        merged.is_some_and(|merged| merged.pairs.iter().all(|pair| pair.ended))
+        self.merged.as_ref().is_some_and(|merged| merged.has_ended)
     }
 
     /// Digests of EvalAI's texts, by key.
@@ -165,19 +236,21 @@ impl Gathered {
 }
 
 /// Takes in EvalAI's texts. The merged file can be large, so it is moved: it is in memory once, under both of its keys.
-fn take_texts(objects: &mut Objects, files: &mut Files) {
-    let texts = [
-        ("evalai/results.json", &files.results_json),
-        ("evalai/stdout.txt", &files.stdout_txt),
-    ];
-    for (key, text) in texts {
-        objects.insert(key.to_owned(), Object::new(text.clone()));
-    }
-    if let Some(metadata) = files.metadata_json.take() {
+fn take_texts(objects: &mut Objects, files: Files) -> Arc<Texts> {
+    objects.insert(
+        "evalai/results.json".to_owned(),
+        Object::new(files.results_json.clone()),
+    );
+    objects.insert("evalai/stdout.txt".to_owned(), Object::new(files.stdout_txt));
+    if let Some(metadata) = files.metadata_json {
         let merged = Object::new(metadata);
         objects.insert(MERGED.to_owned(), merged.clone());
         objects.insert(METADATA.to_owned(), merged);
     }
+    Arc::new(Texts {
+        results: files.results_json,
+        partial_results: files.partial_json,
+    })
 }
 
 /// Reads the volume round by round.
@@ -187,33 +260,49 @@ pub struct Gatherer {
     tree: Arc<Tree>,
     status: PathBuf,
     workers: Vec<Worker>,
-    merged: Option<Arc<Merged>>,
-    files: Arc<Files>,
+    merged: Option<Arc<Summary>>,
+    texts: Arc<Texts>,
     objects: Objects,
     unmerged: Option<String>,
 }
 
 impl Gatherer {
-    /// For a plan that holds.
-    pub fn new(plan: Plan, tree: Arc<Tree>) -> Result<Self, Refusal> {
-        let mut files = leaderboard_results::render(&plan, None)?;
+    /// For a run whose plan holds.
+    pub fn new(run: &Run, tree: Arc<Tree>) -> Result<Self, Refused> {
+        let plan = results_plan(run)?;
         let mut objects = Objects::new();
-        take_texts(&mut objects, &mut files);
+        let texts = take_texts(&mut objects, leaderboard_results::render(&plan, None)?);
         Ok(Self {
             status: tree.path().join(STATUS_FOLDER),
             workers: plan.pairs.iter().map(|_| Worker::default()).collect(),
             plan,
             tree,
             merged: None,
-            files: Arc::new(files),
+            texts,
             objects,
             unmerged: None,
         })
     }
 
-    /// Routes of the whole run, repetitions counted.
-    pub fn total(&self) -> u32 {
-        self.plan.routes.saturating_mul(self.plan.repetitions)
+    /// Removes the checkpoints of other routes, as those of before the plan was changed. None of their routes counts here, and one that is
+    /// complete would be taken for a pair with nothing left to drive.
+    pub fn remove_others(&self) -> Result<(), TreeError> {
+        for pair in Pair::first(self.workers.len()) {
+            let (path, index) = (checkpoint_path(pair), pair.index());
+            let found = match self.tree.read(&path, self.plan.limits_of(index).bytes as u64) {
+                Ok(Some((bytes, _))) => read_worker(&self.plan, index, &bytes),
+                // A round refuses it.
+                Ok(None) | Err(TreeError::TooLarge { .. }) => continue,
+                Err(error) => return Err(error),
+            };
+            if let Err(refusal) = found
+                && refusal.is_of_other_routes()
+            {
+                tracing::warn!("{refusal}: the stored checkpoint is not gone on with, and the pair begins anew");
+                self.tree.remove(&path)?;
+            }
+        }
+        Ok(())
     }
 
     /// Reads everything once. Blocks: not for an asynchronous thread.
@@ -235,7 +324,7 @@ impl Gatherer {
         let pairs = self.pairs(&seen);
         Gathered {
             merged: self.merged.clone(),
-            files: Arc::clone(&self.files),
+            texts: Arc::clone(&self.texts),
             objects: self.objects.clone(),
             pairs,
             seen,
@@ -272,7 +361,7 @@ impl Gatherer {
             Err(error) => return worker.cannot_read(pair, &error),
         };
         worker.unreadable = None;
-        match leaderboard_results::read_worker(&self.plan, index, &bytes) {
+        match read_worker(&self.plan, index, &bytes) {
             Ok(None) => ReadOutcome::Unusable,
             Ok(Some(checkpoint)) => {
                 worker.seen = Some(stamp);
@@ -312,7 +401,7 @@ impl Gatherer {
             return false;
         };
         worker.kept = Some(stamp);
-        let Ok(Some(kept)) = leaderboard_results::read_worker(&self.plan, index, &bytes) else {
+        let Ok(Some(kept)) = read_worker(&self.plan, index, &bytes) else {
             return false;
         };
         let is_taken = worker.take(kept);
@@ -332,12 +421,9 @@ impl Gatherer {
             Ok((merged, files))
         });
         match merged {
-            Ok((mut merged, mut files)) => {
-                take_texts(&mut self.objects, &mut files);
-                // The same text as `metadata.json`.
-                merged.text = String::new();
-                self.merged = Some(Arc::new(merged));
-                self.files = Arc::new(files);
+            Ok((merged, files)) => {
+                self.texts = take_texts(&mut self.objects, files);
+                self.merged = Some(Arc::new(Summary::from(&merged)));
                 self.unmerged = None;
             }
             Err(refusal) => {

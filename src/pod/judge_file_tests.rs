@@ -8,7 +8,7 @@ use nix::errno::Errno;
 use super::tests::seen_on_a_volume::{Volume, text};
 use super::*;
 use crate::pod::fixtures::{checkpoint, put_checkpoint, put_status, run};
-use crate::pod::gather::{Gatherer, results_plan};
+use crate::pod::gather::Gatherer;
 use crate::pod::keys::MERGED;
 use crate::pod::tree::Tree;
 use leaderboard_api::RouteSlice;
@@ -33,16 +33,19 @@ fn a_complete_run_stays_complete_when_all_its_evaluators_are_started_once_more()
     }
     let (after, seen) = volume.round();
     assert_eq!(after.objects, before.objects, "what is stored is what was complete");
-    assert_eq!(after.merged.as_ref().unwrap().entry_status, "Finished");
+    assert_eq!(after.merged.as_ref().unwrap().ended_as, "Finished");
     assert_eq!((seen.complete, after.why()), (Some(Duration::from_secs(10)), None));
 
     // A logcopy that has begun after that finds nothing else.
     let tree = Arc::new(Tree::open(volume.folder.path()).unwrap());
-    let gathered = Gatherer::new(results_plan(&run()).unwrap(), tree).unwrap().round();
+    let gathered = Gatherer::new(&run(), tree).unwrap().round();
     let merged = gathered.merged.as_ref().unwrap();
-    assert_eq!((merged.eligible, merged.ended_as()), (true, "Finished"));
-    assert_eq!(merged.entry_status, "Invalid", "as the original merges these files");
-    assert!(text(&gathered, MERGED).contains(r#""entry_status": "Invalid""#));
+    assert_eq!((merged.eligible, merged.ended_as.as_str()), (true, "Finished"));
+    let original = r#""entry_status": "Invalid""#;
+    assert!(
+        text(&gathered, MERGED).contains(original),
+        "as the original merges these files"
+    );
 }
 
 #[test]
@@ -51,7 +54,7 @@ fn one_pair_whose_evaluator_died_before_its_global_record_stays_complete() {
     run.plan.slices = vec![RouteSlice { first: 0, last: 1 }];
     let mut volume = Volume::new();
     let tree = Arc::new(Tree::open(volume.folder.path()).unwrap());
-    volume.gatherer = Gatherer::new(results_plan(&run).unwrap(), tree).unwrap();
+    volume.gatherer = Gatherer::new(&run, tree).unwrap();
     let whole = checkpoint(0, 2, 2);
     let died = whole
         .replacen(r#"{"index":-1,"status":"Completed"}"#, "{}", 1)
@@ -80,7 +83,7 @@ fn read_in_turn(last_route: u32, files: &[String]) -> Gathered {
     }];
     let mut volume = Volume::new();
     let tree = Arc::new(Tree::open(volume.folder.path()).unwrap());
-    volume.gatherer = Gatherer::new(results_plan(&run).unwrap(), tree).unwrap();
+    volume.gatherer = Gatherer::new(&run, tree).unwrap();
     let rounds = files.iter().map(|file| {
         put_checkpoint(volume.folder.path(), 1, file);
         volume.round().0
@@ -111,7 +114,7 @@ fn a_resumed_pair_whose_rest_fails_before_its_set_up_counts() {
         let gathered = read_in_turn(1, &[before, vec![rest_failed.clone()]].concat());
         let merged = gathered.merged.unwrap();
         assert_eq!(
-            (merged.is_final, merged.eligible, merged.ended_as()),
+            (merged.is_complete, merged.eligible, merged.ended_as.as_str()),
             (true, true, "Finished")
         );
     }
@@ -122,7 +125,7 @@ fn an_agent_that_names_no_sensors_from_its_beginning_does_not_count() {
     let files = [checkpoint(0, 0, 2), checkpoint(0, 1, 2), checkpoint(0, 2, 2)].map(|file| started_once_more(&file));
     let merged = read_in_turn(1, &files).merged.unwrap();
     assert_eq!(
-        (merged.is_final, merged.eligible, merged.ended_as()),
+        (merged.is_complete, merged.eligible, merged.ended_as.as_str()),
         (true, false, "Invalid")
     );
 }
@@ -151,7 +154,7 @@ fn a_checkpoint_that_the_node_cannot_read_is_tried_again_and_spoils_nothing() {
     for trouble in [Errno::EMFILE, Errno::ENFILE, Errno::EIO, Errno::ENOMEM] {
         let mut volume = Volume::new();
         let tree = Arc::new(Tree::open(volume.folder.path()).unwrap());
-        volume.gatherer = Gatherer::new(results_plan(&run()).unwrap(), Arc::clone(&tree)).unwrap();
+        volume.gatherer = Gatherer::new(&run(), Arc::clone(&tree)).unwrap();
         put_checkpoint(volume.folder.path(), 1, &checkpoint(0, 2, 2));
         put_checkpoint(volume.folder.path(), 2, &checkpoint(2, 1, 2));
         volume.round();
@@ -176,7 +179,7 @@ fn a_checkpoint_that_its_agent_has_shut_is_the_agents() {
     for trouble in [Errno::EACCES, Errno::EPERM, Errno::EAGAIN, Errno::ELOOP] {
         let mut volume = Volume::new();
         let tree = Arc::new(Tree::open(volume.folder.path()).unwrap());
-        volume.gatherer = Gatherer::new(results_plan(&run()).unwrap(), Arc::clone(&tree)).unwrap();
+        volume.gatherer = Gatherer::new(&run(), Arc::clone(&tree)).unwrap();
         put_status(volume.folder.path(), Side::Agent, 1, Mark::Done);
         *tree.disk.lock().unwrap() = Some(trouble);
         let (gathered, seen) = volume.round();

@@ -123,12 +123,12 @@ pub(super) mod seen_on_a_volume {
     use std::fs;
     use std::sync::Arc;
 
-    use leaderboard_runner::protocol::{Mark, Side};
+    use leaderboard_runner::protocol::{Mark, Pair, Side};
 
     use super::super::*;
     use crate::pod::fixtures::{checkpoint, put_checkpoint, put_status, run};
     use crate::pod::gather::{Gatherer, results_plan};
-    use crate::pod::keys::{EVALAI, MERGED};
+    use crate::pod::keys::{EVALAI, MERGED, checkpoint_path};
     use crate::pod::tree::Tree;
     use leaderboard_api::{PairState, RouteSlice};
 
@@ -144,7 +144,7 @@ pub(super) mod seen_on_a_volume {
             let folder = tempfile::tempdir().unwrap();
             let tree = Arc::new(Tree::open(folder.path()).unwrap());
             Self {
-                gatherer: Gatherer::new(results_plan(&run()).unwrap(), tree).unwrap(),
+                gatherer: Gatherer::new(&run(), tree).unwrap(),
                 judge: Judge::default(),
                 folder,
                 now: 0,
@@ -286,7 +286,7 @@ pub(super) mod seen_on_a_volume {
             );
         put_checkpoint(volume.folder.path(), 2, &crashed);
         let (gathered, seen) = volume.round();
-        assert_eq!(gathered.merged.as_ref().unwrap().entry_status, "Crashed");
+        assert_eq!(gathered.merged.as_ref().unwrap().ended_as, "Crashed");
         assert!(!gathered.has_ended() && seen.whole && seen.complete.is_none());
         put_checkpoint(volume.folder.path(), 2, &checkpoint(2, 2, 2));
         let (gathered, seen) = volume.round();
@@ -354,6 +354,21 @@ pub(super) mod seen_on_a_volume {
             gathered.objects["agent/agent1/agent_results.json"].bytes,
             checkpoint(0, 1, 2)
         );
+    }
+
+    #[test]
+    fn a_complete_checkpoint_of_other_routes_does_not_make_a_pair_done() {
+        let volume = Volume::new();
+        let folder = volume.folder.path();
+        put_checkpoint(folder, 1, &checkpoint(0, 2, 2));
+        put_checkpoint(folder, 2, &checkpoint(1, 2, 2));
+        volume.gatherer.remove_others().unwrap();
+        let is_there = |pair: u16| folder.join(checkpoint_path(Pair::new(pair).unwrap())).exists();
+        assert_eq!((is_there(1), is_there(2)), (true, false));
+        // Every other refusal is a round's matter.
+        put_checkpoint(folder, 2, &checkpoint(2, 2, 2).replace("100.0", "1000.0"));
+        volume.gatherer.remove_others().unwrap();
+        assert!(is_there(2));
     }
 
     #[test]

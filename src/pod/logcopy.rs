@@ -4,7 +4,7 @@
 //! kubelet would start it again: after its work it waits for SIGTERM. Results are safe before `logcopy.done` is written,
 //! and the simulators hold the Pod until then.
 
-mod describe;
+pub(super) mod describe;
 mod round;
 
 use std::future::Future;
@@ -12,13 +12,12 @@ use std::path::Path;
 use std::sync::Arc;
 use std::time::{Duration, Instant};
 
-use leaderboard_results::Refusal;
 use leaderboard_runner::protocol::StatusFile;
 use tokio::sync::watch;
 use tokio::task::JoinHandle;
 
 use super::blocking;
-use super::gather::{Gatherer, results_plan};
+use super::gather::{Gatherer, Refused};
 use super::identity;
 use super::places::{Places, Setting};
 use super::report::Logs;
@@ -49,8 +48,8 @@ const SHIP_PERIOD: Duration = Duration::from_secs(5);
 #[derive(thiserror::Error, Debug)]
 pub enum LogcopyError {
     /// The plan does not hold; `workspace` has refused it before.
-    #[error("{0}. {next}", next = .0.next_step())]
-    Plan(#[from] Refusal),
+    #[error(transparent)]
+    Plan(#[from] Refused),
     /// The volume.
     #[error("the logs volume can't be used: {0}. Look at the node's disk and the Pod's volumes.")]
     Volume(#[from] TreeError),
@@ -84,7 +83,7 @@ pub async fn work(
     shutdown: impl Future<Output = ()>,
 ) -> Result<(), LogcopyError> {
     let tree = Arc::new(Tree::open(&setting.places.logs)?);
-    let gatherer = Gatherer::new(results_plan(&setting.run)?, Arc::clone(&tree))?;
+    let gatherer = Gatherer::new(&setting.run, Arc::clone(&tree))?;
     let plan = &setting.run.plan;
     let quota = Quota::new(plan.storage.size_limit.bytes(), plan.slices.len());
     let uploader = Uploader::new(archive.clone(), Arc::clone(&tree), quota);

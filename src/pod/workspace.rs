@@ -6,6 +6,7 @@
 
 pub mod restore;
 
+use std::collections::BTreeMap;
 use std::fs;
 use std::io;
 use std::os::unix::fs::PermissionsExt;
@@ -13,21 +14,21 @@ use std::path::Path;
 use std::sync::Arc;
 use std::time::Duration;
 
-use leaderboard_results::Refusal;
 use serde::{Deserialize, Serialize};
 
-use super::gather::results_plan;
+use super::gather::{Gatherer, Refused, check};
 use super::identity;
 use super::isolation::{self, Finding};
+use super::logcopy::describe::describe;
 use super::name_files;
 use super::places::{Places, Setting};
-use super::report::{MAX_BYTES, OWNER_KEY, Owner, REPORT_KEY, Report, ReportPair, SCHEMA};
+use super::report::{MAX_BYTES, OWNER_KEY, Owner, REPORT_KEY, Report};
 use super::run::{Run, STATUS_FOLDER};
 use super::schema::is_read;
 use super::tree::{Tree, TreeError};
 use crate::services::archive::{Archive, ArchiveError};
 use leaderboard_api::names::FAILURE_LOG_KEY;
-use leaderboard_api::{Attempt, Enforcement, PairState};
+use leaderboard_api::{Attempt, Enforcement};
 
 /// Folders that no mount makes. The others are the kubelet's.
 const FOLDERS: [&str; 4] = ["agent", STATUS_FOLDER, "logcopy", "contents"];
@@ -153,8 +154,8 @@ pub enum WorkspaceError {
     #[error("{0} The run is not started, because network.enforcement is Require.")]
     NotIsolated(Finding),
     /// The plan does not hold.
-    #[error("{0}. {next}", next = .0.next_step())]
-    Plan(#[from] Refusal),
+    #[error(transparent)]
+    Plan(#[from] Refused),
     /// S3.
     #[error(transparent)]
     Storage(#[from] ArchiveError),
@@ -216,7 +217,7 @@ pub async fn main(setting: Setting) -> Result<(), WorkspaceError> {
 
 async fn measure_and_prepare(setting: &Setting) -> Result<Option<Finding>, WorkspaceError> {
     let plan = &setting.run.plan;
-    results_plan(&setting.run)?;
+    check(&setting.run)?;
     let finding = measure(setting).await?;
     let aws = identity::aws(setting, "workspace").await;
     prepare(setting, &Archive::of_run(&aws, &plan.storage, &plan.run_id)).await?;
@@ -238,7 +239,7 @@ async fn measure(setting: &Setting) -> Result<Option<Finding>, WorkspaceError> {
 
 /// Does the work, again and again while S3 does not answer.
 pub async fn prepare(setting: &Setting, archive: &Archive) -> Result<(), WorkspaceError> {
-    results_plan(&setting.run)?;
+    check(&setting.run)?;
     copy_runner(&setting.places)?;
     name_files::copy(&setting.places).map_err(|(path, error)| WorkspaceError::NameFile {
         path: path.display().to_string(),
@@ -265,11 +266,12 @@ pub async fn prepare(setting: &Setting, archive: &Archive) -> Result<(), Workspa
 /// Takes the prefix for this Pod.
 async fn take(setting: &Setting, archive: &Archive, tree: &Arc<Tree>) -> Result<(), WorkspaceError> {
     let run = &setting.run;
+    let mut gatherer = Gatherer::new(run, Arc::clone(tree))?;
     let owner = Owner::new(setting.pod_uid.clone()).to_json();
     match claim(run, archive).await? {
         Claim::Fresh => {
             // Names the prefix's owner before anything else is in it, so that a Pod that is lost early can be replaced.
-            let report = first_report(run, &setting.pod_uid)?;
+            let report = first_report(run, &setting.pod_uid, &mut gatherer);
             let bytes = serde_json::to_vec(&report).unwrap_or_default();
             archive.put(REPORT_KEY, bytes).await?;
             archive.put(OWNER_KEY, owner).await?;
@@ -278,7 +280,7 @@ async fn take(setting: &Setting, archive: &Archive, tree: &Arc<Tree>) -> Result<
             // The fence first: what a Pod before this one still stores, it stores before it next reads the fence, and what is
             // restored is then the last of it.
             archive.put(OWNER_KEY, owner).await?;
-            let restored = restore::restore(run, archive, tree).await?;
+            let restored = restore::restore(gatherer, run, archive, tree).await?;
             tracing::info!(
                 files = restored.files,
                 bytes = restored.bytes,
@@ -327,41 +329,12 @@ async fn claim(run: &Run, archive: &Archive) -> Result<Claim, WorkspaceError> {
     Err(WorkspaceError::PrefixInUse(format!("{}/{prefix}", plan.storage.bucket)))
 }
 
-/// The report of a run in which nothing has happened.
-fn first_report(run: &Run, pod_uid: &str) -> Result<Report, WorkspaceError> {
-    let plan = results_plan(run)?;
-    let pairs = (1..).zip(&plan.pairs).map(|(id, slice)| ReportPair {
-        id,
-        done: 0,
-        total: slice.routes().saturating_mul(plan.repetitions),
-        crashes: 0,
-        state: PairState::Waiting,
-        names_crash: false,
-    });
-    Ok(Report {
-        schema: SCHEMA,
-        submission_uid: run.uid.clone(),
-        attempt: run.attempt,
-        pod_uid: pod_uid.to_owned(),
-        round: 0,
-        done: 0,
-        total: plan.routes.saturating_mul(plan.repetitions),
-        pairs: pairs.collect(),
-        score: None,
-        route_completion: None,
-        infraction_penalty: None,
-        is_final: false,
-        eligible: false,
-        entry_status: "Started".to_owned(),
-        stopped: None,
-        why: None,
-        warnings: Vec::new(),
-        logs: None,
-        results: leaderboard_results::render(&plan, None)?.results_json,
-        partial_results: None,
-        agents_fill_disk: false,
-        files: std::collections::BTreeMap::new(),
-    })
+/// The report of a run in which nothing has happened, and nothing but it is stored.
+fn first_report(run: &Run, pod_uid: &str, gatherer: &mut Gatherer) -> Report {
+    Report {
+        files: BTreeMap::new(),
+        ..describe(run, pod_uid, &gatherer.round(), None)
+    }
 }
 
 /// Puts the runner where every container finds it, executable for every user.
@@ -397,10 +370,15 @@ mod tests {
     use crate::pod::fixtures;
     use crate::pod::isolation::Blocked;
 
+    fn first() -> Report {
+        let (run, folder) = (fixtures::run(), tempfile::tempdir().unwrap());
+        let tree = Arc::new(Tree::open(folder.path()).unwrap());
+        first_report(&run, "pod-1", &mut Gatherer::new(&run, tree).unwrap())
+    }
+
     #[test]
     fn the_first_report_is_one_the_controller_takes() {
-        let run = fixtures::run();
-        let report = first_report(&run, "pod-1").unwrap();
+        let report = first();
         let read = Report::parse(&serde_json::to_vec(&report).unwrap()).unwrap();
         assert!(read.belongs_to("uid-1", Attempt(1)) && !read.is_final);
         assert_eq!((read.total, read.pairs.len(), read.pairs[1].total), (4, 2, 2));
@@ -408,7 +386,7 @@ mod tests {
 
     #[test]
     fn what_a_report_quotes_is_one_harmless_line() {
-        let mut report = first_report(&fixtures::run(), "pod-1").unwrap();
+        let mut report = first();
         report.why = Some("pair 1: \u{1b}[2J\nbad".into());
         report.warnings = vec!["\u{202e}route 1".into()];
         report.entry_status = "Started\u{7}".into();

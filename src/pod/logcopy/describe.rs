@@ -2,22 +2,18 @@
 
 use std::collections::BTreeMap;
 
-use leaderboard_results::Merged;
-
 use crate::pod::gather::Gathered;
 use crate::pod::judge::Ending;
-use crate::pod::places::Setting;
 use crate::pod::report::{LONGEST_TEXT, MAX_BYTES, Report, SCHEMA};
+use crate::pod::run::Run;
 use leaderboard_api::text::one_line;
 
 /// Warnings of the results' check that are reported.
 const WARNINGS: usize = 50;
 
 /// The report of a round; its number is the caller's.
-pub(super) fn describe(setting: &Setting, gathered: &Gathered, ending: Option<&Ending>) -> Report {
-    let run = &setting.run;
+pub fn describe(run: &Run, pod_uid: &str, gathered: &Gathered, ending: Option<&Ending>) -> Report {
     let merged = gathered.merged.as_deref();
-    let score = merged.and_then(|merged| merged.score.or(merged.partial_score));
     let invalid = match ending {
         Some(Ending::Invalid(why)) => Some(why.clone()),
         _ => None,
@@ -37,27 +33,23 @@ pub(super) fn describe(setting: &Setting, gathered: &Gathered, ending: Option<&E
         schema: SCHEMA,
         submission_uid: run.uid.clone(),
         attempt: run.attempt,
-        pod_uid: setting.pod_uid.clone(),
+        pod_uid: pod_uid.to_owned(),
         round: 0,
         done: merged.map_or(0, |merged| merged.done).min(total),
         total,
         pairs: gathered.pairs.clone(),
-        score: score.filter(|score| (0.0..=100.0).contains(score)),
-        route_completion: merged
-            .and_then(Merged::route_completion)
-            .filter(|percent| (0.0..=100.0).contains(percent)),
-        infraction_penalty: merged
-            .and_then(Merged::infraction_penalty)
-            .filter(|factor| (0.0..=1.0).contains(factor)),
+        score: merged.and_then(|merged| merged.score),
+        route_completion: merged.and_then(|merged| merged.route_completion),
+        infraction_penalty: merged.and_then(|merged| merged.infraction_penalty),
         is_final: ending.is_some(),
         eligible: counts && merged.is_some_and(|merged| merged.eligible),
-        entry_status: merged.map_or("Started", |merged| merged.ended_as()).to_owned(),
+        entry_status: merged.map_or("Started", |merged| merged.ended_as.as_str()).to_owned(),
         stopped,
         why: invalid.or_else(|| gathered.why()).map(|why| shorten(&why)),
         warnings: warnings.iter().take(WARNINGS).map(|warning| shorten(warning)).collect(),
         logs: None,
-        results: gathered.files.results_json.clone(),
-        partial_results: gathered.files.partial_json.clone().filter(|_| ending.is_none()),
+        results: gathered.texts.results.clone(),
+        partial_results: gathered.texts.partial_results.clone().filter(|_| ending.is_none()),
         agents_fill_disk: false,
         files: gathered.digests(),
     }

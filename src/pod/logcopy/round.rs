@@ -367,7 +367,12 @@ impl Rounds {
 
     /// Stores the report, if it differs from the last one.
     async fn report(&mut self, found: &Found) -> Result<(), ArchiveError> {
-        let mut report = describe(&self.setting, &found.gathered, self.ending.as_ref());
+        let mut report = describe(
+            &self.setting.run,
+            &self.setting.pod_uid,
+            &found.gathered,
+            self.ending.as_ref(),
+        );
         report.round = self.round;
         report.agents_fill_disk = found.agents_fill_disk;
         report.logs.clone_from(&self.logs.borrow());

@@ -14,7 +14,7 @@ use futures::{StreamExt, TryStreamExt};
 use super::WorkspaceError;
 use crate::pod::blocking;
 use crate::pod::daily::Daily;
-use crate::pod::gather::results_plan;
+use crate::pod::gather::Gatherer;
 use crate::pod::keys::{EVALAI, MERGED, REFUSED, checkpoint_path};
 use crate::pod::report::{OWNER_KEY, REPORT_KEY};
 use crate::pod::run::{Run, STATUS_FOLDER};
@@ -23,7 +23,6 @@ use crate::pod::upload::quota::{LEAST, Quota};
 use crate::pod::upload::{Memory, Stored, fingerprint};
 use crate::services::archive::{Archive, Listed};
 use leaderboard_api::names::FAILURE_LOG_KEY;
-use leaderboard_results::{Plan, read_worker};
 use leaderboard_runner::protocol::Pair;
 
 /// Most objects of a run.
@@ -43,7 +42,12 @@ pub struct Restored {
 }
 
 /// Downloads what the run goes on with, and removes the stored status files.
-pub async fn restore(run: &Run, archive: &Archive, tree: &Arc<Tree>) -> Result<Restored, WorkspaceError> {
+pub async fn restore(
+    gatherer: Gatherer,
+    run: &Run,
+    archive: &Archive,
+    tree: &Arc<Tree>,
+) -> Result<Restored, WorkspaceError> {
     let statuses = archive.list(&format!("{STATUS_FOLDER}/"), MAX_OBJECTS).await?;
     let keys: Vec<String> = statuses.objects.into_iter().map(|object| object.key).collect();
     archive.delete(&keys).await?;
@@ -69,8 +73,7 @@ pub async fn restore(run: &Run, archive: &Archive, tree: &Arc<Tree>) -> Result<R
         download(archive, tree, object, &path).await?;
     }
     let stored = download_all(archive, tree, chosen.objects).await?;
-    let (plan, own) = (results_plan(run)?, Arc::clone(tree));
-    let removed = blocking(move || remove_of_other_routes(&plan, &own)).await;
+    let removed = blocking(move || gatherer.remove_others()).await;
     removed
         .map_err(TreeError::from)
         .flatten()
@@ -241,27 +244,6 @@ async fn download(
     Ok(Some((object.key, stored)))
 }
 
-/// Removes the checkpoints of other routes, as those of before the plan was changed. None of their routes counts here, and one that is
-/// complete would be taken for a pair with nothing left to drive.
-fn remove_of_other_routes(plan: &Plan, tree: &Tree) -> Result<(), TreeError> {
-    for pair in Pair::first(plan.pairs.len()) {
-        let (path, index) = (checkpoint_path(pair), pair.index());
-        let found = match tree.read(&path, plan.limits_of(index).bytes as u64) {
-            Ok(Some((bytes, _))) => read_worker(plan, index, &bytes),
-            // logcopy refuses it.
-            Ok(None) | Err(TreeError::TooLarge { .. }) => continue,
-            Err(error) => return Err(error),
-        };
-        if let Err(refusal) = found
-            && refusal.is_of_other_routes()
-        {
-            tracing::warn!("{refusal}: the stored checkpoint is not gone on with, and the pair begins anew");
-            tree.remove(&path)?;
-        }
-    }
-    Ok(())
-}
-
 fn fingerprint_of(tree: &Tree, path: &str) -> Result<Option<(String, Stamp)>, TreeError> {
     let Some((file, stamp)) = tree.file(path)? else {
         return Ok(None);
@@ -279,29 +261,8 @@ fn volume(path: &str, error: TreeError) -> WorkspaceError {
 #[cfg(test)]
 mod tests {
     use super::*;
-    use crate::pod::fixtures;
 
     const MIB: u64 = 1 << 20;
-
-    #[test]
-    fn a_complete_checkpoint_of_other_routes_does_not_make_a_pair_done() {
-        let folder = tempfile::tempdir().unwrap();
-        let plan = results_plan(&fixtures::run()).unwrap();
-        let tree = Tree::open(folder.path()).unwrap();
-        fixtures::put_checkpoint(folder.path(), 1, &fixtures::checkpoint(0, 2, 2));
-        fixtures::put_checkpoint(folder.path(), 2, &fixtures::checkpoint(1, 2, 2));
-        remove_of_other_routes(&plan, &tree).unwrap();
-        let is_there = |pair: u16| tree.file(&checkpoint_path(Pair::new(pair).unwrap())).unwrap().is_some();
-        assert_eq!((is_there(1), is_there(2)), (true, false));
-        // Every other refusal is logcopy's matter.
-        fixtures::put_checkpoint(
-            folder.path(),
-            2,
-            &fixtures::checkpoint(2, 2, 2).replace("100.0", "1000.0"),
-        );
-        remove_of_other_routes(&plan, &tree).unwrap();
-        assert!(is_there(2));
-    }
 
     fn listed(key: &str, size: u64) -> Listed {
         Listed {
