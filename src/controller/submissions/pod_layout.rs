@@ -1,16 +1,29 @@
 //! The inside of a Pod as the Job and the rules for an overlay agree on it: volumes, paths, variables. Pure.
 
+use super::job_spec::workload::ContentsVolume;
 use crate::pod::run::{IDENTITY, LOGS, NAME_FILES, PODINFO, TOOLS};
 
 pub(super) const CARLA_ROOT: &str = "/workspace/CARLA";
 pub(super) const SCENARIO_RUNNER_ROOT: &str = "/workspace/scenario_runner";
 pub(super) const LEADERBOARD_ROOT: &str = "/workspace/leaderboard";
 
-/// Volumes with the private contents, each with where `contents` writes it and where agents read it.
-pub(super) const CONTENTS_VOLUMES: [(&str, &str, &str); 3] = [
-    ("leaderboard", "/tmp/leaderboard", LEADERBOARD_ROOT),
-    ("scenario-runner", "/tmp/scenario_runner", SCENARIO_RUNNER_ROOT),
-    ("carla-python-api", "/tmp/CARLA", CARLA_ROOT),
+/// Volumes with the private contents.
+pub(super) const CONTENTS_VOLUMES: [ContentsVolume; 3] = [
+    ContentsVolume {
+        name: "leaderboard",
+        written: "/tmp/leaderboard",
+        read: LEADERBOARD_ROOT,
+    },
+    ContentsVolume {
+        name: "scenario-runner",
+        written: "/tmp/scenario_runner",
+        read: SCENARIO_RUNNER_ROOT,
+    },
+    ContentsVolume {
+        name: "carla-python-api",
+        written: "/tmp/CARLA",
+        read: CARLA_ROOT,
+    },
 ];
 /// The other volumes of ours. Nothing but our own mounts of them keeps a stranger from what is in them.
 pub(super) const OWN_VOLUMES: [&str; 4] = [LOGS_VOLUME, TOOLS_VOLUME, PODINFO_VOLUME, IDENTITY_VOLUME];
@@ -61,7 +74,7 @@ pub(super) fn python_path() -> String {
 pub(super) fn protected_mounts() -> impl Iterator<Item = &'static str> {
     let contents = CONTENTS_VOLUMES
         .into_iter()
-        .flat_map(|(_, written, read)| [written, read]);
+        .flat_map(|volume| [volume.written, volume.read]);
     contents
         .chain([
             LOGS,

@@ -36,11 +36,7 @@ pub(super) struct Crash {
 }
 
 /// The table. `None`: neither side has crashed; whether their Pod is lost is not judged here.
-pub(super) fn last_crash(
-    host: Option<&ContainerView>,
-    agent: Option<&ContainerView>,
-    now: Timestamp,
-) -> Option<Crash> {
+pub(super) fn last_crash(host: Option<&ContainerView>, agent: Option<&ContainerView>, now: Timestamp) -> Option<Crash> {
     if let Some(crash) = from_outside(host, agent) {
         return Some(crash);
     }

@@ -52,7 +52,10 @@ pub(super) fn waiting(pod: &PodView) -> Vec<&str> {
         Some(next) if is_before_its_pull(next) => vec![&next.name],
         Some(_) => Vec::new(),
         None => {
-            let of_workers = pod.containers.iter().filter(|container| Member::parse(&container.name).is_some());
+            let of_workers = pod
+                .containers
+                .iter()
+                .filter(|container| Member::parse(&container.name).is_some());
             let waiting = of_workers.filter(|container| is_before_its_pull(container));
             waiting.map(|container| container.name.as_str()).collect()
         }

@@ -89,17 +89,15 @@ fn claim_name(pair: Pair) -> String {
     format!("gpu-{pair}")
 }
 
-/// What the runner of a simulator checks before it starts the server: nothing where the operator gives no GPU. By its index the agent
-/// has one only if the node's runtime obeys the variable, and else it would be charged for the lack of it.
-pub(super) fn check(source: GpuSource<'_>, needs: Needs) -> impl Iterator<Item = String> {
-    let own = (source != GpuSource::None).then(|| format!("--gpu={needs}"));
-    let of_agent = is_by_index(source).then(|| "--agent-gpu=true".to_owned());
-    own.into_iter().chain(of_agent)
-}
-
-/// The same for the runner of an agent, which reports to its simulator.
-pub(super) fn report(source: GpuSource<'_>) -> Option<String> {
-    is_by_index(source).then(|| "--report-gpu=true".to_owned())
+/// Flags of the runner: what it checks before it starts its command, which is nothing where the operator gives no GPU. By its index the
+/// agent has one only if the node's runtime obeys the variable, and else it would be charged for the lack of it: it reports to its host.
+pub(super) fn flags(source: GpuSource<'_>, side: Side, draws: Option<Needs>) -> impl Iterator<Item = String> {
+    let own = draws.filter(|_| source != GpuSource::None);
+    let of_agent = is_by_index(source).then(|| match side {
+        Side::Host => "--agent-gpu=true".to_owned(),
+        Side::Agent => "--report-gpu=true".to_owned(),
+    });
+    own.map(|needs| format!("--gpu={needs}")).into_iter().chain(of_agent)
 }
 
 fn is_by_index(source: GpuSource<'_>) -> bool {

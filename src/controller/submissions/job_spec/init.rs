@@ -7,7 +7,7 @@ use k8s_openapi::api::core::v1::{
 };
 
 use super::security::{confined, context, resources};
-use super::{JobInput, commands, own_uid, resume, run_document, variable, volumes};
+use super::{JobInput, commands, is_resumed, own_uid, run_document, variable, volumes};
 use crate::controller::submissions::pod_layout::CONTENTS_LOG_FOLDER;
 use crate::pod::ownlog::CONTENTS_LOG;
 use crate::pod::run::{ENV_POD_UID, ENV_ROLE_ARN, ENV_RUN, RUNNER, TOOLS};
@@ -52,7 +52,8 @@ fn contents_env(input: &JobInput<'_>) -> Vec<EnvVar> {
     let (plan, hosts) = (input.plan, &input.spec().contents.env);
     let ours = [
         variable("SUBMISSION_ID", plan.run_id.as_str()),
-        variable("RESUME", resume(input)),
+        // The evaluator takes any text for a yes.
+        variable("RESUME", if is_resumed(input) { "1" } else { "" }),
         variable("S3_BUCKET", &plan.storage.bucket),
     ];
     let is_free = |ours: &EnvVar| hosts.iter().all(|hosts| hosts.name != ours.name);

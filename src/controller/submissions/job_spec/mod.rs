@@ -3,6 +3,7 @@
 //! Pure: no client, no clock, no error. Called by the controller when an attempt starts, and for the dry run that checks a
 //! Leaderboard. It owns everything the Pod is made of; what the containers then do is in `pod` and in the runner.
 
+mod carla;
 mod commands;
 mod disk;
 mod display;
@@ -14,6 +15,7 @@ mod own_uid;
 mod pairs;
 mod security;
 mod volumes;
+pub mod workload;
 
 #[cfg(test)]
 mod command_tests;
@@ -45,10 +47,10 @@ use crate::controller::settings::Settings;
 use crate::pod::run::{Isolation, Run, SCHEMA};
 pub use gpu_count::gpus;
 use leaderboard_api::{
-    Attempt, Deadlines, Enforcement, FailedNode, JobNumber, Leaderboard, LeaderboardSpec, PolicySource, RunPlan,
-    Submission, Track, conditions, effective, names, reasons,
+    Attempt, Deadlines, Enforcement, FailedNode, GpuSource, JobNumber, Leaderboard, LeaderboardSpec, PolicySource,
+    RunPlan, Submission, Track, conditions, effective, names, reasons,
 };
-use leaderboard_runner::protocol::Pair;
+use workload::Asked;
 
 /// Seconds the containers have between SIGTERM and SIGKILL: the agents' 20 s, then logcopy's last upload.
 const GRACE_SECONDS: i64 = 600;
@@ -87,6 +89,17 @@ impl JobInput<'_> {
 
     fn deadlines(&self) -> Deadlines {
         effective::deadlines(self.spec(), self.track())
+    }
+
+    fn asked(&self) -> Asked<'_> {
+        Asked {
+            spec: self.spec(),
+            track: self.track(),
+            plan: self.plan,
+            deadlines: self.deadlines(),
+            resume: is_resumed(self),
+            has_gpus: source(self.spec()) != GpuSource::None,
+        }
     }
 
     fn pairs(&self) -> usize {
@@ -258,7 +271,6 @@ fn generation(input: &JobInput<'_>) -> i64 {
 }
 
 fn pod(input: &JobInput<'_>) -> PodSpec {
-    let pairs = Pair::first(input.pairs());
     let identity = input.spec().pod_identity.as_ref();
     PodSpec {
         restart_policy: Some("OnFailure".into()),
@@ -268,11 +280,7 @@ fn pod(input: &JobInput<'_>) -> PodSpec {
             init::contents(input),
             init::logcopy(input),
         ]),
-        containers: pairs
-            .clone()
-            .map(|pair| pairs::simulator(input, pair))
-            .chain(pairs.map(|pair| pairs::agent(input, pair)))
-            .collect(),
+        containers: pairs::all(input),
         volumes: Some(volumes::all(input)),
         active_deadline_seconds: active_deadline(&input.deadlines()),
         termination_grace_period_seconds: Some(GRACE_SECONDS),
@@ -320,7 +328,7 @@ fn settle(template: &mut Value, input: &JobInput<'_>) {
     for list in ["initContainers", "containers"] {
         for container in pod[list].as_array_mut().into_iter().flatten() {
             gpu::hide(container, gpus);
-            display::settle(container, input.spec());
+            pairs::settle(container, input);
             security::settle(container);
         }
     }
@@ -351,11 +359,6 @@ fn variable(name: &str, value: &str) -> EnvVar {
     }
 }
 
-/// `RESUME` of a run: the evaluator takes any text for a yes.
-fn resume(input: &JobInput<'_>) -> &'static str {
-    if input.plan.resume || input.number.attempt > Attempt::FIRST {
-        "1"
-    } else {
-        ""
-    }
+fn is_resumed(input: &JobInput<'_>) -> bool {
+    input.plan.resume || input.number.attempt > Attempt::FIRST
 }

@@ -1,20 +1,20 @@
 //! The Pod's volumes, and who mounts which of them where. Pure; called by the builders of the containers.
 
 use k8s_openapi::api::core::v1::{
-    DownwardAPIVolumeFile, DownwardAPIVolumeSource, EmptyDirVolumeSource, ObjectFieldSelector, ProjectedVolumeSource,
-    ServiceAccountTokenProjection, Volume, VolumeMount, VolumeProjection,
+    DownwardAPIVolumeFile, DownwardAPIVolumeSource, EmptyDirVolumeSource, HostPathVolumeSource, ObjectFieldSelector,
+    ProjectedVolumeSource, ServiceAccountTokenProjection, Volume, VolumeMount, VolumeProjection,
 };
 use k8s_openapi::apimachinery::pkg::api::resource::Quantity;
 
-use super::{JobInput, display};
+use super::workload::Mount;
+use super::{JobInput, pairs};
 use crate::controller::submissions::pod_layout::{
-    AGENT, CONTENTS_LOG_FOLDER, CONTENTS_VOLUMES, IDENTITY_VOLUME, LOGS_VOLUME, PODINFO_VOLUME, SAVED, SHM, SHM_VOLUME,
-    STATUS, TOOLS_VOLUME,
+    CONTENTS_LOG_FOLDER, CONTENTS_VOLUMES, IDENTITY_VOLUME, LOGS_VOLUME, PODINFO_VOLUME, SHM, SHM_VOLUME, STATUS,
+    TOOLS_VOLUME,
 };
-use crate::pod::keys::agent_folder;
 use crate::pod::run::{IDENTITY, IDENTITY_TOKEN_FILE, LOGS, NAME_FILES, PODINFO, STATUS_FOLDER, STOP_FILE, TOOLS};
 use leaderboard_api::{ByteQuantity, names};
-use leaderboard_runner::protocol::Pair;
+use leaderboard_runner::protocol::{Member, Pair, Side};
 
 const AUDIENCE: &str = "sts.amazonaws.com";
 const TOKEN_SECONDS: i64 = 3600;
@@ -24,7 +24,7 @@ const LOGS_MARGIN: u64 = 1 << 30;
 
 /// Every volume of the Pod.
 pub(super) fn all(input: &JobInput<'_>) -> Vec<Volume> {
-    let contents = CONTENTS_VOLUMES.map(|(name, _, _)| empty(name, None));
+    let contents = CONTENTS_VOLUMES.map(|volume| empty(volume.name, None));
     let own = [
         empty(LOGS_VOLUME, Some(Quantity(logs_limit(input).to_string()))),
         empty(TOOLS_VOLUME, Some(Quantity("64Mi".into()))),
@@ -33,9 +33,31 @@ pub(super) fn all(input: &JobInput<'_>) -> Vec<Volume> {
     let identity = input.spec().has_role().then(identity);
     let shared = input.spec().agent.shm_size.iter();
     let shared = shared.flat_map(|size| Pair::first(input.pairs()).map(|pair| memory(pair, size)));
-    let display = display::volume(input);
     let all = contents.into_iter().chain(own).chain(identity);
-    all.chain(display).chain(shared).collect()
+    all.chain(of_node(input)).chain(shared).collect()
+}
+
+/// Folders of the node that a worker's containers mount, which are the same for all workers.
+fn of_node(input: &JobInput<'_>) -> Vec<Volume> {
+    let workload = Pair::first(input.pairs())
+        .next()
+        .map(|pair| pairs::workload(input, pair));
+    let roles = workload
+        .into_iter()
+        .flat_map(|workload| [Some(workload.host), workload.agent]);
+    let mounts = roles.flatten().flat_map(|role| role.mounts);
+    let volumes = mounts.filter_map(|mount| match mount {
+        Mount::OfNode { volume, path } => Some(Volume {
+            name: volume.into(),
+            host_path: Some(HostPathVolumeSource {
+                path: path.into(),
+                type_: Some("Directory".into()),
+            }),
+            ..Volume::default()
+        }),
+        Mount::Own { .. } | Mount::Contents(_) => None,
+    });
+    volumes.collect()
 }
 
 /// The shared memory of one agent, which no other one sees.
@@ -115,7 +137,7 @@ fn identity() -> Volume {
 
 /// Where `contents` writes, and the runner that keeps what it prints.
 pub(super) fn of_contents() -> Vec<VolumeMount> {
-    let written = CONTENTS_VOLUMES.map(|(volume, written, _)| mount(volume, written));
+    let written = CONTENTS_VOLUMES.map(|volume| mount(volume.name, volume.written));
     let own = [
         read_only(mount(TOOLS_VOLUME, TOOLS)),
         mount_part(LOGS_VOLUME, "contents".into(), CONTENTS_LOG_FOLDER),
@@ -135,26 +157,27 @@ pub(super) fn of_logcopy(input: &JobInput<'_>) -> Vec<VolumeMount> {
     own.into_iter().chain(token(input)).collect()
 }
 
-/// What a simulator sees.
-pub(super) fn of_simulator(input: &JobInput<'_>, container: &str) -> Vec<VolumeMount> {
-    let own = [mount_part(LOGS_VOLUME, "simulator".into(), SAVED)];
-    let mounts = runner_and_status(container).into_iter().chain(own);
-    mounts.chain(name_files()).chain(display::mount(input)).collect()
-}
-
-/// What an agent sees.
-pub(super) fn of_agent(input: &JobInput<'_>, container: &str, pair: Pair) -> Vec<VolumeMount> {
-    let contents = CONTENTS_VOLUMES.map(|(volume, _, read)| read_only(mount(volume, read)));
-    let own = [mount_part(LOGS_VOLUME, agent_folder(pair), AGENT)];
-    let shared = input.spec().agent.shm_size.as_ref();
-    let shared = shared.map(|_| mount(&format!("{SHM_VOLUME}{pair}"), SHM));
-    runner_and_status(container)
+/// What a container of a worker sees.
+pub(super) fn of_member(input: &JobInput<'_>, member: Member, mounts: &[Mount]) -> Vec<VolumeMount> {
+    let (of_node, of_pod): (Vec<&Mount>, Vec<&Mount>) =
+        mounts.iter().partition(|mount| matches!(mount, Mount::OfNode { .. }));
+    let has_shared = member.side == Side::Agent && input.spec().agent.shm_size.is_some();
+    let shared = has_shared.then(|| mount(&format!("{SHM_VOLUME}{}", member.pair), SHM));
+    runner_and_status(&member.to_string())
         .into_iter()
-        .chain(contents)
-        .chain(own)
+        .chain(of_pod.into_iter().map(mounted))
         .chain(name_files())
+        .chain(of_node.into_iter().map(mounted))
         .chain(shared)
         .collect()
+}
+
+fn mounted(wanted: &Mount) -> VolumeMount {
+    match wanted {
+        Mount::Own { folder, path } => mount_part(LOGS_VOLUME, folder.clone(), path),
+        Mount::Contents(volume) => read_only(mount(volume.name, volume.read)),
+        Mount::OfNode { volume, path } => read_only(mount(volume, path)),
+    }
 }
 
 /// The Pod's own ones are one file for all containers, and root could write to them.

@@ -174,7 +174,7 @@ fn spec(spec: &Map<String, Value>) -> Checked {
 fn volumes(value: &Value) -> Checked {
     for (path, volume) in named(value, "podOverrides.spec.volumes")? {
         if let Some(name) = volume["name"].as_str()
-            && (OWN_VOLUMES.contains(&name) || CONTENTS_VOLUMES.iter().any(|(known, _, _)| *known == name))
+            && (OWN_VOLUMES.contains(&name) || CONTENTS_VOLUMES.iter().any(|known| known.name == name))
         {
             return protected(path, "the operator fills this volume; give yours another name");
         }
@@ -294,7 +294,7 @@ fn mounts(path: &str, container: &Map<String, Value>) -> Checked {
         if OWN_VOLUMES.contains(&volume) {
             return protected(path, format!("volume {volume} is mounted by the operator alone"));
         }
-        if !read_only && CONTENTS_VOLUMES.iter().any(|(known, _, _)| *known == volume) {
+        if !read_only && CONTENTS_VOLUMES.iter().any(|known| known.name == volume) {
             return protected(
                 path,
                 format!("volume {volume} holds the contents; mount it with readOnly true"),

@@ -1,0 +1,65 @@
+//! What a Pod runs, as plain data: a kind of evaluation says it, and the other modules here make Kubernetes' objects of it.
+
+use leaderboard_api::{Deadlines, LeaderboardSpec, RunPlan, Track};
+use leaderboard_runner::graphics::Needs;
+
+/// What a workload depends on.
+#[derive(Clone, Copy, Debug)]
+pub struct Asked<'a> {
+    pub spec: &'a LeaderboardSpec,
+    /// `None` if an edit of the Leaderboard has taken it away since.
+    pub track: Option<&'a Track>,
+    pub plan: &'a RunPlan,
+    pub deadlines: Deadlines,
+    /// The run goes on with what is stored.
+    pub resume: bool,
+    /// The operator gives GPUs to the containers.
+    pub has_gpus: bool,
+}
+
+/// The containers of one worker.
+#[derive(Clone, Debug, PartialEq, Eq)]
+pub struct Workload {
+    /// Runs the host's image.
+    pub host: Role,
+    /// Runs the participant's image.
+    pub agent: Option<Role>,
+}
+
+/// One container behind the runner.
+#[derive(Clone, Debug, PartialEq, Eq)]
+pub struct Role {
+    pub image: String,
+    /// Flags of the runner.
+    pub flags: Vec<String>,
+    /// The command that the runner starts, as Kubernetes gets it.
+    pub command: Vec<String>,
+    /// Variables with their values, which nothing expands.
+    pub env: Vec<(&'static str, String)>,
+    pub mounts: Vec<Mount>,
+    /// Variables of the image that the container does not get.
+    pub removes: &'static [&'static str],
+    /// The runner checks for a driver of this kind where the container has a GPU.
+    pub draws: Option<Needs>,
+}
+
+/// A mount besides those that each container behind the runner has.
+#[derive(Clone, Debug, PartialEq, Eq)]
+pub enum Mount {
+    /// A folder of the `logs` volume that the container writes.
+    Own { folder: String, path: &'static str },
+    /// A volume with the private contents, read-only.
+    Contents(ContentsVolume),
+    /// A folder of the node, read-only, which the node must have.
+    OfNode { volume: &'static str, path: &'static str },
+}
+
+/// A volume that `contents` fills.
+#[derive(Clone, Copy, Debug, PartialEq, Eq)]
+pub struct ContentsVolume {
+    pub name: &'static str,
+    /// Where `contents` writes it.
+    pub written: &'static str,
+    /// Where the agents read it.
+    pub read: &'static str,
+}
