@@ -64,7 +64,7 @@ async fn a_job_that_is_refused_keeps_nothing_else_from_being_done_and_is_known_t
     let around = surroundings(cluster, "http://127.0.0.1:9").await;
     let uses = || around.context.for_observe();
     let view = observe(uses(), Arc::new(submission.clone()), |_| true);
-    assert_eq!(view.job_refused, None);
+    assert_eq!(view.job, ObservedJob::Absent { refused: None });
     let status = submission.status.clone().unwrap();
     let plan = Plan {
         actions: vec![Action::CreateJob(status.job_number()), Action::AskEvalai],
@@ -78,8 +78,10 @@ async fn a_job_that_is_refused_keeps_nothing_else_from_being_done_and_is_known_t
     assert!(failed.is_err(), "it is tried again");
     tokio::time::advance(Duration::from_secs(1)).await;
     let seen = observe(uses(), Arc::new(submission), |_| true);
-    assert_eq!(seen.job_refused.as_deref(), Some("exceeded quota: q"));
-    assert!(seen.evalai_waited >= Duration::from_secs(1), "it was asked");
+    let refused = Some("exceeded quota: q".to_owned());
+    assert_eq!(seen.job, ObservedJob::Absent { refused });
+    let waited = uses().memory.evalai_waited(&seen.submission);
+    assert!(waited >= Duration::from_secs(1), "it was asked");
 }
 
 #[tokio::test(start_paused = true)]

@@ -66,11 +66,13 @@ impl ExternalSystems {
     /// What EvalAI is known to show of a submission.
     pub fn evalai_view(&self, leaderboard: Option<&Leaderboard>, submission: &Submission) -> Option<EvalaiView> {
         let evalai = submission.spec.evalai?;
+        let writes_from = self.hub.writes_from();
         let Some(seen) = self.hub.view(&key_of(submission)) else {
             let ready = leaderboard.is_some_and(|l| self.target(l).is_some());
             let error = (!ready).then(|| "the Leaderboard's token is not known yet; see its status".to_owned());
             return Some(EvalaiView {
                 error,
+                writes_from,
                 cancelled_as_of: leaderboard
                     .and_then(|board| self.hub.cancelled_as_of(&key_of(board), evalai.submission)),
                 ..EvalaiView::default()
@@ -78,6 +80,7 @@ impl ExternalSystems {
         };
         let observes = leaderboard.is_some_and(|board| board.spec.observes());
         Some(EvalaiView {
+            writes_from,
             shows_partial: leaderboard.is_some_and(|board| self.hub.shows_partial(&key_of(board), evalai.phase)),
             ..map_view(&as_observed(seen, observes), submission)
         })
@@ -256,14 +259,13 @@ fn map_view(seen: &SubmissionState, submission: &Submission) -> EvalaiView {
             }),
         read_at: seen.read_at,
         cancelled: ended.is_some(),
-        cancelled_as_of: None,
         overtaken: ended.is_some() && seen.overtaken,
         end: seen.end.as_ref().filter(|_| present).map(map_end),
         unread: seen.unread.clone().filter(|_| present),
         partial_done: seen.partial_done.filter(|_| present),
-        shows_partial: false,
         team_id: seen.row.as_ref().and_then(|row| row.team_id).map(|id| id.to_string()),
         error: seen.last_error.clone(),
+        ..EvalaiView::default()
     }
 }
 

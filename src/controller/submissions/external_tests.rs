@@ -15,7 +15,7 @@ use super::*;
 use crate::ask::Lookup;
 use crate::controller::fixtures::{Cluster, Surroundings, leaderboard, surroundings, with_job};
 use crate::controller::submissions::view::{
-    ObservedFence, ObservedJob, ObservedLog, ObservedNode, ObservedReport, Turn,
+    NodeView, ObservedFence, ObservedJob, ObservedLog, ObservedReport, ReportView, Turn,
 };
 use leaderboard_api::conditions::{self, Truth};
 use leaderboard_api::{Attempt, State, reasons};
@@ -98,22 +98,15 @@ async fn bench(state: State) -> Bench {
         is_policy_in_place: true,
         row: Lookup::default(),
         turn: Turn::Go,
-        job: ObservedJob::Absent,
-        job_refused: None,
-        evalai_waited: std::time::Duration::ZERO,
+        job: ObservedJob::Absent { refused: None },
         written_ago: None,
         pod: None,
-        leaving: None,
-        is_node_watched: true,
-        node: ObservedNode::Unknown,
-        report: ObservedReport::NotRead,
-        report_stage: None,
-        report_waited: std::time::Duration::ZERO,
+        node: NodeView::default(),
+        report: ReportView::default(),
         fence: ObservedFence::NotRequested,
         log: ObservedLog::NotRequested,
         evalai: None,
         record: Some(RecordView::default()),
-        evalai_writes_from: None,
     };
     Bench {
         around: surroundings(Cluster::default(), &endpoint).await,
@@ -150,7 +143,7 @@ fn last() -> ObservedReport {
 #[tokio::test]
 async fn the_row_of_an_end_has_the_metrics_of_the_last_report() {
     let mut bench = bench(State::Finished).await;
-    bench.view.report = last();
+    bench.view.report.stored = last();
     bench.records_the_end();
     let row = bench.row().await;
     assert_eq!(row["submission_status"], "FINISHED");
@@ -161,7 +154,7 @@ async fn the_row_of_an_end_has_the_metrics_of_the_last_report() {
 async fn the_row_of_an_end_without_results_that_count_has_no_metrics() {
     for (state, status) in [(State::Cancelled, "CANCELLED"), (State::Failed, "FAILED")] {
         let mut bench = bench(state).await;
-        bench.view.report = last();
+        bench.view.report.stored = last();
         bench.records_the_end();
         let row = bench.row().await;
         assert_eq!(
@@ -174,7 +167,7 @@ async fn the_row_of_an_end_without_results_that_count_has_no_metrics() {
 #[tokio::test]
 async fn nothing_is_recorded_for_a_leaderboard_that_may_not_name_its_table() {
     let mut bench = bench(State::Finished).await;
-    bench.view.report = last();
+    bench.view.report.stored = last();
     bench.view.not_allowed = Some("It may not name the table theirs.".to_owned());
     bench.records_the_end();
     let known = &bench.around.context.external;

@@ -28,31 +28,17 @@ pub struct View {
     /// Whether it may start now; only meaningful while it has no Job and all else is settled.
     pub turn: Turn,
     pub job: ObservedJob,
-    /// Why the API server has refused that Job, if it did.
-    pub job_refused: Option<String>,
     pub pod: Option<PodView>,
-    pub node: ObservedNode,
-    /// The taint that announces that the node is about to be taken away.
-    pub leaving: Option<String>,
-    /// Whether a watch shows the nodes; else each has to be asked for.
-    pub is_node_watched: bool,
-    pub report: ObservedReport,
-    /// What was known of the run when the answer in `report` was asked for; None: nothing was read for this Job.
-    pub report_stage: Option<Stage>,
-    /// How long the present report has been asked for.
-    pub report_waited: Duration,
+    pub node: NodeView,
+    pub report: ReportView,
     pub fence: ObservedFence,
     pub log: ObservedLog,
     /// None for a submission that is not EvalAI's.
     pub evalai: Option<EvalaiView>,
-    /// How long EvalAI has been asked whether the present attempt is to run.
-    pub evalai_waited: Duration,
     /// How long ago this process wrote the status; None: it has not.
     pub written_ago: Option<Duration>,
     /// None if the Leaderboard has no table.
     pub record: Option<RecordView>,
-    /// Until when nothing is written to EvalAI, because the controller before may still have requests under way.
-    pub evalai_writes_from: Option<Timestamp>,
 }
 
 impl View {
@@ -68,7 +54,10 @@ impl View {
 /// The Job that the present attempt should have.
 #[derive(Clone, Debug, PartialEq)]
 pub enum ObservedJob {
-    Absent,
+    /// It is not there; with the words of the API server, if it refuses that Job.
+    Absent {
+        refused: Option<String>,
+    },
     /// We created it a moment ago, and the cache does not show it yet.
     Created,
     /// It has the right name but another owner: an older object's, going away.
@@ -81,7 +70,7 @@ impl ObservedJob {
     pub fn ours(&self) -> Option<&JobView> {
         match self {
             Self::Ours(job) => Some(job),
-            Self::Absent | Self::Created | Self::Foreign => None,
+            Self::Absent { .. } | Self::Created | Self::Foreign => None,
         }
     }
 }
@@ -176,6 +165,8 @@ pub struct NodeView {
     pub state: ObservedNode,
     /// The taint that announces its end.
     pub leaving: Option<String>,
+    /// A watch shows the nodes; else each has to be asked for.
+    pub is_watched: bool,
 }
 
 /// What an autoscaler has reported of a Pod that no node accepts.
@@ -280,9 +271,10 @@ pub enum LogAt {
 }
 
 /// The report in S3, as far as it was read.
-#[derive(Clone, Debug, PartialEq)]
+#[derive(Clone, Debug, Default, PartialEq)]
 pub enum ObservedReport {
     /// It was not read, or nobody has asked for it.
+    #[default]
     NotRead,
     Absent,
     /// Another object's or attempt's.
@@ -292,11 +284,21 @@ pub enum ObservedReport {
     Ours(Arc<ReportDigest>),
 }
 
-impl ObservedReport {
+/// The answer to the last question for the report, and for how long a newer one has waited.
+#[derive(Clone, Debug, Default, PartialEq)]
+pub struct ReportView {
+    pub stored: ObservedReport,
+    /// The state of the run when that was asked for; None: nothing was read for this Job.
+    pub stage: Option<Stage>,
+    /// How long the present question has waited.
+    pub waited: Duration,
+}
+
+impl ReportView {
     /// The report, if it is ours.
     pub fn ours(&self) -> Option<&Arc<ReportDigest>> {
-        match self {
-            Self::Ours(report) => Some(report),
+        match &self.stored {
+            ObservedReport::Ours(report) => Some(report),
             _ => None,
         }
     }
@@ -331,6 +333,10 @@ pub enum ObservedLog {
 pub struct EvalaiView {
     /// What EvalAI last reported of it; None until it was asked.
     pub info: Option<EvalaiInfo>,
+    /// How long it has been asked whether the present attempt is to run.
+    pub waited: Duration,
+    /// Until when nothing is written there, because the controller before may still have requests under way.
+    pub writes_from: Option<Timestamp>,
     /// When its row was read.
     pub read_at: Option<Timestamp>,
     /// It was cancelled there, after this attempt was announced.

@@ -22,7 +22,7 @@ use tokio::time::Instant;
 use tracing::Instrument;
 
 use super::failure_log::{LogDemand, Tail};
-use super::view::{ObservedFence, ObservedLog, ReportDemand};
+use super::view::{ObservedFence, ObservedLog, ReportDemand, ReportView};
 use crate::controller::objects::{Wake, uid};
 use crate::lock::lock;
 use crate::observability::tasks::Tasks;
@@ -30,7 +30,7 @@ use crate::services::archive::Archive;
 use crate::services::aws::Aws;
 use leaderboard_api::{RunPlan, Storage, Submission, SubmissionStatus, effective};
 use request::{Done, Target, Uid, Work};
-use state::{SeenReport, State};
+use state::State;
 
 /// A worker whose bucket nobody uses ends after this long: the next submission of a quiet Leaderboard finds it ready.
 const LINGERS: Duration = Duration::from_mins(1);
@@ -73,7 +73,7 @@ impl Bucket {
 
 /// What a run's worker remembers of it.
 pub struct Observed {
-    pub report: SeenReport,
+    pub report: ReportView,
     pub fence: ObservedFence,
     pub log: ObservedLog,
 }

@@ -12,7 +12,7 @@ use tokio::time::Instant;
 use super::request::{Done, KINDS, Kind, LIMITS, Target, Uid, What, Work};
 use super::run::{FenceRun, LogRun, ReportRun, Run, answers};
 use crate::controller::submissions::failure_log::{LogAnswer, LogDemand, Tail};
-use crate::controller::submissions::view::{ObservedFence, ObservedLog, ObservedReport, ReportDemand, Stage};
+use crate::controller::submissions::view::{ObservedFence, ObservedLog, ReportDemand, ReportView, Stage};
 use leaderboard_api::JobNumber;
 
 /// Time between two reads of reports in one bucket: at most 100 a second.
@@ -36,13 +36,6 @@ pub(super) struct State {
     under_way: [usize; KINDS.len()],
     next_read: Option<Instant>,
     memories: u64,
-}
-
-/// What is known of a run's report.
-pub struct SeenReport {
-    pub report: ObservedReport,
-    pub stage: Option<Stage>,
-    pub waited: Duration,
 }
 
 impl State {
@@ -92,21 +85,17 @@ impl State {
     }
 
     /// What is known of a report, seen from a run that is at this Job with this Pod.
-    pub fn report(&self, uid: &str, job: JobNumber, pod: Option<&str>, now: Instant) -> SeenReport {
+    pub fn report(&self, uid: &str, job: JobNumber, pod: Option<&str>, now: Instant) -> ReportView {
         let run = self.runs.get(uid);
         let Some((run, known)) = run.and_then(|run| Some((run, run.report.as_ref()?))) else {
-            return SeenReport {
-                report: ObservedReport::NotRead,
-                stage: None,
-                waited: Duration::ZERO,
-            };
+            return ReportView::default();
         };
         let is_of = |sent: &&ReportDemand| {
             let is_of_pod = sent.pod.as_deref() == pod || sent.stage == Stage::JobEnded;
             sent.job == job && is_of_pod
         };
-        SeenReport {
-            report: known.shown(job.attempt, *run.target.submission_uid != *uid),
+        ReportView {
+            stored: known.shown(job.attempt, *run.target.submission_uid != *uid),
             stage: known.of.as_ref().filter(is_of).map(|sent| sent.stage),
             waited: now.saturating_duration_since(known.since),
         }

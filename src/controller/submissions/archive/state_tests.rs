@@ -3,7 +3,7 @@
 use super::*;
 use crate::controller::submissions::archive::request::Answer;
 use crate::controller::submissions::report_digest::ReportDigest;
-use crate::controller::submissions::view::{LogAt, LogPlace};
+use crate::controller::submissions::view::{LogAt, LogPlace, ObservedReport};
 use leaderboard_api::Attempt;
 
 struct Bench {
@@ -94,7 +94,7 @@ impl Bench {
         self.answer(&work, answer)
     }
 
-    fn seen(&self) -> SeenReport {
+    fn seen(&self) -> ReportView {
         self.state
             .report("u", JobNumber::first(Attempt(1)), Some("p"), self.now)
     }
@@ -104,7 +104,7 @@ impl Bench {
     }
 
     fn done(&self) -> Option<u32> {
-        self.seen().report.ours().map(|report| report.done)
+        self.seen().ours().map(|report| report.done)
     }
 
     fn want_fence(&mut self, retry: i32) {
@@ -206,7 +206,7 @@ fn what_was_read_for_one_pod_or_job_is_no_answer_for_another() {
     let seen = bench
         .state
         .report("u", JobNumber::first(Attempt(2)), Some("p"), bench.now);
-    assert_eq!(seen.report, ObservedReport::Foreign, "another attempt's");
+    assert_eq!(seen.stored, ObservedReport::Foreign, "another attempt's");
     // The Pod goes with its Job.
     bench.wait(SPACING);
     bench.demand(Stage::JobEnded);
@@ -229,7 +229,7 @@ fn a_read_that_failed_is_an_answer_and_is_made_again() {
     assert!(bench.read(Answer::Failed("away".into())));
     let seen = bench.seen();
     assert_eq!(
-        (seen.report, seen.stage),
+        (seen.stored, seen.stage),
         (ObservedReport::Unreadable("away".into()), Some(Stage::JobEnded))
     );
     bench.demand(Stage::JobEnded);

@@ -102,25 +102,19 @@ impl Bench {
 #[tokio::test]
 async fn a_report_is_read_in_the_background_and_wakes_its_submission() {
     let mut bench = bench().await;
-    assert_eq!(bench.seen().report.report, ObservedReport::NotRead);
+    assert_eq!(bench.seen().report.stored, ObservedReport::NotRead);
     bench.demand(Stage::Live);
-    assert_eq!(bench.answer().await.report.report, ObservedReport::Absent);
+    assert_eq!(bench.answer().await.report.stored, ObservedReport::Absent);
     bench.stores("logcopy/report.json", report("all is well"));
     bench.demand(Stage::RunEnded);
     let seen = bench.answer().await.report;
-    assert_eq!(
-        (seen.stage, seen.report.ours().unwrap().done),
-        (Some(Stage::RunEnded), 4)
-    );
+    assert_eq!((seen.stage, seen.ours().unwrap().done), (Some(Stage::RunEnded), 4));
     // S3 answers that it is the same.
     bench.demand(Stage::JobEnded);
     let seen = bench.answer().await.report;
-    assert_eq!(
-        (seen.stage, seen.report.ours().unwrap().done),
-        (Some(Stage::JobEnded), 4)
-    );
+    assert_eq!((seen.stage, seen.ours().unwrap().done), (Some(Stage::JobEnded), 4));
     bench.workers().forget("uid-of-sub");
-    assert_eq!(bench.seen().report.report, ObservedReport::NotRead);
+    assert_eq!(bench.seen().report.stored, ObservedReport::NotRead);
 }
 
 #[tokio::test]
@@ -129,14 +123,14 @@ async fn what_is_no_report_is_unreadable_and_another_objects_is_foreign() {
     bench.stores("logcopy/report.json", "torn");
     bench.demand(Stage::JobEnded);
     let seen = bench.answer().await.report;
-    assert!(matches!(seen.report, ObservedReport::Unreadable(why) if why.contains("not one of ours")));
+    assert!(matches!(seen.stored, ObservedReport::Unreadable(why) if why.contains("not one of ours")));
     bench.stores(
         "logcopy/report.json",
         report("").replace("uid-of-sub", "uid-of-another"),
     );
     bench.workers().forget("uid-of-sub");
     bench.demand(Stage::JobEnded);
-    assert_eq!(bench.answer().await.report.report, ObservedReport::Foreign);
+    assert_eq!(bench.answer().await.report.stored, ObservedReport::Foreign);
 }
 
 #[tokio::test]
@@ -147,7 +141,7 @@ async fn a_report_of_before_a_restore_may_be_of_a_later_attempt() {
     bench.stores("logcopy/report.json", later.as_str());
     bench.demand(Stage::JobEnded);
     let seen = bench.answer().await.report;
-    assert_eq!(seen.report, ObservedReport::Foreign, "its own Pods are of its attempt");
+    assert_eq!(seen.stored, ObservedReport::Foreign, "its own Pods are of its attempt");
     let status = bench.submission.status.as_mut().unwrap();
     status.plan.as_mut().unwrap().submission_uid = Some("uid-before".into());
     for (stored, attempt) in [(former(&later), 2), (former(&report("")), 1)] {
@@ -155,7 +149,7 @@ async fn a_report_of_before_a_restore_may_be_of_a_later_attempt() {
         bench.stores("logcopy/report.json", stored);
         bench.demand(Stage::JobEnded);
         let seen = bench.answer().await.report;
-        assert_eq!(seen.report.ours().unwrap().attempt, Attempt(attempt));
+        assert_eq!(seen.ours().unwrap().attempt, Attempt(attempt));
     }
 }
 

@@ -259,7 +259,13 @@ fn ask_evalai<'a>(draft: &mut PlanBuilder<'a>) -> Answer<'a> {
         Some(info) => Answer::Wanted(info),
         None => {
             draft.act(Action::AskEvalai);
-            if draft.waits_quietly(draft.view.evalai_waited) {
+            if draft.waits_quietly(
+                draft
+                    .view
+                    .evalai
+                    .as_ref()
+                    .map_or(Duration::ZERO, |evalai| evalai.waited),
+            ) {
                 return Answer::Waiting;
             }
             draft.requeue_in(RETRY);

@@ -242,7 +242,7 @@ fn send_end(draft: &mut PlanBuilder<'_>, evalai: EvalaiView, is_overtaken: bool,
             reasons::CONCURRENT_UPDATE,
             failed.or_else(|| Some(SENT_AGAIN.to_owned())),
         )
-    } else if let Some(until) = draft.view.evalai_writes_from {
+    } else if let Some(until) = evalai.writes_from {
         draft.requeue_at(until);
         (
             reasons::WAITING_FOR_PREVIOUS_CONTROLLER,

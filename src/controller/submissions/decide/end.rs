@@ -36,7 +36,7 @@ pub(super) fn decide(draft: &mut PlanBuilder<'_>, job_end: Option<&JobEnd>) {
         return draft.requeue_in(left);
     }
     // Without a plan nobody knows where a report would be.
-    let is_read = reading::is_of(draft, Stage::JobEnded) && view.report != ObservedReport::NotRead;
+    let is_read = reading::is_of(draft, Stage::JobEnded) && view.report.stored != ObservedReport::NotRead;
     if draft.status.plan.is_some() && !is_read {
         if let Some(left) = reading::answer_left(draft) {
             return draft.requeue_in(left);
@@ -45,7 +45,7 @@ pub(super) fn decide(draft: &mut PlanBuilder<'_>, job_end: Option<&JobEnd>) {
             return;
         }
     }
-    let report = match &view.report {
+    let report = match &view.report.stored {
         ObservedReport::Ours(report) if is_read => Some(report.as_ref()),
         ObservedReport::Unreadable(why) if wait_for_bucket(draft, why) => return,
         _ => None,

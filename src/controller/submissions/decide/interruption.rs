@@ -35,7 +35,7 @@ fn cause(draft: &PlanBuilder<'_>, pod: &PodView) -> Option<String> {
     if let Some(who) = taken_by(pod) {
         return Some(format!("Pod {} is taken from node {node} ({who}).", pod.name));
     }
-    let taint = draft.view.leaving.as_deref()?;
+    let taint = draft.view.node.leaving.as_deref()?;
     // A Pod that tolerates the taint can come back to the same node.
     let was_here = past.is_some_and(|past| past.nodes.iter().any(|known| known == node));
     (!was_here).then(|| format!("Node {node} is about to be taken away (taint {taint})."))

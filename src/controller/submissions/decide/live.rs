@@ -36,8 +36,8 @@ pub(super) fn decide(draft: &mut PlanBuilder<'_>) {
         ObservedJob::Ours(job) => with_job(draft, job),
         ObservedJob::Created => draft.requeue_in(LOOK),
         ObservedJob::Foreign if !draft.is_to_stop() => name_taken(draft),
-        ObservedJob::Absent | ObservedJob::Foreign if has_job => without_its_job(draft),
-        ObservedJob::Absent | ObservedJob::Foreign => in_line(draft),
+        ObservedJob::Absent { .. } | ObservedJob::Foreign if has_job => without_its_job(draft),
+        ObservedJob::Absent { .. } | ObservedJob::Foreign => in_line(draft),
     }
     follow(draft);
 }
@@ -124,7 +124,7 @@ fn start_job(draft: &mut PlanBuilder<'_>) {
     draft.status.job_name = Some(name);
     note_gpus(draft);
     draft.act(Action::CreateJob(draft.status.job_number()));
-    if let Some(words) = &view.job_refused {
+    if let ObservedJob::Absent { refused: Some(words) } = &view.job {
         start::job_refused(draft, words);
     } else if draft.is_running() {
         draft.waits(reasons::PREPARING);

@@ -82,7 +82,7 @@ fn look_up_node(draft: &mut PlanBuilder<'_>) {
         .view
         .pod
         .as_ref()
-        .filter(|pod| !draft.view.is_node_watched && pod.needs_node());
+        .filter(|pod| !draft.view.node.is_watched && pod.needs_node());
     let node = pod.filter(|pod| pod.delete_by.is_some() || pod.agent_started.is_some());
     if let Some(name) = node.and_then(|pod| pod.node.clone()) {
         draft.act(Action::LookUpNode(name));

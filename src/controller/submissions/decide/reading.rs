@@ -71,10 +71,10 @@ fn stage_of_live(draft: &PlanBuilder<'_>) -> Option<Stage> {
         ObservedJob::Ours(_) => draft.status.times.scheduled.as_ref().map(|_| Stage::Live),
         ObservedJob::Created => None,
         // One that is created only now is not there either, and what is stored is not its own.
-        ObservedJob::Absent if draft.does(|action| matches!(action, Action::CreateJob(_))) => None,
+        ObservedJob::Absent { .. } if draft.does(|action| matches!(action, Action::CreateJob(_))) => None,
         // Whether the first Job of an attempt was there, its report shows.
-        ObservedJob::Absent if draft.is_first_job() => Some(Stage::JobEnded),
-        ObservedJob::Absent | ObservedJob::Foreign => {
+        ObservedJob::Absent { .. } if draft.is_first_job() => Some(Stage::JobEnded),
+        ObservedJob::Absent { .. } | ObservedJob::Foreign => {
             (draft.is_to_stop() || draft.was_job_seen()).then_some(Stage::JobEnded)
         }
     }
@@ -82,12 +82,12 @@ fn stage_of_live(draft: &PlanBuilder<'_>) -> Option<Stage> {
 
 /// Whether the report that is known was asked for at this stage of the run, or later.
 pub(super) fn is_of(draft: &PlanBuilder<'_>, stage: Stage) -> bool {
-    draft.view.report_stage >= Some(stage)
+    draft.view.report.stage >= Some(stage)
 }
 
 /// How long is still waited for an answer before anything is shown.
 pub(super) fn answer_left(draft: &PlanBuilder<'_>) -> Option<Duration> {
-    left_of(ANSWER, draft.view.report_waited)
+    left_of(ANSWER, draft.view.report.waited)
 }
 
 /// How long a lost Pod still waits for the fence.
@@ -115,8 +115,8 @@ pub(super) fn report_of_end(draft: &mut PlanBuilder<'_>) -> Reading {
     }
     draft.needs_report = true;
     let view = draft.view;
-    let is_read = is_of(draft, stage_after_end(draft)) && view.report != ObservedReport::NotRead;
-    match &view.report {
+    let is_read = is_of(draft, stage_after_end(draft)) && view.report.stored != ObservedReport::NotRead;
+    match &view.report.stored {
         _ if !is_read && (draft.is_successful() || may_wait(draft, END_WAITS)) => Reading::Waits(None),
         // What is Finished is nothing without its result.
         ObservedReport::Unreadable(why) if draft.is_successful() || may_wait(draft, END_WAITS) => {

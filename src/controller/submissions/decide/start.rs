@@ -123,7 +123,7 @@ fn lasts(draft: &mut PlanBuilder<'_>, found: &Trouble) -> Option<i64> {
 /// The message for a run whose node is away, before Kubernetes has given its Pod up.
 fn left_by_node(draft: &PlanBuilder<'_>, pod: &PodView) -> Option<String> {
     let node = pod.node.as_deref().filter(|_| draft.is_running())?;
-    match draft.view.node {
+    match draft.view.node.state {
         ObservedNode::Gone => Some(format!(
             "Node {node} is gone, and the Pod with it. A new Pod will resume from the results in S3."
         )),

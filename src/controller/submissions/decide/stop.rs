@@ -188,7 +188,7 @@ pub(super) fn lost_pod<'a>(draft: &mut PlanBuilder<'a>) -> Option<&'a PodView> {
     let is_given_up = |f: &leaderboard_api::Failure| f.reason == reasons::NODE_LOST;
     let other_end = draft.is_cancelled() || draft.status.failure.as_deref().is_some_and(|f| !is_given_up(f));
     let pod = draft.view.pod.as_ref().filter(|_| !other_end)?;
-    let at = given_up_at(draft.view.node, pod)?;
+    let at = given_up_at(draft.view.node.state, pod)?;
     if draft.now() >= at {
         return Some(pod);
     }
@@ -212,7 +212,7 @@ fn given_up_at(node: ObservedNode, pod: &PodView) -> Option<Timestamp> {
 
 /// Ends the Job of a lost Pod; once it is gone, the infrastructure's retry follows.
 pub(super) fn leave_lost_pod(draft: &mut PlanBuilder<'_>, job: &JobView, pod: &PodView) {
-    let found = failure::node_lost(pod.node.as_deref(), draft.view.node);
+    let found = failure::node_lost(pod.node.as_deref(), draft.view.node.state);
     start::replacing(draft, &found.message);
     draft.fail(found);
     if force(draft, pod) {

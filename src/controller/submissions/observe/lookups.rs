@@ -155,7 +155,7 @@ mod tests {
     fn gone() -> NodeView {
         NodeView {
             state: ObservedNode::Gone,
-            leaving: None,
+            ..NodeView::default()
         }
     }
 

@@ -16,7 +16,7 @@ use kube::runtime::reflector::ObjectRef;
 use super::decide::job_name;
 use super::external::ExternalSystems;
 use super::memory::Memory;
-use super::view::{NodeView, ObservedJob, PodView, View};
+use super::view::{EvalaiView, NodeView, ObservedJob, PodView, View};
 use crate::controller::objects::uid;
 use crate::controller::slots::Slots;
 use crate::controller::stores::Stores;
@@ -46,7 +46,6 @@ pub fn observe(uses: Uses<'_>, submission: Arc<Submission>, is_policy_in_place: 
     let status = submission.status.as_ref();
     let is_over = status.is_some_and(SubmissionStatus::has_ended);
     let pod_uid = pod.as_ref().map(|pod| pod.uid.as_str());
-    let node = node(uses, pod.as_ref());
     let archive = workers.archive.observe(&submission, pod_uid, is_over);
     View {
         now,
@@ -54,23 +53,22 @@ pub fn observe(uses: Uses<'_>, submission: Arc<Submission>, is_policy_in_place: 
         is_policy_in_place: may_create(&job) && leaderboard.as_deref().is_some_and(is_policy_in_place),
         not_allowed: leaderboard.as_deref().and_then(|board| uses.external.refusal(board)),
         row: workers.rows.get(uid(submission.as_ref())),
-        job_refused: refusal(uses, &submission, &job),
         turn: uses.slots.turn(&submission, leaderboard.as_deref()),
-        node: node.state,
-        leaving: node.leaving,
-        is_node_watched: node::is_watched(uses.stores),
-        report: archive.report.report,
-        report_stage: archive.report.stage,
-        report_waited: archive.report.waited,
+        node: node(uses, pod.as_ref()),
+        report: archive.report,
         fence: archive.fence,
         log: archive.log,
-        evalai: uses.external.evalai_view(leaderboard.as_deref(), &submission),
+        evalai: uses
+            .external
+            .evalai_view(leaderboard.as_deref(), &submission)
+            .map(|evalai| EvalaiView {
+                waited: uses.memory.evalai_waited(&submission),
+                ..evalai
+            }),
         record: leaderboard
             .as_deref()
             .and_then(|board| uses.external.record_view(board, &submission)),
-        evalai_waited: uses.memory.evalai_waited(&submission),
         written_ago: uses.memory.since_write(&submission),
-        evalai_writes_from: uses.external.hub.writes_from(),
         submission,
         leaderboard,
         job,
@@ -80,14 +78,7 @@ pub fn observe(uses: Uses<'_>, submission: Arc<Submission>, is_policy_in_place: 
 
 /// Whether a Job may be made now.
 fn may_create(job: &ObservedJob) -> bool {
-    matches!(job, ObservedJob::Absent | ObservedJob::Foreign)
-}
-
-/// Why the API server has refused the Job that is not there.
-fn refusal(uses: Uses<'_>, submission: &Submission, job: &ObservedJob) -> Option<String> {
-    let status = submission.status.as_ref().filter(|_| *job == ObservedJob::Absent)?;
-    uses.memory
-        .refusal(submission, &job_name(&submission.name_any(), status))
+    matches!(job, ObservedJob::Absent { .. } | ObservedJob::Foreign)
 }
 
 /// The Job that the present attempt should have, and its newest Pod.
@@ -102,7 +93,9 @@ fn children(uses: Uses<'_>, submission: &Submission) -> (ObservedJob, Option<Pod
         let job = if is_awaited {
             ObservedJob::Created
         } else {
-            ObservedJob::Absent
+            ObservedJob::Absent {
+                refused: uses.memory.refusal(submission, &name),
+            }
         };
         return (job, None);
     };
@@ -128,7 +121,10 @@ fn children(uses: Uses<'_>, submission: &Submission) -> (ObservedJob, Option<Pod
 fn node(uses: Uses<'_>, pod: Option<&PodView>) -> NodeView {
     let name = pod.filter(|pod| pod.needs_node()).and_then(|pod| pod.node.as_deref());
     let known = |name| node::watched(uses.stores, name).unwrap_or_else(|| uses.workers.lookups.node(name));
-    name.map(known).unwrap_or_default()
+    NodeView {
+        is_watched: node::is_watched(uses.stores),
+        ..name.map(known).unwrap_or_default()
+    }
 }
 
 fn is_owned_by(job: &Job, submission: &Submission) -> bool {

@@ -75,7 +75,7 @@ pub(super) async fn read(client: &Client, name: &str) -> NodeView {
 fn gone() -> NodeView {
     NodeView {
         state: ObservedNode::Gone,
-        leaving: None,
+        ..NodeView::default()
     }
 }
 
@@ -83,7 +83,7 @@ fn gone() -> NodeView {
 pub(super) fn healthy() -> NodeView {
     NodeView {
         state: ObservedNode::Reports,
-        leaving: None,
+        ..NodeView::default()
     }
 }
 
@@ -91,6 +91,7 @@ fn of(node: &Node) -> NodeView {
     NodeView {
         state: state(node),
         leaving: leaving(node),
+        ..NodeView::default()
     }
 }
 

@@ -48,7 +48,7 @@ fn the_team_of_a_submission_is_shown_as_one_harmless_line() {
 fn an_answer_of_evalai_within_five_seconds_costs_no_write() {
     let mut world = World::evalai();
     world.in_evalai().info = None;
-    world.view.evalai_waited = Duration::from_secs(2);
+    world.in_evalai().waited = Duration::from_secs(2);
     let plan = world.pass();
     assert_eq!(plan.status, SubmissionStatus::default());
     assert!(has(&plan, |a| *a == Action::AskEvalai));
@@ -56,7 +56,7 @@ fn an_answer_of_evalai_within_five_seconds_costs_no_write() {
     let mut answered = world.clone();
     answered.in_evalai().info = Some(info());
     assert!(creates(&answered.pass_to(Pending, reasons::PREPARING)));
-    world.view.evalai_waited = Duration::from_secs(5);
+    world.in_evalai().waited = Duration::from_secs(5);
     let plan = world.pass_to(Pending, reasons::ASKING_EVALAI);
     assert!(events(&plan).is_empty());
 }
@@ -401,7 +401,7 @@ fn what_waits_between_two_tries_is_followed_after_a_restart() {
         reason: "BackoffLimitExceeded".into(),
         message: "no".into(),
     });
-    world.view.report = crate::controller::submissions::view::ObservedReport::Absent;
+    world.view.report.stored = crate::controller::submissions::view::ObservedReport::Absent;
     world.pass_to(Pending, reasons::REPLACING);
     world.job_gone();
     let plan = world.pass_to(Pending, reasons::REPLACING);

@@ -106,7 +106,7 @@ fn a_job_goes_early_only_by_the_hosts_choice_and_when_all_have_its_end() {
 #[test]
 fn an_end_whose_result_cannot_be_read_shows_why_it_waits() {
     let mut world = finished();
-    world.view.report = ObservedReport::Unreadable("the bucket results did not answer in time".into());
+    world.view.report.stored = ObservedReport::Unreadable("the bucket results did not answer in time".into());
     let told = |plan: &Plan, type_: &str| {
         let condition = conditions::get(&plan.status.conditions, type_).unwrap();
         (condition.reason.to_string(), condition.message.to_string())
@@ -117,13 +117,13 @@ fn an_end_whose_result_cannot_be_read_shows_why_it_waits() {
             .to_owned(),
     );
     assert_eq!(told(&world.pass(), PUBLISHED), waits);
-    world.view.report = ObservedReport::Unreadable("request 2 timed out".into());
+    world.view.report.stored = ObservedReport::Unreadable("request 2 timed out".into());
     assert_eq!(
         told(&world.pass(), PUBLISHED),
         waits,
         "another text is not another write"
     );
-    world.view.report = ObservedReport::Unreadable("the bucket results did not answer in time".into());
+    world.view.report.stored = ObservedReport::Unreadable("the bucket results did not answer in time".into());
     world.published();
     assert_eq!(told(&world.pass(), RECORDED), waits);
     world.report(final_report());
@@ -138,7 +138,7 @@ fn a_cancel_that_our_own_write_may_have_undone_is_sent_again() {
     (world.in_evalai().cancelled, world.in_evalai().overtaken) = (true, true);
     world.pass();
     world.job_gone();
-    world.view.report = ObservedReport::Absent;
+    world.view.report.stored = ObservedReport::Absent;
     let plan = world.pass_to(Cancelled, reasons::ENDED_IN_EVALAI);
     assert_eq!(evalai_updates(&plan), [EvalaiUpdate::Cancelled]);
     assert_eq!(
@@ -372,11 +372,12 @@ fn a_failure_that_evalai_cancels_later_stays_published() {
 #[test]
 fn an_end_shows_until_when_it_waits_for_the_controller_before() {
     let mut world = finished();
-    world.view.evalai_writes_from = world.view.now.checked_add(SignedDuration::from_secs(20)).ok();
+    let until = world.view.now.checked_add(SignedDuration::from_secs(20)).unwrap();
+    world.in_evalai().writes_from = Some(until);
     let plan = world.pass();
     let shown = conditions::get(&plan.status.conditions, PUBLISHED).unwrap();
     assert_eq!(shown.reason, reasons::WAITING_FOR_PREVIOUS_CONTROLLER);
-    let until = world.view.evalai_writes_from.unwrap().strftime("%H:%M:%S").to_string();
+    let until = until.strftime("%H:%M:%S").to_string();
     assert!(
         shown.message.contains(&format!("before {until} UTC")),
         "{}",
@@ -388,7 +389,7 @@ fn an_end_shows_until_when_it_waits_for_the_controller_before() {
         "it is the first to be sent then"
     );
     assert!(plan.requeue.unwrap() <= std::time::Duration::from_secs(21));
-    world.view.evalai_writes_from = None;
+    world.in_evalai().writes_from = None;
     assert_eq!(
         condition(&world.pass(), PUBLISHED),
         ("False".into(), reasons::WAITING.into())

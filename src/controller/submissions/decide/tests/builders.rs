@@ -11,8 +11,8 @@ use crate::controller::submissions::decide::blame::is_crash;
 use crate::controller::submissions::decide::{Action, EvalaiUpdate, Plan, decide, job_name};
 use crate::controller::submissions::report_digest::ReportDigest;
 use crate::controller::submissions::view::{
-    ContainerView, EndView, EvalaiEnd, EvalaiInfo, EvalaiView, JobEnd, JobView, ObservedFence, ObservedJob,
-    ObservedLog, ObservedNode, ObservedReport, PodView, RecordView, Stage, Standing, Turn, View,
+    ContainerView, EndView, EvalaiEnd, EvalaiInfo, EvalaiView, JobEnd, JobView, NodeView, ObservedFence, ObservedJob,
+    ObservedLog, ObservedReport, PodView, RecordView, ReportView, Stage, Standing, Turn, View,
 };
 use crate::pod::report::{Report, ReportPair};
 use crate::pod::run::Stop;
@@ -97,6 +97,8 @@ impl World {
     fn new(evalai: bool) -> Self {
         let known = EvalaiView {
             info: Some(info()),
+            // Long enough that silence is shown.
+            waited: std::time::Duration::from_secs(5),
             ..EvalaiView::default()
         };
         Self {
@@ -109,24 +111,22 @@ impl World {
                 // Nobody else runs it; the tests of foreign runs set it otherwise.
                 row: foreign::free(1),
                 turn: Turn::Go,
-                job: ObservedJob::Absent,
-                job_refused: None,
+                job: ObservedJob::Absent { refused: None },
                 pod: None,
-                node: ObservedNode::Unknown,
-                leaving: None,
-                is_node_watched: true,
-                report: ObservedReport::NotRead,
+                node: NodeView {
+                    is_watched: true,
+                    ..NodeView::default()
+                },
                 // Whatever is asked for is there already; the tests of waiting set it otherwise.
-                report_stage: Some(Stage::JobEnded),
-                report_waited: std::time::Duration::ZERO,
+                report: ReportView {
+                    stage: Some(Stage::JobEnded),
+                    ..ReportView::default()
+                },
                 fence: ObservedFence::Held,
                 log: ObservedLog::Kept,
                 evalai: evalai.then_some(known),
-                // Long enough that silence is shown.
-                evalai_waited: std::time::Duration::from_secs(5),
                 written_ago: None,
                 record: Some(RecordView::default()),
-                evalai_writes_from: None,
             },
         }
     }
@@ -225,13 +225,13 @@ impl World {
     pub fn complete(&mut self) {
         let now = self.view.now;
         self.job().end = Some(JobEnd::Complete { at: Some(now) });
-        self.view.report = ObservedReport::Absent;
+        self.view.report.stored = ObservedReport::Absent;
     }
 
     /// Its report shows this.
     #[allow(clippy::needless_pass_by_value, reason = "the tests read better")]
     pub fn report(&mut self, report: Report) {
-        self.view.report = ObservedReport::Ours(Arc::new(ReportDigest::from(&report)));
+        self.view.report.stored = ObservedReport::Ours(Arc::new(ReportDigest::from(&report)));
     }
 
     pub fn status(&self) -> SubmissionStatus {
@@ -280,10 +280,10 @@ impl World {
 
     /// Nothing of its Job is left.
     pub fn job_gone(&mut self) {
-        self.view.job = ObservedJob::Absent;
+        self.view.job = ObservedJob::Absent { refused: None };
         self.view.pod = None;
-        if self.view.report == ObservedReport::NotRead {
-            self.view.report = ObservedReport::Absent;
+        if self.view.report.stored == ObservedReport::NotRead {
+            self.view.report.stored = ObservedReport::Absent;
         }
     }
 

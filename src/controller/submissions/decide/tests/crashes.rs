@@ -235,7 +235,7 @@ fn a_crash_that_only_the_simulator_has_reported_waits_for_the_agents_own_report(
         reason: "BackoffLimitExceeded".into(),
         message: "no more".into(),
     });
-    late.view.report = ObservedReport::Absent;
+    late.view.report.stored = ObservedReport::Absent;
     let failure = late.pass_to(Failed, reasons::AGENT_CRASHED).status.failure;
     assert_eq!(failure.unwrap().class, Participant);
 }
@@ -317,7 +317,7 @@ fn a_simulator_without_a_gpu_ends_its_job_at_once_and_its_node_is_remembered() {
         world.wait(60);
         assert!(creates(&world.pass()));
         world.see_job();
-        world.view.report = ObservedReport::NotRead;
+        world.view.report.stored = ObservedReport::NotRead;
         see_without_graphics(&mut world, "noGpu");
     }
     world.pass_to(Pending, reasons::STOPPING);

@@ -106,7 +106,7 @@ fn every_other_end_of_a_run_waits_for_its_job() {
     }
     let mut world = World::local().running();
     run_ends(&mut world, 500);
-    world.view.report = ObservedReport::Unreadable("away".into());
+    world.view.report.stored = ObservedReport::Unreadable("away".into());
     world.pass_to(Running, reasons::RUNNING);
 }
 
@@ -238,7 +238,7 @@ fn a_crash_of_an_earlier_job_whose_record_is_kept_is_nobodys_fault() {
     world.gets_another_job();
     world.view.pod = Some(pod(200));
     world.see_agents();
-    world.view.report = ObservedReport::NotRead;
+    world.view.report.stored = ObservedReport::NotRead;
     world.pass_to(Running, reasons::RUNNING);
     world.complete();
     world.report(names_a_crash());
@@ -295,7 +295,7 @@ fn a_foreign_report_counts_for_nothing() {
     let mut world = World::local().running();
     world.leaderboard().retries.infrastructure = 0;
     world.complete();
-    world.view.report = ObservedReport::Foreign;
+    world.view.report.stored = ObservedReport::Foreign;
     world.pass_to(Failed, reasons::RESULTS_NOT_STORED);
 }
 
@@ -308,7 +308,7 @@ fn a_failed_job_is_blamed_on_its_worst_pair_or_on_nobody() {
             reason,
             message,
         });
-        world.view.report = ObservedReport::Absent;
+        world.view.report.stored = ObservedReport::Absent;
         world.view.pod = None;
     };
     let mut world = World::local().running();
@@ -406,7 +406,7 @@ fn what_is_stored_of_the_first_job_is_no_verdict_on_the_second() {
     world.complete();
     world.report(crashed);
     world.pass_to(Pending, reasons::REPLACING);
-    world.view.job = crate::controller::submissions::view::ObservedJob::Absent;
+    world.view.job = crate::controller::submissions::view::ObservedJob::Absent { refused: None };
     world.view.pod = None;
     world.wait(10);
     assert!(creates(&world.pass()));
@@ -418,11 +418,11 @@ fn what_is_stored_of_the_first_job_is_no_verdict_on_the_second() {
 fn a_bucket_that_does_not_answer_is_waited_for() {
     let mut world = World::local().running();
     world.complete();
-    world.view.report = ObservedReport::Unreadable("request 1 timed out".into());
+    world.view.report.stored = ObservedReport::Unreadable("request 1 timed out".into());
     let plan = world.pass_to(Running, reasons::NOT_STORED);
     assert_eq!(condition(&plan, STALLED).0, "True");
     let before = world.status();
-    world.view.report = ObservedReport::Unreadable("request 2 timed out".into());
+    world.view.report.stored = ObservedReport::Unreadable("request 2 timed out".into());
     assert_eq!(world.pass().status, before, "another request id is not another write");
     let mut for_good = world.clone();
     world.wait(3600);
@@ -442,7 +442,7 @@ fn the_wait_for_a_bucket_ends_though_the_clock_is_set_back() {
     world.go_to(500_000);
     world.complete();
     world.submission().spec.cancel = true;
-    world.view.report = ObservedReport::Unreadable("away".into());
+    world.view.report.stored = ObservedReport::Unreadable("away".into());
     world.pass_to(Running, reasons::NOT_STORED);
     world.go_to(100);
     world.pass_to(Running, reasons::NOT_STORED);
@@ -454,7 +454,7 @@ fn the_wait_for_a_bucket_ends_though_the_clock_is_set_back() {
 fn a_report_that_was_not_read_is_read_first() {
     let mut world = World::local().running();
     world.complete();
-    world.view.report = ObservedReport::NotRead;
+    world.view.report.stored = ObservedReport::NotRead;
     let before = world.status();
     let plan = world.pass();
     assert_eq!(

@@ -15,14 +15,14 @@ fn leaving() -> World {
     let mut world = World::evalai().running();
     world.leaderboard().retries.infrastructure = 0;
     world.go_to(100);
-    world.view.node = ObservedNode::Reports;
-    world.view.leaving = Some(TAINT.into());
+    world.view.node.state = ObservedNode::Reports;
+    world.view.node.leaving = Some(TAINT.into());
     world
 }
 
 /// The next Job's Pod runs on this node.
 fn on(world: &mut World, node: &str) {
-    world.view.leaving = None;
+    world.view.node.leaving = None;
     world.job_gone();
     assert!(creates(&world.pass()));
     world.see_job();
@@ -119,7 +119,7 @@ fn who_takes_a_pod_away_decides_whether_it_is_an_interruption() {
     ] {
         let mut world = World::local().running();
         world.go_to(100);
-        world.view.node = node;
+        world.view.node.state = node;
         let pod = world.pod();
         (pod.disruption, pod.deleted, pod.delete_by) = (Some(who.into()), Some(at(100)), Some(at(700)));
         let plan = world.pass_to(Running, reasons::REPLACING);
@@ -134,7 +134,7 @@ fn who_takes_a_pod_away_decides_whether_it_is_an_interruption() {
 #[test]
 fn a_pod_that_has_not_begun_leaves_at_once() {
     let mut world = World::local().with_pod();
-    world.view.leaving = Some(TAINT.into());
+    world.view.node.leaving = Some(TAINT.into());
     let plan = world.pass_to(Pending, reasons::REPLACING);
     assert!(has(&plan, |a| matches!(a, Action::DeleteJob { grace_seconds: 5, .. })));
     assert_eq!(annotated(&plan), None);
@@ -145,13 +145,13 @@ fn a_pod_that_tolerates_the_taint_is_not_moved_in_circles() {
     let mut world = leaving();
     assert_eq!(ends(&mut world).unwrap().number, 1);
     on(&mut world, "node-a");
-    world.view.leaving = Some(TAINT.into());
+    world.view.node.leaving = Some(TAINT.into());
     assert_eq!(world.pass_to(Running, reasons::RUNNING).status.failure, None);
     // Another node is another matter.
-    world.view.leaving = None;
+    world.view.node.leaving = None;
     world.pod().node = Some("node-b".into());
     world.pass();
-    world.view.leaving = Some(TAINT.into());
+    world.view.node.leaving = Some(TAINT.into());
     let known = ends(&mut world).unwrap();
     assert_eq!(
         (known.number, known.nodes),
@@ -167,7 +167,7 @@ fn a_cluster_that_takes_every_node_away_comes_to_an_end() {
         assert_eq!(known.number, number);
         assert!(known.nodes.len() <= leaderboard_api::MAX_INTERRUPTED_NODES);
         on(&mut world, &format!("node-{number}"));
-        world.view.leaving = Some(TAINT.into());
+        world.view.node.leaving = Some(TAINT.into());
     }
     let status = world.pass_to(Running, reasons::RUNNING).status;
     assert_eq!((status.failure, status.retry), (None, 20));
@@ -179,7 +179,7 @@ fn interruptions_use_up_no_retry_and_put_no_other_off() {
     world.leaderboard().retries.infrastructure = 1;
     ends(&mut world);
     on(&mut world, "node-b");
-    world.view.report = super::super::super::view::ObservedReport::Absent;
+    world.view.report.stored = super::super::super::view::ObservedReport::Absent;
     world.complete();
     let plan = world.pass_to(Pending, reasons::REPLACING);
     assert!(
@@ -221,7 +221,7 @@ fn followed(mut world: World, stop: Stop) -> World {
         ..report(2)
     });
     world.pass_to(Pending, reasons::REPLACING);
-    world.view.leaving = None;
+    world.view.node.leaving = None;
     world.job_gone();
     // One that has failed waits before it is tried again.
     world.wait(20);

@@ -161,13 +161,13 @@ fn a_job_of_an_older_object_is_waited_for_and_never_taken() {
     world.view.job = ObservedJob::Foreign;
     let plan = world.pass_to(Pending, reasons::JOB_NAME_TAKEN);
     assert!(!creates(&plan));
-    world.view.job = ObservedJob::Absent;
+    world.view.job = ObservedJob::Absent { refused: None };
     assert!(creates(&world.pass_to(Pending, reasons::PREPARING)));
 
     // Also when it was only seen after ours had been asked for: it is no deletion of ours then.
     world.view.job = ObservedJob::Foreign;
     world.pass_to(Pending, reasons::JOB_NAME_TAKEN);
-    world.view.job = ObservedJob::Absent;
+    world.view.job = ObservedJob::Absent { refused: None };
     let plan = world.pass_to(Pending, reasons::PREPARING);
     assert!(creates(&plan));
     assert_eq!(plan.status.recreated, 0);

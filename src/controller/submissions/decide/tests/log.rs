@@ -30,8 +30,8 @@ fn short(place: &LogPlace) -> String {
 fn end_without_pod(world: &mut World) -> Plan {
     world.leaderboard().retries.infrastructure = 0;
     world.job_gone();
-    if world.view.report == ObservedReport::NotRead {
-        world.view.report = ObservedReport::Absent;
+    if world.view.report.stored == ObservedReport::NotRead {
+        world.view.report.stored = ObservedReport::Absent;
     }
     let plan = world.pass();
     assert_eq!(plan.status.state, Some(Failed), "{:?}", plan.status);
@@ -69,7 +69,7 @@ fn a_failure_of_the_whole_run_is_explained_by_a_pair_that_was_not_done() {
     world.pass();
     world.go_to(90_000);
     world.pass_to(Running, reasons::STOPPING);
-    world.view.report = ObservedReport::Absent;
+    world.view.report.stored = ObservedReport::Absent;
     assert_eq!(
         places(&end_without_pod(&mut world)),
         ["s3 agent/agent2/leaderboard.log"],

@@ -48,7 +48,7 @@ fn going(node: ObservedNode) -> World {
     world.go_to(100);
     world.pod().deleted = Some(at(100));
     world.pod().delete_by = Some(at(700));
-    world.view.node = node;
+    world.view.node.state = node;
     world
 }
 
@@ -60,7 +60,7 @@ fn a_node_that_is_away_is_reported_before_kubernetes_gives_its_pod_up() {
         (silent, "node-a has been silent since 2026-01-01T00:00:40Z."),
     ] {
         let mut world = World::local().running();
-        world.view.node = node;
+        world.view.node.state = node;
         let plan = world.pass_to(Running, reasons::REPLACING);
         assert!(
             plan.status.message.as_ref().unwrap().contains(words),
@@ -71,10 +71,10 @@ fn a_node_that_is_away_is_reported_before_kubernetes_gives_its_pod_up() {
             a,
             Action::DeleteJob { .. } | Action::ForceDeletePod { .. }
         )));
-        world.view.node = ObservedNode::Reports;
+        world.view.node.state = ObservedNode::Reports;
         world.pass_to(Running, reasons::RUNNING);
         // For one that is being stopped, the stop is shown.
-        world.view.node = node;
+        world.view.node.state = node;
         world.submission().spec.cancel = true;
         world.pass_to(Running, reasons::STOPPING);
     }
@@ -121,7 +121,7 @@ fn a_lost_node_costs_neither_an_attempt_nor_a_pairs_retry() {
     world.go_to(130);
     world.pass_to(Running, reasons::REPLACING);
     world.job_gone();
-    world.view.node = ObservedNode::Unknown;
+    world.view.node.state = ObservedNode::Unknown;
     let plan = world.pass_to(Pending, reasons::REPLACING);
     assert_eq!(
         (plan.status.attempt, plan.status.failure.as_ref()),
@@ -141,7 +141,7 @@ fn a_kubelet_that_comes_back_in_time_keeps_its_pod() {
     world.pass();
     world.go_to(129);
     world.pass();
-    world.view.node = ObservedNode::Reports;
+    world.view.node.state = ObservedNode::Reports;
     world.go_to(400);
     let plan = world.pass_to(Running, reasons::REPLACING);
     assert!(!has(&plan, |a| *a == Action::TakeOwnership));
@@ -150,7 +150,7 @@ fn a_kubelet_that_comes_back_in_time_keeps_its_pod() {
         uid: "pod-2".into(),
         ..pod(410)
     });
-    world.view.node = ObservedNode::Unknown;
+    world.view.node.state = ObservedNode::Unknown;
     world.go_to(500);
     let plan = world.pass_to(Running, reasons::REPLACING);
     assert_eq!(plan.status.failure, None);
@@ -179,7 +179,7 @@ fn a_pod_that_its_node_does_not_admit_ends_its_job_with_the_kubelets_words() {
     world.wait(60);
     assert!(creates(&world.pass()));
     world.see_job();
-    world.view.report = ObservedReport::NotRead;
+    world.view.report.stored = ObservedReport::NotRead;
     refused(&mut world);
     world.pass_to(Failed, reasons::NODE_CANNOT_START);
 }

@@ -277,10 +277,8 @@ fn evalai_view() -> impl Strategy<Value = EvalaiView> {
     );
     (select(infos), cancels, select(ends), why, partials).prop_map(
         |(info, (cancelled, overtaken), end, (error, unread), partial_done)| EvalaiView {
-            shows_partial: false,
-            team_id: None,
+            waited: Duration::from_secs(5),
             info,
-            read_at: None,
             cancelled,
             cancelled_as_of: cancelled.then(|| at(900)),
             overtaken,
@@ -288,6 +286,7 @@ fn evalai_view() -> impl Strategy<Value = EvalaiView> {
             unread,
             partial_done,
             error,
+            ..EvalaiView::default()
         },
     )
 }
@@ -343,7 +342,7 @@ fn set_job(world: &mut World, case: JobCase) {
         })
     };
     world.view.job = match case {
-        JobCase::Absent => ObservedJob::Absent,
+        JobCase::Absent => ObservedJob::Absent { refused: None },
         JobCase::Created => ObservedJob::Created,
         JobCase::Foreign => ObservedJob::Foreign,
         JobCase::Earlier => ours(None, false, false),
@@ -358,17 +357,17 @@ fn apply(world: &mut World, change: Change) {
         Change::Job(case) => set_job(world, case),
         Change::Pod(pod) => world.view.pod = pod.map(|pod| *pod),
         Change::Node(node, leaving) => {
-            (world.view.node, world.view.leaving) = (node, leaving.map(str::to_owned));
+            (world.view.node.state, world.view.node.leaving) = (node, leaving.map(str::to_owned));
         }
-        Change::Report(report) => world.view.report = report,
+        Change::Report(report) => world.view.report.stored = report,
         Change::Answers {
             stage,
             waited,
             fence,
             log,
         } => {
-            world.view.report_stage = stage;
-            world.view.report_waited = waited;
+            world.view.report.stage = stage;
+            world.view.report.waited = waited;
             world.view.fence = fence;
             world.view.log = log;
         }
@@ -421,12 +420,12 @@ proptest! {
         }
         world.submission().spec.cancel = true;
         // Its worker is never answered.
-        world.view.report_stage = None;
+        world.view.report.stage = None;
         for _ in 0..12 {
-            world.view.report_waited += Duration::from_mins(5);
-            world.view.fence = ObservedFence::Failed(world.view.report_waited);
-            if world.view.report == ObservedReport::NotRead {
-                world.view.report = ObservedReport::Absent;
+            world.view.report.waited += Duration::from_mins(5);
+            world.view.fence = ObservedFence::Failed(world.view.report.waited);
+            if world.view.report.stored == ObservedReport::NotRead {
+                world.view.report.stored = ObservedReport::Absent;
             }
             let plan = world.pass();
             if has(&plan, |a| matches!(a, crate::controller::submissions::decide::Action::DeleteJob { .. })) || is_going(&world) {

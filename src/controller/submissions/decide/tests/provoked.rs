@@ -141,11 +141,11 @@ fn an_interruption_between_two_failures_counts_the_routes_of_its_own_job_alone()
     world.leaderboard().retries.infrastructure = 9;
     simulator_fails(&mut world, 1);
     runs_again(&mut world);
-    world.view.leaving = Some("karpenter.sh/disrupted".into());
+    world.view.node.leaving = Some("karpenter.sh/disrupted".into());
     world.pass_to(Running, reasons::REPLACING);
     world.complete();
     world.report(report(2));
-    world.view.leaving = None;
+    world.view.node.leaving = None;
     runs_again(&mut world);
     assert_eq!(world.status().routes_before, Some(2));
     simulator_fails(&mut world, 2);

@@ -43,13 +43,13 @@ fn each_moment_of_a_life_needs_its_own_report() {
     assert_eq!(demanded(&live), Some((Stage::Live, Some("pod-uid"))));
     assert_eq!(live.report.unwrap().period, 10 * SECOND);
     world.pod().run_ended = Some(at(500));
-    world.view.report_stage = Some(Stage::Live);
+    world.view.report.stage = Some(Stage::Live);
     assert_eq!(demanded(&world.pass()), Some((Stage::RunEnded, Some("pod-uid"))));
     world.complete();
     assert_eq!(demanded(&world.pass()), Some((Stage::JobEnded, Some("pod-uid"))));
     world.job_gone();
     assert_eq!(demanded(&world.pass()), Some((Stage::JobEnded, None)));
-    world.view.report_stage = Some(Stage::JobEnded);
+    world.view.report.stage = Some(Stage::JobEnded);
     world.report(final_report());
     let end = world.pass_to(Finished, reasons::FINISHED);
     assert_eq!(demanded(&end), Some((Stage::JobEnded, None)), "it is to be published");
@@ -78,14 +78,14 @@ fn an_end_is_decided_only_on_a_report_that_was_asked_for_after_it() {
             let mut world = World::local().running();
             world.leaderboard().retries.infrastructure = 0;
             world.complete();
-            world.view.report = early;
-            world.view.report_stage = stage;
-            world.view.report_waited = 2 * SECOND;
+            world.view.report.stored = early;
+            world.view.report.stage = stage;
+            world.view.report.waited = 2 * SECOND;
             let plan = world.pass_to(Running, reasons::RUNNING);
             assert_eq!(plan.requeue, Some(13 * SECOND), "the answer wakes it before");
-            world.view.report_waited = 15 * SECOND;
+            world.view.report.waited = 15 * SECOND;
             world.pass_to(Running, reasons::NOT_STORED);
-            world.view.report_stage = Some(Stage::JobEnded);
+            world.view.report.stage = Some(Stage::JobEnded);
             world.report(final_report());
             world.pass_to(Finished, reasons::FINISHED);
         }
@@ -103,7 +103,7 @@ fn a_complete_run_ends_only_on_a_report_that_was_asked_for_after_its_agents_ende
         world.go_to(501);
         world.pod().run_ended = Some(at(500));
         world.report(final_report());
-        world.view.report_stage = stage;
+        world.view.report.stage = stage;
         assert_eq!(world.pass().status.state, Some(state), "{stage:?}");
     }
 }
@@ -112,16 +112,16 @@ fn a_complete_run_ends_only_on_a_report_that_was_asked_for_after_its_agents_ende
 fn a_job_that_is_gone_is_made_again_only_when_it_is_known_what_its_run_has_stored() {
     let mut world = World::local().running();
     world.job_gone();
-    world.view.report_stage = Some(Stage::Live);
+    world.view.report.stage = Some(Stage::Live);
     let plan = world.pass();
     assert!(!creates(&plan) && plan.requeue == Some(15 * SECOND));
     let mut silent = world.clone();
-    world.view.report_stage = Some(Stage::JobEnded);
+    world.view.report.stage = Some(Stage::JobEnded);
     let mut complete = world.clone();
     assert!(creates(&world.pass()));
     complete.report(final_report());
     complete.pass_to(Finished, reasons::FINISHED);
-    silent.view.report_waited = 15 * SECOND;
+    silent.view.report.waited = 15 * SECOND;
     assert!(creates(&silent.pass()), "a bucket that is away does not keep it");
 }
 
@@ -131,7 +131,7 @@ fn lost() -> World {
     world.go_to(100);
     world.pod().deleted = Some(at(100));
     world.pod().delete_by = Some(at(700));
-    world.view.node = ObservedNode::Silent { since: at(40) };
+    world.view.node.state = ObservedNode::Silent { since: at(40) };
     world.go_to(130);
     world
 }
@@ -299,7 +299,7 @@ fn what_cannot_be_read_of_a_result_is_shown_and_waited_for_but_not_permanently()
 fn what_is_finished_is_nothing_without_its_numbers_and_everything_else_goes_without() {
     let unreadable = ObservedReport::Unreadable("torn".into());
     let mut world = finished();
-    world.view.report = unreadable.clone();
+    world.view.report.stored = unreadable.clone();
     world.wait(10 * 86_400);
     assert_eq!(evalai_updates(&world.pass()), []);
 
@@ -308,7 +308,7 @@ fn what_is_finished_is_nothing_without_its_numbers_and_everything_else_goes_with
     world.pass();
     world.complete();
     world.pass_to(Cancelled, reasons::CANCELLED);
-    world.view.report = unreadable;
+    world.view.report.stored = unreadable;
     assert_eq!(evalai_updates(&world.pass()), []);
     world.wait(86_400);
     assert_eq!(evalai_updates(&world.pass()), [EvalaiUpdate::Cancelled]);
@@ -321,7 +321,7 @@ fn the_end_of_a_deleted_one_does_not_wait_until_the_finalizer_gives_up() {
     world.pass();
     world.complete();
     world.pass_to(Cancelled, reasons::DELETED);
-    world.view.report = ObservedReport::Unreadable("torn".into());
+    world.view.report.stored = ObservedReport::Unreadable("torn".into());
     world.wait(900 - 121);
     assert_eq!(evalai_updates(&world.pass()), []);
     world.wait(1);
@@ -335,12 +335,12 @@ fn the_row_of_a_finished_submission_waits_for_its_report_but_not_permanently() {
     world.complete();
     world.report(final_report());
     assert!(records(&world.pass_to(Finished, reasons::FINISHED)));
-    world.view.report = ObservedReport::Unreadable("torn".into());
+    world.view.report.stored = ObservedReport::Unreadable("torn".into());
     let plan = world.pass();
     assert!(!records(&plan) && waits_with(&plan, RECORDED).contains("torn"));
     // After a restart nothing is known.
-    world.view.report = ObservedReport::NotRead;
-    world.view.report_stage = None;
+    world.view.report.stored = ObservedReport::NotRead;
+    world.view.report.stage = None;
     let plan = world.pass();
     assert!(!records(&plan) && demanded(&plan).is_some());
 
@@ -349,7 +349,7 @@ fn the_row_of_a_finished_submission_waits_for_its_report_but_not_permanently() {
     world.pass();
     world.complete();
     world.pass_to(Cancelled, reasons::CANCELLED);
-    world.view.report_stage = None;
+    world.view.report.stage = None;
     assert!(records(&world.pass()), "a row without metrics waits for no report");
 }
 
@@ -357,7 +357,7 @@ fn the_row_of_a_finished_submission_waits_for_its_report_but_not_permanently() {
 fn an_end_that_never_had_a_plan_waits_for_nothing() {
     let mut world = World::evalai();
     world.in_evalai().info = None;
-    world.view.report_stage = None;
+    world.view.report.stage = None;
     world.submission().spec.cancel = true;
     let plan = world.pass_to(Cancelled, reasons::CANCELLED);
     assert_eq!(

@@ -59,7 +59,7 @@ fn a_run_stops_with_all_that_was_reached_and_waits_for_its_turn_in_the_higher_at
     assert_eq!(world.status().progress.unwrap().text, "2/4");
 
     world.job_gone();
-    world.view.report = ObservedReport::NotRead;
+    world.view.report.stored = ObservedReport::NotRead;
     world.view.turn = Turn::Paused { position: 1 };
     let plan = world.pass_to(Pending, reasons::PAUSED);
     assert!(!creates(&plan), "a host who upgrades nodes pauses the Leaderboard");
@@ -121,7 +121,7 @@ fn what_else_ends_a_run_meanwhile_is_forgiven() {
 
     let mut lost = restarted();
     lost.pass();
-    lost.view.node = ObservedNode::Gone;
+    lost.view.node.state = ObservedNode::Gone;
     (lost.pod().deleted, lost.pod().delete_by) = (Some(at(100)), Some(at(101)));
     lost.go_to(200);
     lost.pass();
@@ -143,9 +143,9 @@ fn a_run_that_comes_to_its_results_is_finished_for_good() {
     // It had ended by itself, and only its Job is still there.
     let mut world = restarted();
     world.pod().run_ended = Some(at(99));
-    world.view.report_stage = None;
+    world.view.report.stage = None;
     assert_eq!(annotated(&world.pass()), None);
-    world.view.report_stage = Some(crate::controller::submissions::view::Stage::RunEnded);
+    world.view.report.stage = Some(crate::controller::submissions::view::Stage::RunEnded);
     world.report(final_report());
     world.pass_to(Finished, reasons::FINISHED);
 }

@@ -17,7 +17,7 @@ fn failed() -> World {
     world.complete();
     world.report(report(2));
     world.pass_to(Failed, reasons::AGENT_CRASHED);
-    world.view.report = ObservedReport::NotRead;
+    world.view.report.stored = ObservedReport::NotRead;
     world
 }
 
@@ -30,7 +30,7 @@ fn cancelled() -> World {
     world.complete();
     world.report(report(2));
     world.pass_to(Cancelled, reasons::CANCELLED);
-    world.view.report = ObservedReport::NotRead;
+    world.view.report.stored = ObservedReport::NotRead;
     world
 }
 
@@ -115,7 +115,7 @@ fn what_the_old_pipeline_left_is_taken_up_without_status_or_report() {
     // Resumed in EvalAI: a message for a submission that this cluster has never seen.
     let mut world = World::evalai();
     world.in_evalai().info.as_mut().unwrap().standing = Standing::Resumed;
-    world.view.report = ObservedReport::Absent;
+    world.view.report.stored = ObservedReport::Absent;
     let plan = world.pass();
     assert!(has(&plan, |a| *a == Action::CreateJob(JobNumber::first(Attempt(1)))));
     assert!(

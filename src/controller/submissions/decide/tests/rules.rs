@@ -155,7 +155,7 @@ fn a_reporting_node_has_its_grace(view: &View, plan: &Plan) {
     if let (true, true, Some(pod)) = (is_live, is_lost, &view.pod) {
         let by = pod.delete_by.expect("only a Pod that is being deleted is given up");
         assert!(
-            view.node != ObservedNode::Reports || view.now > by,
+            view.node.state != ObservedNode::Reports || view.now > by,
             "given up within its grace"
         );
     }

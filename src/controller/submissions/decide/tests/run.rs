@@ -339,13 +339,13 @@ fn a_job_that_was_just_created_is_waited_for() {
 fn a_run_that_began_and_ended_between_two_controllers_is_not_driven_again() {
     let mut world = World::local();
     assert_eq!(world.pass().report, None, "what is stored is no word of a new Job");
-    world.view.report_stage = None;
+    world.view.report.stage = None;
     let plan = world.pass();
     assert!(!creates(&plan));
     assert_eq!(plan.report.unwrap().stage, Stage::JobEnded);
-    world.view.report_stage = Some(Stage::JobEnded);
+    world.view.report.stage = Some(Stage::JobEnded);
     let mut never = world.clone();
-    never.view.report = ObservedReport::Absent;
+    never.view.report.stored = ObservedReport::Absent;
     let plan = never.pass_to(Pending, reasons::PREPARING);
     assert_eq!((creates(&plan), plan.status.recreated), (true, 0));
     world.report(final_report());
@@ -423,7 +423,7 @@ fn a_clock_that_is_set_back_costs_a_run_nothing() {
     let mut world = World::local().running();
     world.go_to(-5000);
     world.pass_to(Running, reasons::RUNNING);
-    world.view.report = ObservedReport::NotRead;
+    world.view.report.stored = ObservedReport::NotRead;
     world.go_to(20);
     world.pass_to(Running, reasons::RUNNING);
 }

@@ -169,7 +169,7 @@ const STAGES: [Stage; 9] = [
         || {
             let mut world = World::evalai().running();
             world.complete();
-            world.view.report = ObservedReport::Unreadable("away".into());
+            world.view.report.stored = ObservedReport::Unreadable("away".into());
             world
         },
         Done::Waits,
@@ -350,7 +350,7 @@ fn a_cancelled_one_does_not_wait_long_for_a_bucket() {
     world.pass();
     let at = Some(at(100));
     world.job().end = Some(JobEnd::Complete { at });
-    world.view.report = ObservedReport::Unreadable("no route to the bucket".into());
+    world.view.report.stored = ObservedReport::Unreadable("no route to the bucket".into());
     world.pass_to(Running, reasons::NOT_STORED);
     world.go_to(219);
     world.pass_to(Running, reasons::NOT_STORED);
@@ -363,7 +363,7 @@ fn a_job_that_shows_up_after_the_end_is_ended() {
     let mut world = World::local();
     world.pass();
     world.submission().spec.cancel = true;
-    world.view.report = ObservedReport::Absent;
+    world.view.report.stored = ObservedReport::Absent;
     world.pass_to(Cancelled, reasons::CANCELLED);
     world.see_job();
     let plan = world.pass_to(Cancelled, reasons::CANCELLED);

@@ -4,7 +4,7 @@ use std::time::Duration;
 
 use super::builders::*;
 use crate::controller::submissions::decide::EvalaiUpdate;
-use crate::controller::submissions::view::{ScaleUp, Turn};
+use crate::controller::submissions::view::{ObservedJob, ScaleUp, Turn};
 use leaderboard_api::FailureClass::Infrastructure;
 use leaderboard_api::State::{Failed, Pending};
 use leaderboard_api::conditions::STALLED;
@@ -160,13 +160,14 @@ fn a_job_that_the_api_server_refuses_is_shown_and_tried_again() {
     for (words, reason) in cases {
         let mut world = World::evalai();
         world.pass_to(Pending, reasons::PREPARING);
-        world.view.job_refused = Some(words.into());
+        world.view.job = ObservedJob::Absent {
+            refused: Some(words.into()),
+        };
         let plan = world.pass_to(Pending, reason);
         assert!(creates(&plan));
         assert_eq!(evalai_updates(&plan), [EvalaiUpdate::Queued]);
         assert_eq!(condition(&plan, STALLED), ("True".to_owned(), reason.to_owned()));
         assert!(plan.status.message.unwrap().contains(words));
-        world.view.job_refused = None;
         world.see_job();
         world.view.pod = Some(pod(0));
         world.pass_to(Pending, reasons::PREPARING);
