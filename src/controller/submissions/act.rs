@@ -11,7 +11,7 @@ use kube::{Resource, ResourceExt};
 use serde_json::json;
 use tokio::time::Instant;
 
-use super::decide::{Action, Event, Plan, StatusWrite, pinned};
+use super::decide::{Action, Event, Plan, Question, StatusWrite, pinned};
 use super::external::ExternalSystems;
 use super::failure_log::LogDemand;
 use super::job_spec::{self, JobInput};
@@ -83,7 +83,7 @@ pub async fn act(uses: Uses<'_>, view: &View, plan: Plan) -> Result<Option<Durat
         namespace: view.submission.namespace().unwrap_or_default(),
     };
     let mut version = view.submission.resource_version();
-    if plan.actions.contains(&Action::AddFinalizer) {
+    if plan.actions.contains(&Action::SetFinalizer(true)) {
         version = actor.set_finalizer(true).await?;
     }
     let turn_in = actor.write_status(&plan.status, plan.write, version.as_deref()).await?;
@@ -127,8 +127,8 @@ impl Actor<'_> {
         let (uses, workers, submission) = (self.uses, self.uses.workers, self.submission());
         match action {
             // It went before the status.
-            Action::AddFinalizer => {}
-            Action::ReleaseFinalizer => {
+            Action::SetFinalizer(true) => {}
+            Action::SetFinalizer(false) => {
                 self.set_finalizer(false).await?;
             }
             Action::CreateJob(number) => self.create_job(status, number).await?,
@@ -137,25 +137,18 @@ impl Actor<'_> {
                 uid,
                 grace_seconds,
             } => self.delete_job(&name, &uid, grace_seconds).await?,
-            Action::ForceDeletePod { name, uid } => self.delete_pod(&name, &uid, 0).await?,
-            Action::AnnotateStop { pod, stop } => self.annotate_stop(&pod, stop).await?,
+            Action::DeletePod { name, uid } => self.delete_pod(&name, &uid, 0).await?,
+            Action::StopPod { pod, stop } => self.annotate_stop(&pod, stop).await?,
             Action::DeleteSubmission { uid, resource_version } => {
                 self.delete_submission(uid, resource_version).await?;
             }
             Action::JoinLine(place) => uses.slots.join(submission, place),
-            Action::ReadRow(row) => workers.rows.want(&key_of(submission), *row, log_span_of(submission)),
+            Action::Ask(question) => self.ask(question, status),
             Action::TakeOwnership => workers.archive.want_fence(submission, status),
             Action::KeepLog { places } => workers.archive.want_log(submission, status, log_demand(places, status)),
-            Action::LookUpNode(name) => workers.lookups.want(submission, &name),
-            Action::AskEvalai => {
-                uses.memory.asks_evalai(submission);
-                uses.external.ask(self.view);
-            }
-            Action::FollowEvalai => uses.external.follow(self.view, status),
             Action::UpdateEvalai(update) => {
                 uses.external.update_evalai(&workers.archive, self.view, status, update);
             }
-            Action::ForgetEvalai => uses.external.hub.forget(&key_of(submission)),
             Action::Forget => {
                 uses.external.gone(&key_of(submission));
                 workers.forget(uid(submission));
@@ -163,6 +156,20 @@ impl Actor<'_> {
             Action::Record(update) => uses.external.record(self.view, status, update),
         }
         Ok(())
+    }
+
+    fn ask(&self, question: Question, status: &SubmissionStatus) {
+        let (uses, workers, submission) = (self.uses, self.uses.workers, self.submission());
+        match question {
+            Question::Row(row) => workers.rows.want(&key_of(submission), *row, log_span_of(submission)),
+            Question::Node(name) => workers.lookups.want(submission, &name),
+            Question::Evalai => {
+                uses.memory.asks_evalai(submission);
+                uses.external.ask(self.view);
+            }
+            Question::EvalaiAnew => uses.external.hub.forget(&key_of(submission)),
+            Question::EvalaisEnd => uses.external.follow(self.view, status),
+        }
     }
 
     async fn set_finalizer(&self, wanted: bool) -> Result<Option<String>, ActError> {

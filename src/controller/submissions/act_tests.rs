@@ -9,6 +9,7 @@ use crate::controller::fixtures::{Cluster, Surroundings, leaderboard, surroundin
 use crate::controller::objects::span_of;
 use crate::controller::submissions::decide::{Plan, StatusWrite};
 use crate::controller::submissions::observe::observe;
+use crate::controller::submissions::view::ObservedJob;
 use crate::observability::logging::tests::Lines;
 use leaderboard_api::Attempt;
 
@@ -67,7 +68,7 @@ async fn a_job_that_is_refused_keeps_nothing_else_from_being_done_and_is_known_t
     assert_eq!(view.job, ObservedJob::Absent { refused: None });
     let status = submission.status.clone().unwrap();
     let plan = Plan {
-        actions: vec![Action::CreateJob(status.job_number()), Action::AskEvalai],
+        actions: vec![Action::CreateJob(status.job_number()), Action::Ask(Question::Evalai)],
         status,
         write: StatusWrite::Now,
         events: Vec::new(),

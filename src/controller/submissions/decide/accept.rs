@@ -6,7 +6,7 @@ use k8s_openapi::apimachinery::pkg::apis::meta::v1::Time;
 
 use super::failure::{self, infrastructure};
 use super::isolation::Missing;
-use super::plan::Action;
+use super::plan::{Action, Question};
 use super::plan_builder::{PlanBuilder, Terms, after};
 use super::{end, foreign, image, isolation, pin};
 use crate::controller::submissions::view::{EvalaiInfo, Standing};
@@ -258,7 +258,7 @@ fn ask_evalai<'a>(draft: &mut PlanBuilder<'a>) -> Answer<'a> {
         Some(info) if info.standing == Standing::Ended => Answer::Ended(&info.status),
         Some(info) => Answer::Wanted(info),
         None => {
-            draft.act(Action::AskEvalai);
+            draft.act(Action::Ask(Question::Evalai));
             if draft.waits_quietly(
                 draft
                     .view

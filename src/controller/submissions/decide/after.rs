@@ -385,7 +385,7 @@ fn release(draft: &mut PlanBuilder<'_>, complete: bool) {
         return;
     }
     if complete {
-        return draft.act(Action::ReleaseFinalizer);
+        return draft.act(Action::SetFinalizer(false));
     }
     let patience = draft.leaderboard().map_or(900, |l| l.deadlines.finalize_seconds);
     let until = after(deleted.0, patience);
@@ -396,7 +396,7 @@ fn release(draft: &mut PlanBuilder<'_>, complete: bool) {
             "The submission was deleted, and its end was not published within deadlines.finalizeSeconds: the finalizer is removed.",
         );
         draft.act(Action::Forget);
-        draft.act(Action::ReleaseFinalizer);
+        draft.act(Action::SetFinalizer(false));
     } else {
         draft.requeue_at(until);
     }

@@ -3,7 +3,7 @@
 
 use std::time::Duration;
 
-use super::plan::Action;
+use super::plan::{Action, Question};
 use super::plan_builder::{PlanBuilder, Terms};
 use super::{clock, stop};
 use crate::ask::{Answered, Failure};
@@ -46,7 +46,7 @@ pub(super) fn waits(draft: &mut PlanBuilder<'_>, terms: Terms<'_>) -> bool {
         }
         None => show_reading(draft),
     }
-    draft.act(Action::ReadRow(Box::new(question)));
+    draft.act(Action::Ask(Question::Row(Box::new(question))));
     true
 }
 
@@ -81,7 +81,7 @@ fn awaits_evalai(draft: &mut PlanBuilder<'_>, answer: &Answered<Row>) -> bool {
         return false;
     }
     draft.keeps_status();
-    draft.act(Action::ForgetEvalai);
+    draft.act(Action::Ask(Question::EvalaiAnew));
     draft.requeue_in(Duration::from_secs(1));
     true
 }

@@ -3,7 +3,7 @@
 use std::sync::Arc;
 use std::time::Duration;
 
-use super::plan::{Action, EvalaiUpdate, TableUpdate};
+use super::plan::{Action, EvalaiUpdate, Question, TableUpdate};
 use super::plan_builder::{PlanBuilder, after};
 use super::{
     accept, clock, crashes, disk, end, failure, foreign, image, interruption, isolation, line, reading, record,
@@ -48,7 +48,7 @@ fn follow(draft: &mut PlanBuilder<'_>) {
     let is_known = draft.status.times.submitted.is_some();
     let may_run = is_known && draft.evalai_info().is_some_and(|info| info.standing != Standing::Ended);
     if draft.does(is_progress) || (may_run && !draft.is_finished() && !draft.is_to_stop()) {
-        draft.act(Action::FollowEvalai);
+        draft.act(Action::Ask(Question::EvalaisEnd));
     }
 }
 

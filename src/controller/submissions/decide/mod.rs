@@ -45,7 +45,7 @@ use std::time::Duration;
 use super::view::View;
 pub use after::previous_controller;
 pub(super) use image::pinned;
-pub use plan::{Action, EvalaiUpdate, Event, Plan, SlotUse, StatusWrite, TableUpdate, job_name};
+pub use plan::{Action, EvalaiUpdate, Event, Plan, Question, SlotUse, StatusWrite, TableUpdate, job_name};
 use plan_builder::PlanBuilder;
 pub use reading::{awaits_publication, patience};
 
@@ -59,7 +59,7 @@ pub fn decide(view: &View) -> Plan {
     } else {
         decide_stage(&mut draft);
         if needs_finalizer(&draft) {
-            draft.act_first(Action::AddFinalizer);
+            draft.act_first(Action::SetFinalizer(true));
         }
     }
     look_up_node(&mut draft);
@@ -85,7 +85,7 @@ fn look_up_node(draft: &mut PlanBuilder<'_>) {
         .filter(|pod| !draft.view.node.is_watched && pod.needs_node());
     let node = pod.filter(|pod| pod.delete_by.is_some() || pod.agent_started.is_some());
     if let Some(name) = node.and_then(|pod| pod.node.clone()) {
-        draft.act(Action::LookUpNode(name));
+        draft.act(Action::Ask(Question::Node(name)));
     }
 }
 

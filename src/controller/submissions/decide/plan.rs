@@ -63,14 +63,12 @@ pub enum StatusWrite {
 /// One thing to do. All are safe to repeat.
 #[derive(Clone, Debug, PartialEq)]
 pub enum Action {
-    /// Put our finalizer on the object; goes before the status.
-    AddFinalizer,
-    /// Take our finalizer off the object.
-    ReleaseFinalizer,
+    /// Put our finalizer on the object, which goes before the status, or take it off.
+    SetFinalizer(bool),
     /// All but the slot is settled: wait for one at this place. Shows nothing new until it is known who is next.
     JoinLine(InLine),
-    /// Read the row of another program that may run the submission.
-    ReadRow(Box<Row>),
+    /// Ask this in the background.
+    Ask(Question),
     /// Create this Job.
     CreateJob(JobNumber),
     /// Delete a Job and its Pods with this grace period.
@@ -80,29 +78,36 @@ pub enum Action {
         grace_seconds: i64,
     },
     /// Remove a Pod that does not end.
-    ForceDeletePod { name: String, uid: String },
+    DeletePod { name: String, uid: String },
     /// Write our own mark into `logcopy/owner`, so that a Pod that can no longer be reached stops itself.
     TakeOwnership,
     /// Ask the Pod to stop.
-    AnnotateStop { pod: String, stop: Stop },
+    StopPod { pod: String, stop: Stop },
     /// Keep the tail of the log that explains the failure, from the first of these places that has it.
     KeepLog { places: Vec<LogPlace> },
-    /// Ask the API server for this node.
-    LookUpNode(String),
-    /// Ask EvalAI for the submission.
-    AskEvalai,
-    /// Look for its end in EvalAI from now on.
-    FollowEvalai,
     /// Send an update to EvalAI.
     UpdateEvalai(EvalaiUpdate),
-    /// Forget what EvalAI last reported, so that it is asked anew.
-    ForgetEvalai,
     /// Every system has the end: drop all that is remembered for it.
     Forget,
     /// Write the row.
     Record(TableUpdate),
     /// Delete the object, if it is still the one that was decided on.
     DeleteSubmission { uid: String, resource_version: String },
+}
+
+/// A question, whose answer wakes the submission.
+#[derive(Clone, Debug, PartialEq)]
+pub enum Question {
+    /// Does another program's row of the table show a run?
+    Row(Box<Row>),
+    /// Does this node report?
+    Node(String),
+    /// Does EvalAI want it to run?
+    Evalai,
+    /// Does it still, whatever was answered before?
+    EvalaiAnew,
+    /// Has it come to an end in EvalAI, from now on?
+    EvalaisEnd,
 }
 
 /// What is sent to EvalAI.

@@ -130,7 +130,7 @@ fn annotate(draft: &mut PlanBuilder<'_>, pod: &PodView) {
     } else {
         failure::stop_of(draft.status.failure.as_deref())
     };
-    draft.act(Action::AnnotateStop {
+    draft.act(Action::StopPod {
         pod: pod.name.clone(),
         stop,
     });
@@ -152,7 +152,7 @@ fn force(draft: &mut PlanBuilder<'_>, pod: &PodView) -> bool {
         draft.requeue_in(left);
         return false;
     }
-    draft.act(Action::ForceDeletePod {
+    draft.act(Action::DeletePod {
         name: pod.name.clone(),
         uid: pod.uid.clone(),
     });

@@ -6,7 +6,7 @@ use std::time::Duration;
 use k8s_openapi::apimachinery::pkg::apis::meta::v1::Time;
 
 use super::builders::*;
-use crate::controller::submissions::decide::{Action, EvalaiUpdate, TableUpdate};
+use crate::controller::submissions::decide::{Action, EvalaiUpdate, Question, TableUpdate};
 use crate::controller::submissions::view::{Standing, Turn};
 use leaderboard_api::State::{Cancelled, Failed, Pending};
 use leaderboard_api::conditions::{ACCEPTED, FINISHED, PUBLISHED, READY, RECORDED, STALLED};
@@ -51,7 +51,7 @@ fn an_answer_of_evalai_within_five_seconds_costs_no_write() {
     world.in_evalai().waited = Duration::from_secs(2);
     let plan = world.pass();
     assert_eq!(plan.status, SubmissionStatus::default());
-    assert!(has(&plan, |a| *a == Action::AskEvalai));
+    assert!(has(&plan, |a| *a == Action::Ask(Question::Evalai)));
     assert_eq!(plan.requeue, Some(Duration::from_secs(3)));
     let mut answered = world.clone();
     answered.in_evalai().info = Some(info());
@@ -105,7 +105,7 @@ fn evalai_is_asked_and_its_silence_shown() {
     let mut world = World::evalai();
     world.in_evalai().info = None;
     let plan = world.pass_to(Pending, reasons::ASKING_EVALAI);
-    assert!(has(&plan, |a| *a == Action::AskEvalai) && !creates(&plan));
+    assert!(has(&plan, |a| *a == Action::Ask(Question::Evalai)) && !creates(&plan));
     assert_eq!(condition(&plan, ACCEPTED).0, "Unknown");
 
     world.in_evalai().error = Some("401 Unauthorized, request 7".into());
@@ -208,7 +208,7 @@ fn a_leaderboard_that_names_what_it_may_not_starts_nothing_and_has_nothing_looke
             "{message}"
         );
         assert!(!creates(&plan), "{:?}", plan.actions);
-        assert!(!has(&plan, |action| matches!(action, Action::ReadRow(_))));
+        assert!(!has(&plan, |action| matches!(action, Action::Ask(Question::Row(_)))));
         world.view.not_allowed = None;
         assert!(creates(&world.pass()));
     }
@@ -326,7 +326,7 @@ fn a_submission_with_a_wrong_phase_is_taken_back_without_ending_the_row() {
     let plan = world.pass_to(Cancelled, reasons::DELETED);
     assert_eq!(evalai_updates(&plan), []);
     assert_eq!(condition(&plan, PUBLISHED).1, reasons::NOT_REQUIRED);
-    assert!(has(&plan, |a| *a == Action::ReleaseFinalizer), "{:?}", plan.actions);
+    assert!(has(&plan, |a| *a == Action::SetFinalizer(false)), "{:?}", plan.actions);
 
     // It was accepted, and EvalAI has heard that it is queued.
     let mut world = World::evalai();
@@ -363,7 +363,7 @@ fn what_waits_before_its_acceptance_hears_of_its_end_in_evalai() {
         wait(&mut world);
         let plan = world.pass_to(Pending, reason);
         assert!(
-            has(&plan, |a| *a == Action::FollowEvalai),
+            has(&plan, |a| *a == Action::Ask(Question::EvalaisEnd)),
             "{reason}: {:?}",
             plan.actions
         );
@@ -384,7 +384,7 @@ fn evalai_is_asked_also_where_the_track_is_missing() {
     let mut world = World::evalai();
     world.leaderboard().tracks[0].phase = Some(8);
     world.in_evalai().info = None;
-    assert!(has(&world.pass(), |a| *a == Action::AskEvalai));
+    assert!(has(&world.pass(), |a| *a == Action::Ask(Question::Evalai)));
     world.in_evalai().info = Some(crate::controller::submissions::view::EvalaiInfo {
         standing: Standing::Ended,
         status: "cancelled".into(),
@@ -405,7 +405,11 @@ fn what_waits_between_two_tries_is_followed_after_a_restart() {
     world.pass_to(Pending, reasons::REPLACING);
     world.job_gone();
     let plan = world.pass_to(Pending, reasons::REPLACING);
-    assert!(has(&plan, |a| *a == Action::FollowEvalai), "{:?}", plan.actions);
+    assert!(
+        has(&plan, |a| *a == Action::Ask(Question::EvalaisEnd)),
+        "{:?}",
+        plan.actions
+    );
 }
 
 #[test]

@@ -309,7 +309,7 @@ fn a_leaderboard_that_is_gone_wants_what_it_wanted() {
     world.pass();
     world.delete();
     assert!(has(&world.pass_to(Cancelled, reasons::DELETED), |a| *a
-        == Action::ReleaseFinalizer));
+        == Action::SetFinalizer(false)));
 }
 
 #[test]

@@ -460,7 +460,7 @@ pub fn events(plan: &Plan) -> Vec<&str> {
 /// The stop that the Pod is asked for.
 pub fn annotated(plan: &Plan) -> Option<Stop> {
     plan.actions.iter().find_map(|a| match a {
-        Action::AnnotateStop { stop, .. } => Some(*stop),
+        Action::StopPod { stop, .. } => Some(*stop),
         _ => None,
     })
 }

@@ -23,7 +23,10 @@ fn it_runs_one_route_with_one_pair_and_has_no_row() {
     assert_eq!(run.slices, [RouteSlice { first: 0, last: 0 }]);
     assert_eq!((run.routes, run.repetitions, run.run_id.as_str()), (1, 1, "sub"));
     assert!(creates(&plan));
-    assert!(!has(&plan, |a| matches!(a, Action::AddFinalizer | Action::Record(_))));
+    assert!(!has(&plan, |a| matches!(
+        a,
+        Action::SetFinalizer(true) | Action::Record(_)
+    )));
     assert_eq!(World::local().pass().status.plan.unwrap().routes, 4);
 }
 

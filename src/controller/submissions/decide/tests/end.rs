@@ -84,7 +84,7 @@ fn a_farewell_that_never_ends_does_not_keep_the_job() {
     let plan = lost.pass();
     assert!(deletes(&plan));
     lost.job().deleting = true;
-    assert!(has(&lost.pass(), |a| matches!(a, Action::ForceDeletePod { .. })));
+    assert!(has(&lost.pass(), |a| matches!(a, Action::DeletePod { .. })));
 }
 
 #[test]

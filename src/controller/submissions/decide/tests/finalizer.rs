@@ -17,9 +17,9 @@ fn a_finalizer_goes_on_first_where_another_system_has_to_get_the_end() {
         world.view.record = has_table.then(RecordView::default);
         let plan = world.pass();
         assert!(creates(&plan));
-        let is_first = plan.actions[0] == Action::AddFinalizer;
+        let is_first = plan.actions[0] == Action::SetFinalizer(true);
         assert_eq!(is_first, wanted, "EvalAI {evalai}, table {has_table}");
-        assert_eq!(has(&plan, |a| *a == Action::AddFinalizer), wanted);
+        assert_eq!(has(&plan, |a| *a == Action::SetFinalizer(true)), wanted);
     }
 }
 
@@ -30,7 +30,7 @@ fn a_finalizer_comes_with_the_first_job_or_with_a_later_table() {
     let (position, eta) = (1, None);
     world.view.turn = Turn::Wait { position, eta };
     assert!(
-        !has(&world.pass(), |a| *a == Action::AddFinalizer),
+        !has(&world.pass(), |a| *a == Action::SetFinalizer(true)),
         "nobody knows of it"
     );
 
@@ -38,7 +38,7 @@ fn a_finalizer_comes_with_the_first_job_or_with_a_later_table() {
     world.submission().metadata.finalizers = None;
     world.view.record = None;
     let mut world = world.running();
-    assert!(!has(&world.pass(), |a| *a == Action::AddFinalizer));
+    assert!(!has(&world.pass(), |a| *a == Action::SetFinalizer(true)));
     world.view.record = Some(RecordView::default());
-    assert_eq!(world.pass().actions[0], Action::AddFinalizer);
+    assert_eq!(world.pass().actions[0], Action::SetFinalizer(true));
 }

@@ -5,7 +5,7 @@ use std::time::Duration;
 
 use super::builders::*;
 use crate::ask::{Answered, Failure, Lookup};
-use crate::controller::submissions::decide::{Action, Plan, SlotUse};
+use crate::controller::submissions::decide::{Action, Plan, Question, SlotUse};
 use crate::controller::submissions::rows::{ForeignRun, Row};
 use crate::controller::submissions::view::{EvalaiInfo, JobEnd, Standing};
 use leaderboard_api::State::{Cancelled, Pending};
@@ -72,7 +72,7 @@ fn adopt(world: &mut World, text: &str) {
 
 fn asked(plan: &Plan) -> Option<&Row> {
     plan.actions.iter().find_map(|action| match action {
-        Action::ReadRow(row) => Some(&**row),
+        Action::Ask(Question::Row(row)) => Some(&**row),
         _ => None,
     })
 }
@@ -148,7 +148,7 @@ fn what_another_program_runs_waits_and_nothing_is_written_of_it() {
     for mut world in [refused, moved] {
         for _ in 0..3 {
             let plan = world.pass_to(Pending, reasons::FOREIGN);
-            assert!(writes_nothing(&plan) && !has(&plan, |a| *a == Action::AddFinalizer));
+            assert!(writes_nothing(&plan) && !has(&plan, |a| *a == Action::SetFinalizer(true)));
             assert_eq!((asked(&plan), plan.slot()), (Some(&question(1)), SlotUse::Leaves));
             assert!(plan.status.plan.is_none() && plan.requeue.is_some());
             assert_eq!(condition(&plan, ACCEPTED), ("False".into(), reasons::FOREIGN.into()));
@@ -178,7 +178,7 @@ fn when_the_other_run_has_ended_evalai_decides_what_follows() {
     // What EvalAI answered before the row was read may be older than the end: it is asked anew.
     let mut world = ended();
     let plan = world.pass_to(Pending, reasons::FOREIGN);
-    assert!(writes_nothing(&plan) && has(&plan, |a| *a == Action::ForgetEvalai));
+    assert!(writes_nothing(&plan) && has(&plan, |a| *a == Action::Ask(Question::EvalaiAnew)));
     // Resumed there: what is stored is taken up.
     let mut world = ended();
     world.in_evalai().info.as_mut().unwrap().standing = Standing::Resumed;

@@ -17,11 +17,11 @@ fn a_node_that_does_not_come_back_is_given_up_and_another_job_made() {
     world.pass_to(Running, reasons::REPLACING);
     world.go_to(730);
     let plan = world.pass_to(Running, reasons::REPLACING);
-    let wanted = |a: &Action| matches!(a, Action::TakeOwnership | Action::ForceDeletePod { .. });
+    let wanted = |a: &Action| matches!(a, Action::TakeOwnership | Action::DeletePod { .. });
     assert_eq!(plan.actions.iter().filter(|a| wanted(a)).count(), 2);
     assert!(has(&plan, |a| matches!(a, Action::DeleteJob { grace_seconds: 0, .. })));
     // A crash of ours before the actions: they are requested again.
-    assert!(has(&world.pass(), |a| matches!(a, Action::ForceDeletePod { .. })));
+    assert!(has(&world.pass(), |a| matches!(a, Action::DeletePod { .. })));
     world.job().deleting = true;
     world.pass_to(Running, reasons::REPLACING);
     world.job_gone();
@@ -69,7 +69,7 @@ fn a_node_that_is_away_is_reported_before_kubernetes_gives_its_pod_up() {
         );
         assert!(!has(&plan, |a| matches!(
             a,
-            Action::DeleteJob { .. } | Action::ForceDeletePod { .. }
+            Action::DeleteJob { .. } | Action::DeletePod { .. }
         )));
         world.view.node.state = ObservedNode::Reports;
         world.pass_to(Running, reasons::RUNNING);
@@ -106,7 +106,7 @@ fn a_pod_is_given_up_early_only_where_its_kubelet_is_silent() {
         let plan = world.pass_to(Running, reasons::REPLACING);
         let order = plan.actions.iter().filter_map(|a| match a {
             Action::TakeOwnership => Some("fence"),
-            Action::ForceDeletePod { .. } => Some("pod"),
+            Action::DeletePod { .. } => Some("pod"),
             Action::DeleteJob { grace_seconds: 0, .. } => Some("job"),
             _ => None,
         });

@@ -2,7 +2,7 @@
 
 use super::builders::*;
 use crate::ask::Lookup;
-use crate::controller::submissions::decide::{Action, EvalaiUpdate};
+use crate::controller::submissions::decide::{Action, EvalaiUpdate, Question};
 use leaderboard_api::State::{Failed, Finished, Pending};
 use leaderboard_api::conditions::PUBLISHED;
 use leaderboard_api::{EvalaiMode, reasons};
@@ -63,5 +63,5 @@ fn nobody_looks_whether_another_program_runs_what_is_only_observed() {
     let mut world = observed();
     world.view.row = Lookup::default();
     let plan = world.pass_to(Pending, reasons::PREPARING);
-    assert!(creates(&plan) && !has(&plan, |a| matches!(a, Action::ReadRow(_))));
+    assert!(creates(&plan) && !has(&plan, |a| matches!(a, Action::Ask(Question::Row(_)))));
 }

@@ -22,7 +22,7 @@ fn demanded(plan: &Plan) -> Option<(Stage, Option<&str>)> {
 
 fn deletes(plan: &Plan) -> bool {
     has(plan, |a| {
-        matches!(a, Action::DeleteJob { .. } | Action::ForceDeletePod { .. })
+        matches!(a, Action::DeleteJob { .. } | Action::DeletePod { .. })
     })
 }
 

@@ -61,7 +61,7 @@ fn an_end_that_the_table_does_not_take_is_settled_and_not_written_again() {
     let again = world.pass();
     assert_eq!((again.actions, again.status), (plan.actions, plan.status));
     world.delete();
-    assert!(has(&world.pass(), |a| *a == Action::ReleaseFinalizer));
+    assert!(has(&world.pass(), |a| *a == Action::SetFinalizer(false)));
 }
 
 #[test]
@@ -139,7 +139,7 @@ fn a_cancel_before_evalais_row_is_known_keeps_what_had_finished_there() {
         assert!(!has(&plan, |a| matches!(a, Action::UpdateEvalai(_))));
         let published = condition(&plan, conditions::PUBLISHED);
         assert_eq!(published, ("False".into(), reasons::NOT_REQUIRED.into()));
-        assert_eq!(has(&plan, |a| *a == Action::ReleaseFinalizer), is_deleted);
+        assert_eq!(has(&plan, |a| *a == Action::SetFinalizer(false)), is_deleted);
         assert_eq!(world.pass().status, plan.status, "once");
     }
 }

@@ -2,7 +2,7 @@
 
 use std::collections::HashSet;
 
-use crate::controller::submissions::decide::{Action, EvalaiUpdate, Plan, decide, job_name};
+use crate::controller::submissions::decide::{Action, EvalaiUpdate, Plan, Question, decide, job_name};
 use crate::controller::submissions::view::{ObservedJob, ObservedNode, Standing, View};
 use leaderboard_api::conditions::{self, FINISHED, PUBLISHED, RECORDED};
 use leaderboard_api::reasons::{self, Class};
@@ -111,7 +111,7 @@ fn logs_come_first(plan: &Plan) {
     let takes_it_away = |a: &Action| {
         matches!(
             a,
-            Action::DeleteJob { .. } | Action::ForceDeletePod { .. } | Action::UpdateEvalai(_) | Action::Forget
+            Action::DeleteJob { .. } | Action::DeletePod { .. } | Action::UpdateEvalai(_) | Action::Forget
         )
     };
     let first = plan.actions.iter().position(takes_it_away);
@@ -187,7 +187,12 @@ fn updates_fit(view: &View, plan: &Plan) {
 
 fn status_is_whole(plan: &Plan) {
     let status = &plan.status;
-    let waits = |action: &Action| matches!(action, Action::JoinLine(_) | Action::AskEvalai | Action::ReadRow(_));
+    let waits = |action: &Action| {
+        matches!(
+            action,
+            Action::JoinLine(_) | Action::Ask(Question::Evalai | Question::Row(_))
+        )
+    };
     if *status == SubmissionStatus::default() && plan.actions.iter().any(waits) {
         // Nothing was written of it yet, and its place, or an answer of EvalAI or the table comes first.
         return;
@@ -278,7 +283,7 @@ fn a_wait_hears_evalai(view: &View, plan: &Plan) {
         let follows = |a: &Action| {
             matches!(
                 a,
-                Action::FollowEvalai | Action::UpdateEvalai(EvalaiUpdate::Queued | EvalaiUpdate::Running)
+                Action::Ask(Question::EvalaisEnd) | Action::UpdateEvalai(EvalaiUpdate::Queued | EvalaiUpdate::Running)
             )
         };
         assert!(
@@ -301,7 +306,7 @@ fn comes_to_rest(view: &View, plan: &Plan) {
     let again = decide(&view);
     assert_eq!(again.status, last.status, "a write each pass");
     // The reconcile that releases a deleted object is its last.
-    if !again.actions.contains(&Action::ReleaseFinalizer) {
+    if !again.actions.contains(&Action::SetFinalizer(false)) {
         assert_eq!(again.events, Vec::new(), "an event each pass");
     }
     assert_eq!(again.actions, last.actions);

@@ -385,7 +385,7 @@ fn a_job_that_somebody_deletes_slowly_is_waited_for() {
     world.pod().delete_by = Some(at(70));
     assert!(!creates(&world.pass_to(Running, reasons::REPLACING)));
     world.go_to(85);
-    assert!(has(&world.pass(), |a| matches!(a, Action::ForceDeletePod { .. })));
+    assert!(has(&world.pass(), |a| matches!(a, Action::DeletePod { .. })));
     world.job_gone();
     assert!(creates(&world.pass_to(Running, reasons::REPLACING)));
 }

@@ -386,7 +386,7 @@ fn an_agent_that_waits_for_a_simulator_without_image_is_no_run() {
     let plan = world.pass_to(Pending, reasons::STOPPING);
     let stop = Stop::Retries;
     assert!(has(&plan, |a| *a
-        == Action::AnnotateStop {
+        == Action::StopPod {
             pod: "sub-1-x".into(),
             stop
         }));

@@ -53,7 +53,7 @@ fn a_running_one_is_asked_to_stop_and_keeps_what_it_has() {
         let plan = world.pass_to(Running, reasons::STOPPING);
         assert_eq!(
             plan.actions,
-            [Action::AnnotateStop {
+            [Action::StopPod {
                 pod: "sub-1-x".into(),
                 stop: Stop::Cancel
             }]
@@ -258,7 +258,7 @@ fn a_pod_that_does_not_obey_is_deleted_then_removed() {
     stuck.go_to(1210);
     let plan = stuck.pass();
     assert_eq!(plan.actions[0], Action::TakeOwnership, "the fence goes first");
-    assert!(matches!(plan.actions[1], Action::ForceDeletePod { .. }));
+    assert!(matches!(plan.actions[1], Action::DeletePod { .. }));
     // It did not: by force all the same.
     world.go_to(1210);
     let plan = world.pass();
@@ -274,7 +274,7 @@ fn a_logcopy_that_is_being_restarted_may_still_store() {
     world.pod().logcopy_running = false;
     world.submission().spec.cancel = true;
     let plan = world.pass_to(Running, reasons::STOPPING);
-    assert!(has(&plan, |a| matches!(a, Action::AnnotateStop { .. })));
+    assert!(has(&plan, |a| matches!(a, Action::StopPod { .. })));
     assert!(!has(&plan, |a| matches!(a, Action::DeleteJob { .. })));
 }
 
@@ -317,11 +317,11 @@ fn a_deleted_one_is_released_when_all_know_its_end() {
     world.complete();
     let plan = world.pass_to(Cancelled, reasons::DELETED);
     assert_eq!(evalai_updates(&plan), [EvalaiUpdate::Cancelled]);
-    assert!(!has(&plan, |a| *a == Action::ReleaseFinalizer));
+    assert!(!has(&plan, |a| *a == Action::SetFinalizer(false)));
     world.published();
     assert!(has(&world.pass(), |a| *a == Action::Record(TableUpdate::End)));
     world.recorded();
-    assert!(has(&world.pass(), |a| *a == Action::ReleaseFinalizer));
+    assert!(has(&world.pass(), |a| *a == Action::SetFinalizer(false)));
 }
 
 #[test]
@@ -333,13 +333,13 @@ fn deletion_does_not_wait_without_end() {
     world.complete();
     world.pass_to(Cancelled, reasons::DELETED);
     world.go_to(999);
-    assert!(!has(&world.pass(), |a| *a == Action::ReleaseFinalizer));
+    assert!(!has(&world.pass(), |a| *a == Action::SetFinalizer(false)));
     world.go_to(1000);
     let plan = world.pass();
-    assert!(has(&plan, |a| *a == Action::ReleaseFinalizer));
+    assert!(has(&plan, |a| *a == Action::SetFinalizer(false)));
     assert_eq!(events(&plan), [reasons::RELEASED_UNPUBLISHED]);
     world.submission().metadata.finalizers = Some(vec![format!("{}-other", names::FINALIZER_SUBMISSION)]);
-    assert!(!has(&world.pass(), |a| *a == Action::ReleaseFinalizer));
+    assert!(!has(&world.pass(), |a| *a == Action::SetFinalizer(false)));
 }
 
 #[test]

@@ -4,7 +4,7 @@ use std::time::Duration;
 
 use super::builders::*;
 use crate::controller::slots::turns::Turn;
-use crate::controller::submissions::decide::{Action, EvalaiUpdate, StatusWrite, TableUpdate};
+use crate::controller::submissions::decide::{Action, EvalaiUpdate, Question, StatusWrite, TableUpdate};
 
 #[test]
 fn progress_waits_since_the_last_write_and_what_matters_does_not() {
@@ -65,7 +65,7 @@ fn only_of_a_team_is_there_a_row() {
         let mut world = World::local();
         world.submission().metadata.finalizers = None;
         world.submission().spec.team.take_if(|_| !has_team);
-        assert_eq!(has(&world.pass(), |a| *a == Action::AddFinalizer), has_team);
+        assert_eq!(has(&world.pass(), |a| *a == Action::SetFinalizer(true)), has_team);
         let mut world = world.running();
         let updates = |world: &mut World| -> Vec<TableUpdate> {
             let actions = world.pass().actions.into_iter();
@@ -86,7 +86,7 @@ fn only_of_a_team_is_there_a_row() {
 
 #[test]
 fn a_node_is_asked_for_where_none_are_watched_and_only_for_a_pod_that_runs_or_goes() {
-    let asks = |world: &mut World| has(&world.pass(), |a| *a == Action::LookUpNode("node-a".into()));
+    let asks = |world: &mut World| has(&world.pass(), |a| *a == Action::Ask(Question::Node("node-a".into())));
     let mut world = World::local().with_pod();
     world.view.node.is_watched = false;
     assert!(!asks(&mut world), "it does not run yet");
