@@ -7,20 +7,13 @@ use k8s_openapi::apimachinery::pkg::apis::meta::v1::Time;
 use super::failure::{self, infrastructure};
 use super::isolation::Missing;
 use super::plan::{Action, Question};
-use super::plan_builder::{PlanBuilder, Terms, after};
+use super::plan_builder::{PlanBuilder, Terms};
+use super::waits::Wait;
 use super::{end, foreign, image, isolation, pin};
 use crate::controller::submissions::view::{EvalaiInfo, Standing};
 use leaderboard_api::conditions::{self, Truth};
 use leaderboard_api::text::{LONGEST_NAME, one_line, sentence};
 use leaderboard_api::{Failure, ImageReference, LeaderboardSpec, Team, TeamStatus, Track, reasons};
-
-/// When EvalAI is asked again, should its answer not come.
-const RETRY: Duration = Duration::from_secs(30);
-/// How long a submission waits whose row is of another phase: time for a host who has made a mistake, and not too long for a
-/// participant, whose team has that submission in progress.
-const PHASE_SECONDS: i64 = 3600;
-/// How long after its creation a submission does not show that the policy is not in place yet.
-const POLICY_SECONDS: i64 = 5;
 
 /// Whether the submission may go on to its turn. Otherwise the draft shows why not. EvalAI's own end goes before all that it may
 /// wait for.
@@ -110,7 +103,7 @@ fn refuse_image(draft: &mut PlanBuilder<'_>, terms: Terms<'_>, image: String, fo
 /// A Leaderboard and its first submission may come together: that the policy takes a moment then is no news.
 fn wait_for_policy(draft: &mut PlanBuilder<'_>, missing: &Missing) -> bool {
     let created = draft.submission().metadata.creation_timestamp.as_ref();
-    let until = after(created.map_or(draft.now(), |time| time.0), POLICY_SECONDS);
+    let until = Wait::POLICY.shown_at(created.map_or(draft.now(), |time| time.0));
     if draft.now() < until && !missing.is_refused {
         draft.requeue_at(until);
         return refuse(draft, reasons::PREPARING, &missing.message);
@@ -229,11 +222,11 @@ fn waits_for_phase(draft: &mut PlanBuilder<'_>, info: Option<&EvalaiInfo>) -> bo
         "{what} Set phase {} back in EvalAI, or delete this Submission and apply it with the right phase; after {} min it \
          fails, uncharged.",
         draft.spec().evalai.map_or(0, |evalai| evalai.phase),
-        PHASE_SECONDS / 60
+        Wait::PHASE.longest / 60
     );
     let message = draft.stall(reasons::PHASE_DIFFERS, &message);
     let since = draft.blocked_since(reasons::PHASE_DIFFERS).unwrap_or(draft.now());
-    let until = after(since, PHASE_SECONDS);
+    let until = Wait::PHASE.over_at(since);
     if draft.now() >= until {
         end::failed(draft, infrastructure(reasons::PHASE_DIFFERS, &what));
     } else {
@@ -259,17 +252,11 @@ fn ask_evalai<'a>(draft: &mut PlanBuilder<'a>) -> Answer<'a> {
         Some(info) => Answer::Wanted(info),
         None => {
             draft.act(Action::Ask(Question::Evalai));
-            if draft.waits_quietly(
-                draft
-                    .view
-                    .evalai
-                    .as_ref()
-                    .map_or(Duration::ZERO, |evalai| evalai.waited),
-            ) {
+            let view = draft.view.evalai.as_ref();
+            if draft.waits_quietly(Wait::EVALAI, view.map_or(Duration::ZERO, |evalai| evalai.waited)) {
                 return Answer::Waiting;
             }
-            draft.requeue_in(RETRY);
-            let view = draft.view.evalai.as_ref();
+            draft.look_again(Wait::EVALAI);
             let message = match view.and_then(|view| view.error.as_deref()) {
                 Some(error) => draft.stall(reasons::ASKING_EVALAI, &asking(Some(error))),
                 None => asking(None),

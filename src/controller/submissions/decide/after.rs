@@ -6,21 +6,16 @@ use jiff::Timestamp;
 use k8s_openapi::apimachinery::pkg::apis::meta::v1::Time;
 
 use super::plan::{Action, EvalaiUpdate};
-use super::plan_builder::{PlanBuilder, after, seconds};
+use super::plan_builder::{PlanBuilder, seconds};
 use super::reading::{self, Reading};
 use super::record::{self, record_end, superseded};
+use super::waits::{Wait, after};
 use super::{accept, foreign, log, retention, stop};
 use crate::controller::submissions::view::{EvalaiEnd, EvalaiView, ObservedJob};
 use leaderboard_api::conditions::{self, Truth};
 use leaderboard_api::text::sentence;
 use leaderboard_api::{Ingested, JOB_SECONDS, State, reasons};
 
-/// How often an unpublished end is looked at again.
-const AGAIN: Duration = Duration::from_secs(30);
-/// How long logcopy and the kubelet have for their last words after a run. Its results are stored by then.
-const FAREWELL_SECONDS: i64 = 120;
-/// How long EvalAI's answer waits for the table's, to be shown with it.
-const TOGETHER_SECONDS: i64 = 10;
 /// EvalAI's word for a row with a result.
 const FINISHED: &str = "finished";
 /// Why an attempt does not begin.
@@ -60,7 +55,7 @@ pub(super) fn decide(draft: &mut PlanBuilder<'_>) {
         draft.act(Action::Forget);
         retention::decide(draft);
     } else {
-        draft.requeue_in(AGAIN);
+        draft.look_again(Wait::DELIVERY);
     }
     if complete {
         remove_job_in_time(draft);
@@ -114,7 +109,7 @@ fn show_published(draft: &mut PlanBuilder<'_>, at: Timestamp, recorded: bool) {
 }
 
 fn shown_by(at: Timestamp) -> Timestamp {
-    after(at, TOGETHER_SECONDS)
+    Wait::TOGETHER.shown_at(at)
 }
 
 /// What becomes of the Job of an attempt that has ended: it is kept for its time, and one that shows up late is ended.
@@ -131,9 +126,9 @@ pub(super) fn leave_job(draft: &mut PlanBuilder<'_>) {
     if job.deleting {
         stop::remove_overdue_pod(draft);
     } else {
-        draft.act(stop::delete(job, stop::DELETE_GRACE_SECONDS));
+        draft.act(stop::delete(job, Wait::DELETION.longest));
     }
-    draft.requeue_in(AGAIN);
+    draft.look_again(Wait::DELIVERY);
 }
 
 /// Until when a Pod whose run has ended may take to say its farewell; None if nothing is to be waited for.
@@ -141,7 +136,7 @@ fn farewell(draft: &PlanBuilder<'_>) -> Option<Timestamp> {
     let pod = draft.view.pod.as_ref().filter(|pod| pod.delete_by.is_none())?;
     pod.run_ended?;
     let end = draft.status.end()?;
-    let until = after(end.last_transition_time.0, FAREWELL_SECONDS);
+    let until = Wait::FAREWELL.over_at(end.last_transition_time.0);
     (draft.now() < until).then_some(until)
 }
 
@@ -211,7 +206,7 @@ fn note_late_cancel(draft: &mut PlanBuilder<'_>) {
     if listed > after(published.0, 1) {
         draft.condition(conditions::PUBLISHED, Truth::False, reasons::CANCELLED_IN_EVALAI, "");
     } else {
-        draft.requeue_in(AGAIN);
+        draft.look_again(Wait::DELIVERY);
     }
 }
 
@@ -372,8 +367,8 @@ fn remove_job_in_time(draft: &mut PlanBuilder<'_>) {
     if draft.now() < until {
         draft.requeue_at(until);
     } else {
-        draft.act(stop::delete(job, stop::DELETE_GRACE_SECONDS));
-        draft.requeue_in(AGAIN);
+        draft.act(stop::delete(job, Wait::DELETION.longest));
+        draft.look_again(Wait::DELIVERY);
     }
 }
 

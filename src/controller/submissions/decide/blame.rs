@@ -7,13 +7,11 @@
 
 use jiff::Timestamp;
 
+use super::waits::Wait;
 use super::words;
 use crate::controller::submissions::view::{ContainerView, EndView};
 use leaderboard_api::EndReason;
 use leaderboard_runner::verdict::{CODE_NO_PROCESS, CODE_NODE_REFUSED, What};
-
-/// How long the other side's end of a round is waited for. A runner ends within moments of its peer.
-pub(super) const PEER_SECONDS: i64 = 120;
 
 /// Exit codes of a container that was ended with all others of its Pod, as by a sandbox that is made anew: killed, or lost from sight.
 const FROM_OUTSIDE: [i32; 2] = [137, 255];
@@ -216,7 +214,7 @@ fn cannot_be_started(host: &ContainerView) -> bool {
 
 /// Whether the other side's end may still be seen. A clock that was set back does not prolong this.
 fn is_awaited(at: Option<Timestamp>, now: Timestamp) -> bool {
-    at.is_some_and(|at| now.duration_since(at).as_secs().abs() < PEER_SECONDS)
+    at.is_some_and(|at| now.duration_since(at).as_secs().abs() < Wait::PEER.longest)
 }
 
 fn crash(cause: EndReason, end: &EndView) -> Crash {

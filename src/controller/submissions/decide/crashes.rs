@@ -11,7 +11,8 @@ use leaderboard_runner::protocol::{Member, Pair, Side};
 use super::blame::{self, Crash};
 use super::failure::{infrastructure, participant};
 use super::next_steps::{Steps, for_both, in_the_log_of, of_participant, smaller};
-use super::plan_builder::{PlanBuilder, after};
+use super::plan_builder::PlanBuilder;
+use super::waits::Wait;
 use crate::controller::submissions::report_digest::{ReportDigest, clamp};
 use crate::controller::submissions::view::{ContainerView, PodView};
 use leaderboard_api::{EndReason, Failure, LastEnd, PairState, PairStatus, SubmissionStatus, reasons};
@@ -134,7 +135,7 @@ pub(super) fn too_many(draft: &mut PlanBuilder<'_>) -> Option<Failure> {
         }
     }
     if let Some(at) = awaited {
-        draft.requeue_at(after(at, blame::PEER_SECONDS));
+        draft.requeue_at(Wait::PEER.over_at(at));
     }
     None
 }

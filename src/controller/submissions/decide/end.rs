@@ -1,10 +1,9 @@
 //! The end of an attempt: which outcome it has, or whether an infrastructure failure gives it another Job.
 
-use std::time::Duration;
-
 use k8s_openapi::apimachinery::pkg::apis::meta::v1::Time;
 
-use super::plan_builder::{PlanBuilder, after};
+use super::plan_builder::PlanBuilder;
+use super::waits::{Wait, after};
 use super::{clock, crashes, disk, failure, interruption, provoked, reading, reported};
 use crate::controller::submissions::report_digest::ReportDigest;
 use crate::controller::submissions::view::{JobEnd, ObservedReport, Stage};
@@ -14,16 +13,6 @@ use leaderboard_api::{FailedNode, Failure, FailureClass, MAX_FAILED_NODES, reaso
 
 /// Shown while the report of an ended run has been asked for and no answer has come, not even a refusal.
 const NO_ANSWER: &str = "its bucket has not answered yet.";
-/// First delay before a new Job after an infrastructure failure; doubles with each.
-const RETRY_SECONDS: i64 = 10;
-/// Most doublings of that delay.
-const MAX_DOUBLINGS: i32 = 8;
-/// Longest delay before a new Job.
-pub(super) const LONGEST_RETRY_SECONDS: i64 = RETRY_SECONDS << MAX_DOUBLINGS;
-/// How long an end waits for a bucket that does not answer; what it stores can still be taken up by a resume.
-const READ_SECONDS: i64 = 86_400;
-/// The same of one that was cancelled, which has `deadlines.cancelSeconds`: a bucket that hung is left alone for up to half of it.
-const READ_AT_LEAST_SECONDS: i64 = 60;
 
 /// Failures of a node, which gets no third Job of the attempt.
 const OF_NODES: [&str; 2] = [reasons::NO_GPU, reasons::NODE_CANNOT_START];
@@ -99,9 +88,9 @@ pub(super) fn of_complete_run(draft: &mut PlanBuilder<'_>) -> bool {
 /// Whether the end still waits until the bucket can be read.
 fn wait_for_bucket(draft: &mut PlanBuilder<'_>, why: &str) -> bool {
     let limit = if draft.is_cancelled() {
-        draft.deadlines().cancel_seconds.max(READ_AT_LEAST_SECONDS)
+        draft.deadlines().cancel_seconds.max(Wait::CANCELLED_REPORT.longest)
     } else {
-        READ_SECONDS
+        Wait::REPORT.longest
     };
     let message = format!(
         "The results cannot be read: {} The submission goes on when they can.",
@@ -115,7 +104,7 @@ fn wait_for_bucket(draft: &mut PlanBuilder<'_>, why: &str) -> bool {
     }
     draft.show(reasons::NOT_STORED, message);
     draft.requeue_at(until);
-    draft.requeue_in(Duration::from_secs(10));
+    draft.look_again(Wait::REPORT);
     true
 }
 
@@ -195,7 +184,7 @@ fn retry(draft: &mut PlanBuilder<'_>, found: &Failure) {
         let next = "A new Job resumes from the results in S3; this costs neither an attempt nor a retry.";
         (0, next.to_owned())
     } else {
-        let delay = RETRY_SECONDS << failures.clamp(0, MAX_DOUBLINGS);
+        let delay = (Wait::RETRY.again << failures.clamp(0, 16)).min(Wait::RETRY.longest);
         (
             delay,
             format!("The submission is tried again in {delay} s; this costs no attempt."),

@@ -1,10 +1,9 @@
 //! Another program may run a submission of EvalAI's too, as the old pipeline does. A row of its run, or results of something else below
 //! the prefix, hold the submission back: nothing is written anywhere until that run has ended, or a person hands the submission over.
 
-use std::time::Duration;
-
 use super::plan::{Action, Question};
 use super::plan_builder::{PlanBuilder, Terms};
+use super::waits::Wait;
 use super::{clock, stop};
 use crate::ask::{Answered, Failure};
 use crate::controller::submissions::rows::{ForeignRun, Row};
@@ -18,8 +17,6 @@ const PREFIX_IN_USE: &str = "PrefixInUse";
 /// Why an end of what was held back is written to no other system.
 pub(super) const NOT_WRITTEN: &str = "Nothing is written of this end, because another program may run the submission. If none does, \
                                       cancel it in EvalAI.";
-/// How soon the Job of a submission that is held back is looked at again.
-const SOON: Duration = Duration::from_secs(15);
 
 /// Whether the submission is held back, or that is not known yet.
 pub(super) fn waits(draft: &mut PlanBuilder<'_>, terms: Terms<'_>) -> bool {
@@ -65,7 +62,7 @@ fn question(draft: &PlanBuilder<'_>, terms: Terms<'_>) -> Option<Row> {
 }
 
 fn show_reading(draft: &mut PlanBuilder<'_>) {
-    if draft.waits_quietly(draft.view.row.waited.unwrap_or_default()) {
+    if draft.waits_quietly(Wait::ROW, draft.view.row.waited.unwrap_or_default()) {
         return;
     }
     let message = "The table is asked whether another program runs the submission, and has not answered yet.";
@@ -82,7 +79,7 @@ fn awaits_evalai(draft: &mut PlanBuilder<'_>, answer: &Answered<Row>) -> bool {
     }
     draft.keeps_status();
     draft.act(Action::Ask(Question::EvalaiAnew));
-    draft.requeue_in(Duration::from_secs(1));
+    draft.look_again(Wait::ROW);
     true
 }
 
@@ -173,8 +170,8 @@ pub(super) fn holds(draft: &mut PlanBuilder<'_>, job: &JobView) -> bool {
     // The next Job has the name of this one, so it waits until this one is gone.
     draft.status.job_name = None;
     if !job.deleting {
-        draft.act(stop::delete(job, stop::DELETE_GRACE_SECONDS));
+        draft.act(stop::delete(job, Wait::DELETION.longest));
     }
-    draft.requeue_in(SOON);
+    draft.look_again(Wait::JOB);
     true
 }

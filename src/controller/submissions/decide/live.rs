@@ -1,10 +1,10 @@
 //! A submission that has not come to its end: in line, with its Job, without it.
 
 use std::sync::Arc;
-use std::time::Duration;
 
 use super::plan::{Action, EvalaiUpdate, Question, TableUpdate};
-use super::plan_builder::{PlanBuilder, after};
+use super::plan_builder::PlanBuilder;
+use super::waits::{Wait, after};
 use super::{
     accept, clock, crashes, disk, end, failure, foreign, image, interruption, isolation, line, reading, record,
     reported, start, stop,
@@ -17,13 +17,6 @@ use leaderboard_api::{JOB_SECONDS, LeaderboardSpec, reasons};
 
 /// Times a Job is made again after somebody deleted it.
 const MAX_RECREATED: i32 = 3;
-/// When a submission in line is looked at again, should nothing wake it before.
-const BACKSTOP: Duration = Duration::from_mins(5);
-/// When a Job is looked at again, should nothing wake it before: its Pod, its node, what events show, its report or EvalAI. What a stage
-/// does by the clock it asks for itself.
-const LIVE_BACKSTOP: Duration = Duration::from_mins(5);
-/// How soon a Job that was just asked for is looked for.
-const LOOK: Duration = Duration::from_secs(15);
 
 /// Decides for a live submission.
 pub(super) fn decide(draft: &mut PlanBuilder<'_>) {
@@ -32,9 +25,9 @@ pub(super) fn decide(draft: &mut PlanBuilder<'_>) {
     let has_job = draft.status.job_name.is_some() && (draft.status.plan.is_some() || draft.is_to_stop());
     match &view.job {
         // What was seen is of an earlier try; the next reconcile looks at the present one.
-        ObservedJob::Ours(job) if job.name != draft.job_name() => draft.requeue_in(Duration::from_secs(1)),
+        ObservedJob::Ours(job) if job.name != draft.job_name() => draft.look_again(Wait::EARLIER_JOB),
         ObservedJob::Ours(job) => with_job(draft, job),
-        ObservedJob::Created => draft.requeue_in(LOOK),
+        ObservedJob::Created => draft.look_again(Wait::JOB),
         ObservedJob::Foreign if !draft.is_to_stop() => name_taken(draft),
         ObservedJob::Absent { .. } | ObservedJob::Foreign if has_job => without_its_job(draft),
         ObservedJob::Absent { .. } | ObservedJob::Foreign => in_line(draft),
@@ -67,7 +60,7 @@ fn name_taken(draft: &mut PlanBuilder<'_>) {
     );
     let message = draft.stall(reasons::JOB_NAME_TAKEN, &message);
     draft.show(reasons::JOB_NAME_TAKEN, message);
-    draft.requeue_in(Duration::from_secs(5));
+    draft.look_again(Wait::JOB_NAME);
 }
 
 fn in_line(draft: &mut PlanBuilder<'_>) {
@@ -86,7 +79,7 @@ fn in_line(draft: &mut PlanBuilder<'_>) {
         return end::cancelled(draft, reason, &format!("{what} {when}."));
     }
     if !accept::decide(draft) {
-        return draft.requeue_in(BACKSTOP);
+        return draft.look_again(Wait::SLOT);
     }
     if waits_for_next_try(draft) {
         return;
@@ -96,7 +89,7 @@ fn in_line(draft: &mut PlanBuilder<'_>) {
         line::Step::Join => {}
         line::Step::Wait => update_evalai(draft),
     }
-    draft.requeue_in(BACKSTOP);
+    draft.look_again(Wait::SLOT);
 }
 
 fn waits_for_next_try(draft: &mut PlanBuilder<'_>) -> bool {
@@ -104,7 +97,7 @@ fn waits_for_next_try(draft: &mut PlanBuilder<'_>) -> bool {
         return false;
     };
     // A clock that was set back must not turn seconds into days.
-    let latest = after(draft.now(), end::LONGEST_RETRY_SECONDS);
+    let latest = Wait::RETRY.over_at(draft.now());
     if at <= draft.now() || at > latest {
         return false;
     }
@@ -137,7 +130,7 @@ fn start_job(draft: &mut PlanBuilder<'_>) {
     }
     update_evalai(draft);
     record(draft);
-    draft.requeue_in(LOOK);
+    draft.look_again(Wait::JOB);
 }
 
 /// How many GPUs the next Job has: the Leaderboard may be another one when it ends.
@@ -202,13 +195,13 @@ fn is_held_up(draft: &mut PlanBuilder<'_>) -> bool {
         let message = accept::no_leaderboard(draft);
         let message = draft.stall(reasons::LEADERBOARD_NOT_FOUND, &message);
         draft.show(reasons::LEADERBOARD_NOT_FOUND, message);
-        draft.requeue_in(BACKSTOP);
+        draft.look_again(Wait::SLOT);
         return true;
     }
     if let Some(missing) = isolation::missing(draft) {
         draft.stall_with(reasons::NOT_ISOLATED, &missing.message);
         draft.show(reasons::NOT_ISOLATED, missing.message);
-        draft.requeue_in(BACKSTOP);
+        draft.look_again(Wait::SLOT);
         return true;
     }
     false
@@ -232,7 +225,7 @@ fn with_job(draft: &mut PlanBuilder<'_>, job: &JobView) {
     draft.status.next_retry_time = None;
     // Somebody has removed the status, and with it the plan.
     if draft.status.plan.is_none() && !draft.is_to_stop() && !accept::decide(draft) {
-        return draft.requeue_in(LOOK);
+        return draft.look_again(Wait::JOB);
     }
     let view = draft.view;
     if let Some(pod) = &view.pod {
@@ -269,7 +262,7 @@ fn with_job(draft: &mut PlanBuilder<'_>, job: &JobView) {
     if draft.is_running() {
         record(draft);
     }
-    draft.requeue_in(LIVE_BACKSTOP);
+    draft.look_again(Wait::RUN);
 }
 
 fn take_pod(draft: &mut PlanBuilder<'_>, pod: &PodView) {

@@ -6,16 +6,14 @@
 use std::time::Duration;
 
 use super::plan::Action;
-use super::plan_builder::{PlanBuilder, left_of};
+use super::plan_builder::PlanBuilder;
 use super::trouble;
+use super::waits::Wait;
 use crate::controller::submissions::view::{LogAt, LogPlace, ObservedLog, PodView};
 use crate::pod::keys::agent_log;
 use crate::pod::run::console;
 use leaderboard_api::{FailureClass, SubmissionStatus, conditions, names, reasons};
 use leaderboard_runner::protocol::Pair;
-
-/// How long a log is waited for before its Pod goes, or EvalAI has the end without it.
-const LONGEST: Duration = Duration::from_secs(15);
 
 /// Requests the log of a run that is being stopped for a failure, as far as the end of its Pod would take it away. Returns how
 /// long that end waits for it.
@@ -30,14 +28,14 @@ pub(super) fn keep_while_there(draft: &mut PlanBuilder<'_>) -> Option<Duration> 
     }
     places.retain(is_on_node);
     draft.act(Action::KeepLog { places });
-    left(draft.view.log, Some(LONGEST))
+    left(draft.view.log, Wait::LOG.left(Duration::ZERO))
 }
 
 /// How long a log is still waited for; `at_first`: while nobody has been asked for it.
 fn left(log: ObservedLog, at_first: Option<Duration>) -> Option<Duration> {
     match log {
         ObservedLog::NotRequested => at_first,
-        ObservedLog::Pending(waited) => left_of(LONGEST, waited),
+        ObservedLog::Pending(waited) => Wait::LOG.left(waited),
         ObservedLog::Kept | ObservedLog::None | ObservedLog::GivenUp => None,
     }
 }
@@ -60,7 +58,7 @@ pub(super) fn keep_at_end(draft: &mut PlanBuilder<'_>) -> Option<Duration> {
             } else {
                 draft.view.log
             };
-            return left(log, Some(LONGEST));
+            return left(log, Wait::LOG.left(Duration::ZERO));
         }
     }
     left(draft.view.log, None).filter(|_| !has_just_ended)

@@ -38,6 +38,7 @@ mod stop;
 #[cfg(test)]
 mod tests;
 mod trouble;
+mod waits;
 mod words;
 
 use std::time::Duration;

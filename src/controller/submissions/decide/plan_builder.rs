@@ -7,6 +7,7 @@ use k8s_openapi::apimachinery::pkg::apis::meta::v1::Time;
 
 use super::plan::{Action, Event, Plan, StatusWrite, job_name};
 use super::significance::{self, Change};
+use super::waits::Wait;
 use crate::controller::submissions::view::{EvalaiInfo, ObservedJob, ReportDemand, View};
 use leaderboard_api::conditions::{self, Truth};
 use leaderboard_api::{
@@ -21,9 +22,6 @@ const WITHOUT_EVENT: [&str; 4] = [
     reasons::RUNNING,
     reasons::RESUMED,
 ];
-
-/// How long what was asked for may take before that is shown: an answer within it costs no write.
-const SILENCE: Duration = Duration::from_secs(5);
 
 /// What a submission is run by.
 #[derive(Clone, Copy)]
@@ -291,9 +289,14 @@ impl<'a> PlanBuilder<'a> {
         self.requeue = Some(self.requeue.map_or(delay, |present| present.min(delay)));
     }
 
-    /// Shows nothing new while an answer that was waited for so long may still come soon. Returns whether it may.
-    pub(super) fn waits_quietly(&mut self, waited: Duration) -> bool {
-        let left = left_of(SILENCE, waited);
+    /// Asks for another look, should nothing wake the submission before.
+    pub(super) fn look_again(&mut self, wait: Wait) {
+        self.requeue_in(wait.again());
+    }
+
+    /// Shows nothing new while an answer that was waited for so long may still come soon: it then costs no write. Returns whether it may.
+    pub(super) fn waits_quietly(&mut self, wait: Wait, waited: Duration) -> bool {
+        let left = wait.silence_left(waited);
         if let Some(left) = left {
             self.keeps_status();
             self.requeue_in(left);
@@ -373,8 +376,8 @@ impl<'a> PlanBuilder<'a> {
     }
 
     /// Shows a wait that is a stall once it has lasted for so long.
-    pub(super) fn stalls_after(&mut self, seconds: i64, reason: &str, message: &str) {
-        let until = after(self.blocked(reason), seconds);
+    pub(super) fn stalls_after(&mut self, wait: Wait, reason: &str, message: &str) {
+        let until = wait.over_at(self.blocked(reason));
         if self.now() >= until {
             return self.stall_with(reason, message);
         }
@@ -466,16 +469,4 @@ impl<'a> PlanBuilder<'a> {
 pub(super) fn seconds(milliseconds: i64) -> String {
     let at = Timestamp::from_millisecond(milliseconds).unwrap_or_default();
     format!("{at:.0}")
-}
-
-/// What is left of a time of which so much has passed.
-pub(super) fn left_of(time: Duration, passed: Duration) -> Option<Duration> {
-    time.checked_sub(passed).filter(|left| !left.is_zero())
-}
-
-/// The moment `seconds` after another.
-pub(super) fn after(start: Timestamp, seconds: i64) -> Timestamp {
-    start
-        .checked_add(jiff::SignedDuration::from_secs(seconds))
-        .unwrap_or(Timestamp::MAX)
 }

@@ -6,7 +6,7 @@
 
 use jiff::Timestamp;
 
-use super::plan_builder::after;
+use super::waits::after;
 use crate::controller::submissions::view::{ContainerView, PodView};
 use leaderboard_api::{Deadlines, names};
 use leaderboard_runner::protocol::Member;

@@ -5,25 +5,15 @@
 
 use std::time::Duration;
 
-use jiff::{SignedDuration, Timestamp};
+use jiff::Timestamp;
 
 use super::plan::Action;
-use super::plan_builder::{PlanBuilder, left_of};
+use super::plan_builder::PlanBuilder;
+use super::waits::{Wait, after};
 use crate::controller::submissions::view::{ObservedFence, ObservedJob, ObservedReport, ReportDemand, Stage, View};
 use crate::services::evalai::Patience;
 use leaderboard_api::conditions::{self, Condition};
 use leaderboard_api::{State, SubmissionStatus, reasons};
-
-/// How long an answer is waited for before the status shows that.
-const ANSWER: Duration = Duration::from_secs(15);
-/// After this time without the fence a lost Pod is given up all the same.
-pub(super) const FENCE: Duration = Duration::from_mins(1);
-/// How long an end waits to be published for a result that cannot be read: as long as the end itself.
-pub(super) const END_WAITS: SignedDuration = SignedDuration::from_hours(24);
-/// The same for texts that are of another round than the report: they hardly change.
-const UNFIT_WAITS: SignedDuration = SignedDuration::from_mins(10);
-/// What is left to publish an end in before the finalizer of a deleted object gives up.
-const BEFORE_RELEASE: SignedDuration = SignedDuration::from_mins(2);
 
 /// What is known of a result that is to be published.
 pub(super) enum Reading {
@@ -87,7 +77,7 @@ pub(super) fn is_of(draft: &PlanBuilder<'_>, stage: Stage) -> bool {
 
 /// How long is still waited for an answer before anything is shown.
 pub(super) fn answer_left(draft: &PlanBuilder<'_>) -> Option<Duration> {
-    left_of(ANSWER, draft.view.report.waited)
+    Wait::REPORT.silence_left(draft.view.report.waited)
 }
 
 /// How long a lost Pod still waits for the fence.
@@ -99,7 +89,7 @@ pub(super) fn fence_left(draft: &PlanBuilder<'_>) -> Option<Duration> {
         ObservedFence::NotRequested => Duration::ZERO,
         ObservedFence::Pending(waited) | ObservedFence::Failed(waited) => waited,
     };
-    left_of(FENCE, waited)
+    Wait::FENCE.left(waited)
 }
 
 /// The same for what follows the Pod: only a fence that was requested is waited for.
@@ -117,9 +107,9 @@ pub(super) fn report_of_end(draft: &mut PlanBuilder<'_>) -> Reading {
     let view = draft.view;
     let is_read = is_of(draft, stage_after_end(draft)) && view.report.stored != ObservedReport::NotRead;
     match &view.report.stored {
-        _ if !is_read && (draft.is_successful() || may_wait(draft, END_WAITS)) => Reading::Waits(None),
+        _ if !is_read && (draft.is_successful() || may_wait(draft)) => Reading::Waits(None),
         // What is Finished is nothing without its result.
-        ObservedReport::Unreadable(why) if draft.is_successful() || may_wait(draft, END_WAITS) => {
+        ObservedReport::Unreadable(why) if draft.is_successful() || may_wait(draft) => {
             Reading::Waits(Some(why.clone()))
         }
         _ => Reading::Done,
@@ -135,29 +125,27 @@ pub fn awaits_publication(status: &SubmissionStatus) -> bool {
 
 /// Until when an end waits for what cannot be read of its result. What is Finished is nothing without its results.
 pub fn patience(view: &View, status: &SubmissionStatus) -> Patience {
-    let unread = waits_until(view, status, END_WAITS);
+    let unread = waits_until(view, status, Wait::UNREAD);
     let is_successful = status.state_of_conditions() == State::Finished;
     Patience {
-        unfit: waits_until(view, status, UNFIT_WAITS),
+        unfit: waits_until(view, status, Wait::UNFIT),
         unread,
         report: if is_successful { Timestamp::MAX } else { unread },
     }
 }
 
 /// Whether an end that is published once waits for its result: so long after it was decided, and not until the finalizer gives up.
-fn may_wait(draft: &PlanBuilder<'_>, longest: SignedDuration) -> bool {
-    draft.now() < waits_until(draft.view, &draft.status, longest)
+fn may_wait(draft: &PlanBuilder<'_>) -> bool {
+    draft.now() < waits_until(draft.view, &draft.status, Wait::UNREAD)
 }
 
-fn waits_until(view: &View, status: &SubmissionStatus, longest: SignedDuration) -> Timestamp {
+fn waits_until(view: &View, status: &SubmissionStatus, wait: Wait) -> Timestamp {
     let end = status.condition(conditions::FINISHED);
-    let until = |from: Timestamp, time: SignedDuration| from.checked_add(time).unwrap_or(Timestamp::MAX);
-    let patience = until(end.map_or(view.now, |c| c.last_transition_time.0), longest);
+    let patience = wait.over_at(end.map_or(view.now, |c| c.last_transition_time.0));
     let Some(deleted) = &view.submission.metadata.deletion_timestamp else {
         return patience;
     };
     let leaderboard = view.leaderboard.as_ref();
     let seconds = leaderboard.map_or(0, |leaderboard| leaderboard.spec.deadlines.finalize_seconds);
-    let release = until(deleted.0, SignedDuration::from_secs(seconds) - BEFORE_RELEASE);
-    patience.min(release)
+    patience.min(after(deleted.0, seconds - Wait::BEFORE_RELEASE.longest))
 }

@@ -3,25 +3,19 @@
 //! Called by `after`. Pure. An end is deleted only as it is stored: the deletion names the version of the object that was decided
 //! on, and a reconcile that still has something to store deletes nothing.
 
-use std::time::Duration;
-
 use jiff::Timestamp;
 
 use super::plan::Action;
-use super::plan_builder::{PlanBuilder, after};
+use super::plan_builder::PlanBuilder;
+use super::waits::{Wait, after};
 use crate::controller::submissions::view::ObservedJob;
 use leaderboard_api::conditions;
-
-/// A deletion that has not succeeded is tried again after this long.
-const AGAIN: Duration = Duration::from_secs(30);
-/// A far end is decided on again after this long, since the Leaderboard may have been edited.
-const AT_MOST: Duration = Duration::from_hours(1);
 
 /// Deletes the Submission if its time is over, else comes back at that time.
 pub(super) fn decide(draft: &mut PlanBuilder<'_>) {
     let Some(until) = until(draft) else { return };
     if draft.now() < until {
-        draft.requeue_in(AT_MOST);
+        draft.look_again(Wait::RETENTION);
         return draft.requeue_at(until);
     }
     let object = draft.submission();
@@ -31,7 +25,7 @@ pub(super) fn decide(draft: &mut PlanBuilder<'_>) {
     {
         draft.act(Action::DeleteSubmission { uid, resource_version });
     }
-    draft.requeue_in(AGAIN);
+    draft.look_again(Wait::DELIVERY);
 }
 
 /// When it is to be deleted. None: not at all, or not as it stands.

@@ -4,13 +4,12 @@
 
 use std::time::Duration;
 
+use super::waits::Wait;
 use leaderboard_api::conditions::STALLED;
 use leaderboard_api::{PairState, SharedText, SubmissionStatus};
 
 /// Places in line that are written without waiting for their turn.
 pub(super) const FIRST_PLACES: i32 = 20;
-/// Longest wait of progress.
-const LONGEST: Duration = Duration::from_secs(30);
 /// Periods that progress waits for, where that is shorter.
 const PERIODS: u32 = 3;
 
@@ -50,7 +49,7 @@ fn place_alone(old: &SubmissionStatus, new: &SubmissionStatus) -> Option<i32> {
 
 /// How long progress may wait since the last write, with reports of this period.
 pub(super) fn patience(period: Duration) -> Duration {
-    LONGEST.min(period * PERIODS)
+    Wait::PROGRESS.silence().min(period * PERIODS)
 }
 
 /// A status without what moves while a submission waits, starts or runs.

@@ -6,9 +6,10 @@ use jiff::Timestamp;
 
 use super::failure::{self, infrastructure, participant};
 use super::next_steps::for_both;
-use super::plan_builder::{PlanBuilder, after};
+use super::plan_builder::PlanBuilder;
 use super::pulls::{self, Limit};
 use super::trouble::{self, Trouble};
+use super::waits::{Wait, after};
 use super::words::Cause;
 use crate::controller::submissions::view::{JobView, ObservedNode, PodView, ScaleUp};
 use leaderboard_api::conditions::{self, Truth};
@@ -20,18 +21,8 @@ pub(super) const PREPARED: &str = "The Pod is being prepared.";
 /// The kubelet's reason where a device plugin does not give the devices on which the scheduler counted.
 const NOT_ADMITTED: &str = "UnexpectedAdmissionError";
 const LOST: &str = "The Pod was lost. A new Pod will resume from the results in S3.";
-/// How long a Pod may be silent before what it is at is shown; a healthy one costs no write until then. Less than the minute
-/// in which people want to see a cause.
-const SILENCE: i64 = 45;
 /// The minutes of silence that are reported: a count of every one would be a write each.
 const REPORTED_MINUTES: [i64; 6] = [2, 5, 10, 20, 30, 60];
-/// How long a new Job may be refused its Pod, or a new Pod find no node, before that is shown: the Pod whose slot it got may still be
-/// leaving.
-const SETTLE_SECONDS: i64 = 5;
-/// How long no node may accept a Pod, without an autoscaler that adds one, before a person has to look: `Stalled` is True then.
-const NODE_SECONDS: i64 = 15 * 60;
-/// How long a Job may take to make its Pod before that is shown.
-const POD_SECONDS: i64 = 45;
 
 /// Reports how far a Job's Pod is, and fails the attempt when a start has taken too long.
 pub(super) fn watch(draft: &mut PlanBuilder<'_>, job: &JobView) {
@@ -176,13 +167,13 @@ fn show_trouble(draft: &mut PlanBuilder<'_>, found: &Trouble, has_started: bool)
 fn show_preparing(draft: &mut PlanBuilder<'_>, pod: &PodView, since: Timestamp) {
     draft.moves();
     let silent = draft.now().duration_since(since).as_secs();
-    let mut told = [SILENCE]
+    let mut told = [Wait::PREPARATION.silent]
         .into_iter()
         .chain(REPORTED_MINUTES.map(|minutes| minutes * 60));
     if let Some(next) = told.find(|at| silent < *at) {
         draft.requeue_at(after(since, next));
     }
-    let message = if silent < SILENCE {
+    let message = if silent < Wait::PREPARATION.silent {
         PREPARED.to_owned()
     } else {
         let told = REPORTED_MINUTES.iter().rev().find(|m| silent >= **m * 60);
@@ -230,7 +221,7 @@ fn without_pod(draft: &mut PlanBuilder<'_>, job: &JobView) {
         }
     } else if had_pod {
         replacing(draft, LOST);
-    } else if let Some(at) = job.created.map(|at| after(at, POD_SECONDS)) {
+    } else if let Some(at) = job.created.map(|at| Wait::POD.shown_at(at)) {
         if draft.now() < at {
             return draft.requeue_at(at);
         }
@@ -267,7 +258,7 @@ fn refused(what: &str, words: &str) -> (&'static str, String) {
 
 /// Shows nothing yet of a Job that is new.
 fn settles(draft: &mut PlanBuilder<'_>, job: &JobView) -> bool {
-    let settled = job.created.map(|at| after(at, SETTLE_SECONDS));
+    let settled = job.created.map(|at| Wait::NODE.shown_at(at));
     let Some(settled) = settled.filter(|at| draft.now() < *at) else {
         return false;
     };
@@ -291,7 +282,7 @@ fn unschedulable(draft: &mut PlanBuilder<'_>, job: &JobView, words: &str, scale_
     if matches!(scale_up, Some(ScaleUp::Coming(_))) {
         draft.waits_since(reason, &message);
     } else {
-        draft.stalls_after(NODE_SECONDS, reason, &message);
+        draft.stalls_after(Wait::NODE, reason, &message);
     }
     show_wait(draft, reason, &message);
 }

@@ -6,30 +6,12 @@ use jiff::Timestamp;
 use k8s_openapi::apimachinery::pkg::apis::meta::v1::Time;
 
 use super::plan::Action;
-use super::plan_builder::{PlanBuilder, after};
+use super::plan_builder::PlanBuilder;
+use super::waits::{Wait, after};
 use super::{failure, interruption, log, reading, start};
 use crate::controller::submissions::view::{JobView, ObservedNode, PodView};
 use crate::pod::run::Stop;
 use leaderboard_api::reasons;
-
-/// Added to `cancelSeconds` before a Pod that was asked to stop is deleted.
-const STOP_MARGIN_SECONDS: i64 = 15;
-/// Grace of a Pod that is deleted because it did not stop by itself.
-pub(super) const DELETE_GRACE_SECONDS: i64 = 60;
-/// How long a Pod whose node is about to go has for all that it stores: of the two minutes of a Spot instance's notice, what is left
-/// when the cluster has passed it on.
-const LEAVING_SECONDS: i64 = 90;
-/// Grace of such a Pod after that: all that takes longer is lost with the node.
-const LEAVING_GRACE_SECONDS: i64 = 5;
-/// How long a Pod may be past its grace before its node is given up, where nobody knows about the node.
-const LOST_MARGIN_SECONDS: i64 = 30;
-/// The same while the kubelet reports: it may still be cleaning up.
-const STUCK_MARGIN_SECONDS: i64 = 120;
-/// How long a node must have been silent, or gone, and its Pod been deleted, before the Pod is given up. The node controller
-/// itself has waited some 40 s for a word, and 60 s more before it deletes the Pod.
-const SILENT_SECONDS: i64 = 30;
-/// How soon a deletion is looked at again.
-const SOON: Duration = Duration::from_secs(2);
 
 /// Brings a Job to its end: first by word, then by deletion, then by force.
 pub(super) fn decide(draft: &mut PlanBuilder<'_>, job: &JobView) {
@@ -39,11 +21,11 @@ pub(super) fn decide(draft: &mut PlanBuilder<'_>, job: &JobView) {
     let view = draft.view;
     let is_leaving = is_leaving(draft);
     let (seconds, grace) = if is_leaving {
-        (LEAVING_SECONDS, LEAVING_GRACE_SECONDS)
+        (Wait::LEAVING.longest, Wait::LEAVING_GRACE.longest)
     } else {
         (
-            draft.deadlines().cancel_seconds + STOP_MARGIN_SECONDS,
-            DELETE_GRACE_SECONDS,
+            draft.deadlines().cancel_seconds + Wait::STOP_MARGIN.longest,
+            Wait::DELETION.longest,
         )
     };
     // Before the first agent there is nothing to store, and none may ever begin: logcopy alone would wait for the end of all.
@@ -51,12 +33,12 @@ pub(super) fn decide(draft: &mut PlanBuilder<'_>, job: &JobView) {
         return end_job(draft, job, grace, log_left);
     };
     let delete_at = after(since, seconds);
-    let force_at = after(delete_at, grace + STOP_MARGIN_SECONDS);
+    let force_at = Wait::STOP_MARGIN.over_at(after(delete_at, grace));
     if draft.now() >= force_at {
         if log_left.is_none() && force(draft, pod) {
             end_job(draft, job, 0, None);
         }
-        draft.requeue_in(SOON);
+        draft.look_again(Wait::DELETION);
     } else if draft.now() >= delete_at {
         end_job(draft, job, grace, log_left);
         draft.requeue_at(force_at);
@@ -81,7 +63,7 @@ fn end_job(draft: &mut PlanBuilder<'_>, job: &JobView, grace_seconds: i64, log_l
         return draft.requeue_in(left);
     }
     draft.act(delete(job, grace_seconds));
-    draft.requeue_in(SOON);
+    draft.look_again(Wait::DELETION);
 }
 
 /// When the stop began. A clock that was set back must not put its end off, so the stop begins anew then.
@@ -168,7 +150,7 @@ pub(super) fn being_deleted(draft: &mut PlanBuilder<'_>) {
         start::replacing(draft, "The Job is being deleted by somebody else; it is created again.");
     }
     remove_overdue_pod(draft);
-    draft.requeue_in(Duration::from_secs(5));
+    draft.look_again(Wait::OTHERS_DELETION);
 }
 
 /// Removes by force a Pod that outstays its grace.
@@ -176,7 +158,7 @@ pub(super) fn remove_overdue_pod(draft: &mut PlanBuilder<'_>) {
     let view = draft.view;
     let overdue = |pod: &&PodView| {
         pod.delete_by
-            .is_some_and(|by| view.now >= after(by, STOP_MARGIN_SECONDS))
+            .is_some_and(|by| view.now >= Wait::STOP_MARGIN.over_at(by))
     };
     if let Some(pod) = view.pod.as_ref().filter(overdue) {
         force(draft, pod);
@@ -201,13 +183,13 @@ fn given_up_at(node: ObservedNode, pod: &PodView) -> Option<Timestamp> {
     let by = pod.delete_by?;
     let deleted = pod.deleted.unwrap_or(by);
     let at = match node {
-        ObservedNode::Unknown => after(by, LOST_MARGIN_SECONDS),
-        ObservedNode::Reports => after(by, STUCK_MARGIN_SECONDS),
-        ObservedNode::Silent { since } => after(deleted.max(since), SILENT_SECONDS),
-        ObservedNode::Gone => after(deleted, SILENT_SECONDS),
+        ObservedNode::Unknown => Wait::LOST_POD.over_at(by),
+        ObservedNode::Reports => Wait::STUCK_POD.over_at(by),
+        ObservedNode::Silent { since } => Wait::SILENT_NODE.over_at(deleted.max(since)),
+        ObservedNode::Gone => Wait::SILENT_NODE.over_at(deleted),
     };
     // A grace that is shorter than the silence is over all the same.
-    Some(at.min(after(by, STUCK_MARGIN_SECONDS)))
+    Some(at.min(Wait::STUCK_POD.over_at(by)))
 }
 
 /// Ends the Job of a lost Pod; once it is gone, the infrastructure's retry follows.
@@ -217,6 +199,6 @@ pub(super) fn leave_lost_pod(draft: &mut PlanBuilder<'_>, job: &JobView, pod: &P
     draft.fail(found);
     if force(draft, pod) {
         draft.act(delete(job, 0));
-        draft.requeue_in(SOON);
+        draft.look_again(Wait::DELETION);
     }
 }
