@@ -247,7 +247,7 @@ fn map_view(seen: &SubmissionState, submission: &Submission) -> EvalaiView {
                     (None, Status::Resuming) => Standing::Resumed,
                     (None, _) => Standing::Wanted,
                 },
-                status: ended.unwrap_or(row.status).as_str().to_owned(),
+                status: ended.unwrap_or(row.status),
                 phase: row.phase,
                 team_id: row.team_id.map(|id| id.to_string()).unwrap_or_default(),
                 team_name: row.team_name.clone(),
@@ -276,9 +276,7 @@ fn map_end(end: &Ended) -> EvalaiEnd {
             status: status @ Status::Finished,
             ..
         }
-        | Ended::Otherwise(status) => EvalaiEnd::Ended {
-            status: status.as_str().to_owned(),
-        },
+        | Ended::Otherwise(status) => EvalaiEnd::Ended(*status),
         Ended::Published { at, .. } | Ended::Agreed { at, .. } => EvalaiEnd::Published { at: *at },
         Ended::Refused(message) => EvalaiEnd::Refused {
             message: message.clone(),

@@ -275,9 +275,7 @@ fn what_had_finished_in_evalai_before_is_its_own_end() {
     let of = |end: Ended| map_end(&end);
     let at = Timestamp::UNIX_EPOCH;
     let agreed = |status| Ended::Agreed { status, at };
-    let kept = EvalaiEnd::Ended {
-        status: "finished".into(),
-    };
+    let kept = EvalaiEnd::Ended(Status::Finished);
     assert_eq!(of(agreed(Status::Finished)), kept);
     assert_eq!(of(agreed(Status::Cancelled)), EvalaiEnd::Published { at });
 }

@@ -11,6 +11,8 @@ use super::rows::Row;
 use crate::ask::Lookup;
 pub use crate::controller::slots::turns::Turn;
 use crate::pod::run::Stop;
+use crate::pod::workspace::WorkspaceReason;
+use crate::services::evalai::Status;
 use leaderboard_api::{Attempt, JobNumber, Leaderboard, SharedText, Submission, names};
 
 /// Everything a decision may depend on.
@@ -218,8 +220,8 @@ pub struct EndView {
     pub at: Option<Timestamp>,
     /// What the runner reported. An agent can forge its own.
     pub verdict: Option<Verdict>,
-    /// The reason that a container of the host's reported, such as `PrefixInUse`.
-    pub own_reason: Option<String>,
+    /// What `workspace` reported.
+    pub own_reason: Option<WorkspaceReason>,
     /// The sentence of a container of the host's, or Kubernetes' own.
     pub why: Option<String>,
 }
@@ -363,7 +365,7 @@ pub struct EvalaiView {
 #[derive(Clone, Debug, PartialEq)]
 pub struct EvalaiInfo {
     pub standing: Standing,
-    pub status: String,
+    pub status: Status,
     /// Phase of its row; none where EvalAI does not show one.
     pub phase: Option<i64>,
     pub team_id: String,
@@ -395,7 +397,7 @@ pub enum EvalaiEnd {
     /// EvalAI has it.
     Published { at: Timestamp },
     /// EvalAI had ended it before: cancelled, archived, ignored, or it is gone.
-    Ended { status: String },
+    Ended(Status),
     /// EvalAI does not take it, and why.
     Refused { message: String },
 }

@@ -11,6 +11,7 @@ use super::plan_builder::{PlanBuilder, Terms};
 use super::waits::Wait;
 use super::{end, foreign, image, isolation, pin};
 use crate::controller::submissions::view::{EvalaiInfo, Standing};
+use crate::services::evalai::Status;
 use leaderboard_api::conditions::{self, Truth};
 use leaderboard_api::text::{LONGEST_NAME, one_line, sentence};
 use leaderboard_api::{Failure, ImageReference, LeaderboardSpec, Team, TeamStatus, Track, reasons};
@@ -113,15 +114,15 @@ fn wait_for_policy(draft: &mut PlanBuilder<'_>, missing: &Missing) -> bool {
 
 /// What is shown of a row that has come to its end without us. EvalAI resumes only what has failed, re-runs all but what was deleted,
 /// and counts what was deleted before its end as being processed until it is ended.
-fn ended_in_evalai(status: &str) -> String {
-    let done = if status == "deleted" {
+fn ended_in_evalai(status: Status) -> String {
+    let done = if status == Status::Deleted {
         "`cancelled` is written there"
     } else {
         "nothing is reported"
     };
     let next = match status {
-        "failed" => "Resume it there if it is to run.",
-        "deleted" | "ignored" | "missing" => {
+        Status::Failed => "Resume it there if it is to run.",
+        Status::Deleted | Status::Ignored | Status::Missing => {
             "EvalAI takes up nothing that was deleted; the participant can submit again."
         }
         _ => "EvalAI resumes only what has failed; re-run it there if it is to run.",
@@ -239,7 +240,7 @@ fn waits_for_phase(draft: &mut PlanBuilder<'_>, info: Option<&EvalaiInfo>) -> bo
 enum Answer<'a> {
     NotNeeded,
     Waiting,
-    Ended(&'a str),
+    Ended(Status),
     Wanted(&'a EvalaiInfo),
 }
 
@@ -248,7 +249,7 @@ fn ask_evalai<'a>(draft: &mut PlanBuilder<'a>) -> Answer<'a> {
         return Answer::NotNeeded;
     }
     match draft.evalai_info() {
-        Some(info) if info.standing == Standing::Ended => Answer::Ended(&info.status),
+        Some(info) if info.standing == Standing::Ended => Answer::Ended(info.status),
         Some(info) => Answer::Wanted(info),
         None => {
             draft.act(Action::Ask(Question::Evalai));

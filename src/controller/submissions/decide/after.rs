@@ -12,12 +12,11 @@ use super::record::{self, record_end, superseded};
 use super::waits::{Wait, after};
 use super::{accept, foreign, log, retention, stop};
 use crate::controller::submissions::view::{EvalaiEnd, EvalaiView, ObservedJob};
+use crate::services::evalai::Status;
 use leaderboard_api::conditions::{self, Truth};
 use leaderboard_api::text::sentence;
 use leaderboard_api::{Ingested, JOB_SECONDS, State, reasons};
 
-/// EvalAI's word for a row with a result.
-const FINISHED: &str = "finished";
 /// Why an attempt does not begin.
 const NO_MESSAGE: &str = "no queue message announced it, and participants can edit the status there. Raise spec.attempt if it is to \
                           run; otherwise set the status back in EvalAI.";
@@ -181,7 +180,7 @@ fn publish(draft: &mut PlanBuilder<'_>, log_left: Option<Duration>) -> Delivery 
     let view = draft.view.evalai.clone().unwrap_or_default();
     match view.end {
         Some(EvalaiEnd::Published { at }) => Delivery::Answered(at),
-        Some(EvalaiEnd::Ended { status }) => amend(draft, &status),
+        Some(EvalaiEnd::Ended(status)) => amend(draft, status),
         Some(EvalaiEnd::Refused { message }) => {
             refused(draft, &message);
             Delivery::Refused
@@ -319,7 +318,7 @@ fn refused(draft: &mut PlanBuilder<'_>, message: &str) {
 }
 
 /// EvalAI had ended it first: its cancel wins until our result is answered, so that all systems agree.
-fn amend(draft: &mut PlanBuilder<'_>, status: &str) -> Delivery {
+fn amend(draft: &mut PlanBuilder<'_>, status: Status) -> Delivery {
     draft.condition(conditions::PUBLISHED, Truth::False, reasons::NOT_REQUIRED, "");
     if draft.status.state_of_conditions() == State::Cancelled {
         keep_evalais_end(draft, status);
@@ -340,10 +339,10 @@ fn amend(draft: &mut PlanBuilder<'_>, status: &str) -> Delivery {
 }
 
 /// A cancel of what EvalAI calls finished: that is kept, and the object says whose end holds.
-fn keep_evalais_end(draft: &mut PlanBuilder<'_>, status: &str) {
+fn keep_evalais_end(draft: &mut PlanBuilder<'_>, status: Status) {
     let end = draft.status.condition(conditions::FINISHED);
     let is_ours = end.is_some_and(|end| end.reason != reasons::ENDED_IN_EVALAI);
-    if is_ours && status == FINISHED {
+    if is_ours && status == Status::Finished {
         let message = format!("EvalAI showed {status} before the submission was run here; that is kept.");
         draft.condition(conditions::FINISHED, Truth::True, reasons::ENDED_IN_EVALAI, &message);
         draft.show(reasons::ENDED_IN_EVALAI, message);

@@ -8,12 +8,11 @@ use super::{clock, stop};
 use crate::ask::{Answered, Failure};
 use crate::controller::submissions::rows::{ForeignRun, Row};
 use crate::controller::submissions::view::{ContainerView, JobView, PodView};
+use crate::pod::workspace::WorkspaceReason;
 use leaderboard_api::conditions::{self, Truth};
 use leaderboard_api::text::{LONGEST_NAME, one_line, sentence};
 use leaderboard_api::{names, reasons};
 
-/// The reason of `workspace` for a prefix that holds results of something else.
-const PREFIX_IN_USE: &str = "PrefixInUse";
 /// Why an end of what was held back is written to no other system.
 pub(super) const NOT_WRITTEN: &str = "Nothing is written of this end, because another program may run the submission. If none does, \
                                       cancel it in EvalAI.";
@@ -137,7 +136,7 @@ fn is_held_by_prefix(draft: &PlanBuilder<'_>) -> bool {
 fn prefix_in_use(pod: &PodView) -> Option<&str> {
     let is_workspace = |c: &&ContainerView| c.name == names::CONTAINER_WORKSPACE && pod.agent_started.is_none();
     let end = pod.containers.iter().find(is_workspace)?.last.as_ref()?;
-    let is_in_use = end.own_reason.as_deref() == Some(PREFIX_IN_USE);
+    let is_in_use = end.own_reason == Some(WorkspaceReason::PrefixInUse);
     is_in_use.then(|| {
         end.why
             .as_deref()

@@ -4,6 +4,7 @@
 
 use super::words::{self, Cause};
 use crate::controller::submissions::view::{ContainerView, PodView};
+use crate::pod::workspace::WorkspaceReason;
 use leaderboard_api::text::sentence;
 use leaderboard_api::{names, reasons};
 use leaderboard_runner::protocol::{Member, Side};
@@ -119,8 +120,10 @@ fn of_end(container: &ContainerView, is_init: bool) -> Option<Trouble> {
         return None;
     }
     // Another try of the same Pod would find the same; the next Pod may get another node.
-    let own_reason = end.own_reason.as_deref().filter(|_| name == names::CONTAINER_WORKSPACE);
-    if own_reason == Some(reasons::NOT_ISOLATED) {
+    if matches!(
+        end.own_reason,
+        Some(WorkspaceReason::NotIsolated | WorkspaceReason::NotKnownIsolated)
+    ) {
         let why = end.why.as_deref().unwrap_or(NOT_ISOLATED);
         return Some(Trouble {
             is_hopeless: true,

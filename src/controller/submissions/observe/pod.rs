@@ -7,8 +7,8 @@ use crate::controller::submissions::view::{ContainerView, EndView, PodView};
 use crate::kubernetes::objects::{Condition, ContainerStatus, Ended, Pod, PodStatus};
 use crate::pod::run::Stop;
 use crate::pod::workspace::{NotAVerdict, WorkspaceReason, WorkspaceVerdict};
+use leaderboard_api::names;
 use leaderboard_api::text::{LONGEST_MESSAGE, one_line};
-use leaderboard_api::{names, reasons};
 
 /// Reduces a Pod.
 pub fn view(pod: &Pod) -> PodView {
@@ -143,23 +143,15 @@ fn end(container: &str, terminated: &Ended) -> EndView {
         began: terminated.started_at.as_ref().map(|t| t.0),
         at: terminated.finished_at.as_ref().map(|t| t.0),
         verdict,
-        own_reason: foreign.and_then(foreign_word),
+        own_reason: foreign
+            .filter(|_| container == names::CONTAINER_WORKSPACE)
+            .and_then(own_reason),
         why: foreign.and_then(foreign_why),
     }
 }
 
-/// `workspace` leaves `{"schema": …, "reason": …, "message": …}`.
-fn foreign_word(message: &str) -> Option<String> {
-    let value: serde_json::Value = serde_json::from_str(message).ok()?;
-    match WorkspaceVerdict::parse(message) {
-        // For the run it is the same; the Leaderboard's condition distinguishes them.
-        Ok(verdict) if verdict.reason == WorkspaceReason::NotKnownIsolated => {
-            return Some(reasons::NOT_ISOLATED.to_owned());
-        }
-        Err(NotAVerdict::Schema(_)) => return None,
-        _ => {}
-    }
-    value.get("reason")?.as_str().map(short)
+fn own_reason(message: &str) -> Option<WorkspaceReason> {
+    WorkspaceVerdict::parse(message).ok().map(|verdict| verdict.reason)
 }
 
 fn foreign_why(message: &str) -> Option<String> {
@@ -205,7 +197,7 @@ mod tests {
             }
         }
         let told = seen("workspace", "Error", forged);
-        assert_eq!(told.own_reason.as_deref(), Some("route 7 begins at x=13"));
+        assert_eq!((told.own_reason, told.why.as_deref()), (None, Some("and ends at y=4")));
         assert_eq!(seen("contents", "Error", "disk full").why.as_deref(), Some("disk full"));
         let kubelets = seen("agent-1", "StartError", "exec: no such file");
         assert_eq!(kubelets.why.as_deref(), Some("exec: no such file"));
@@ -320,13 +312,5 @@ mod tests {
         let end = seen("workspace", "Error", &newer);
         let why = "the verdict of `workspace` has schema 2, and 1 and the one before are read";
         assert_eq!((end.own_reason, end.why.as_deref()), (None, Some(why)));
-    }
-
-    #[test]
-    fn a_pod_that_is_not_known_to_be_isolated_is_not_isolated_for_its_run() {
-        for reason in ["NotIsolated", "NotKnownIsolated"] {
-            let said = json!({"reason": reason, "message": "There is no address to try."}).to_string();
-            assert_eq!(foreign_word(&said).as_deref(), Some(reasons::NOT_ISOLATED), "{reason}");
-        }
     }
 }

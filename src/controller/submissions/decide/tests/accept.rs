@@ -8,6 +8,7 @@ use k8s_openapi::apimachinery::pkg::apis::meta::v1::Time;
 use super::builders::*;
 use crate::controller::submissions::decide::{Action, EvalaiUpdate, Question, TableUpdate};
 use crate::controller::submissions::view::{Standing, Turn};
+use crate::services::evalai::Status;
 use leaderboard_api::State::{Cancelled, Failed, Pending};
 use leaderboard_api::conditions::{ACCEPTED, FINISHED, PUBLISHED, READY, RECORDED, STALLED};
 use leaderboard_api::{Attempt, FailureClass, JobNumber, SubmissionStatus, Team, conditions, reasons};
@@ -123,7 +124,7 @@ fn what_evalai_has_ended_never_runs_and_is_not_written() {
     let mut world = World::evalai();
     world.in_evalai().info = Some(crate::controller::submissions::view::EvalaiInfo {
         standing: Standing::Ended,
-        status: "cancelled".into(),
+        status: Status::Cancelled,
         ..info()
     });
     let plan = world.pass_to(Cancelled, reasons::ENDED_IN_EVALAI);
@@ -387,7 +388,7 @@ fn evalai_is_asked_also_where_the_track_is_missing() {
     assert!(has(&world.pass(), |a| *a == Action::Ask(Question::Evalai)));
     world.in_evalai().info = Some(crate::controller::submissions::view::EvalaiInfo {
         standing: Standing::Ended,
-        status: "cancelled".into(),
+        status: Status::Cancelled,
         ..info()
     });
     world.pass_to(Cancelled, reasons::ENDED_IN_EVALAI);
@@ -441,18 +442,18 @@ fn a_row_of_another_phase_that_its_participant_deleted_is_ended_there() {
 #[test]
 fn the_next_step_after_evalais_own_end_is_one_that_evalai_takes() {
     for (status, is_written, step) in [
-        ("failed", false, "Resume it there if it is to run."),
-        ("cancelled", false, "re-run it there if it is to run."),
-        ("archived", false, "re-run it there if it is to run."),
-        ("finished", false, "re-run it there if it is to run."),
-        ("deleted", true, "the participant can submit again."),
-        ("ignored", false, "the participant can submit again."),
-        ("missing", false, "the participant can submit again."),
+        (Status::Failed, false, "Resume it there if it is to run."),
+        (Status::Cancelled, false, "re-run it there if it is to run."),
+        (Status::Archived, false, "re-run it there if it is to run."),
+        (Status::Finished, false, "re-run it there if it is to run."),
+        (Status::Deleted, true, "the participant can submit again."),
+        (Status::Ignored, false, "the participant can submit again."),
+        (Status::Missing, false, "the participant can submit again."),
     ] {
         let mut world = World::evalai();
         world.in_evalai().info = Some(crate::controller::submissions::view::EvalaiInfo {
             standing: Standing::Ended,
-            status: status.into(),
+            status,
             ..info()
         });
         let message = world

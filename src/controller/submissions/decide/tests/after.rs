@@ -8,6 +8,7 @@ use super::builders::*;
 use super::record::{finished, refused};
 use crate::controller::submissions::decide::{Action, EvalaiUpdate, Plan, TableUpdate};
 use crate::controller::submissions::view::{EvalaiEnd, ObservedReport};
+use crate::services::evalai::Status;
 use leaderboard_api::State::{Cancelled, Failed, Finished};
 use leaderboard_api::conditions::{self, PUBLISHED, RECORDED};
 use leaderboard_api::reasons;
@@ -160,9 +161,7 @@ fn a_cancel_that_our_own_write_may_have_undone_is_sent_again() {
 #[test]
 fn evalais_end_wins_until_ours_is_answered_and_not_after() {
     for mut world in [finished(), failed()] {
-        world.in_evalai().end = Some(EvalaiEnd::Ended {
-            status: "cancelled".into(),
-        });
+        world.in_evalai().end = Some(EvalaiEnd::Ended(Status::Cancelled));
         let plan = world.pass_to(Cancelled, reasons::ENDED_IN_EVALAI);
         assert_eq!(
             condition(&plan, PUBLISHED),
@@ -182,9 +181,7 @@ fn evalais_end_wins_until_ours_is_answered_and_not_after() {
     world.published();
     world.recorded();
     world.pass();
-    world.in_evalai().end = Some(EvalaiEnd::Ended {
-        status: "cancelled".into(),
-    });
+    world.in_evalai().end = Some(EvalaiEnd::Ended(Status::Cancelled));
     world.pass_to(Finished, reasons::FINISHED);
 }
 
@@ -196,9 +193,7 @@ fn a_cancelled_one_that_evalai_ended_too_is_sent_once() {
         evalai_updates(&world.pass_to(Cancelled, reasons::CANCELLED)),
         [EvalaiUpdate::Cancelled]
     );
-    world.in_evalai().end = Some(EvalaiEnd::Ended {
-        status: "cancelled".into(),
-    });
+    world.in_evalai().end = Some(EvalaiEnd::Ended(Status::Cancelled));
     world.pass();
     world.recorded();
     world.pass();
@@ -231,9 +226,7 @@ fn a_cancel_in_evalai_after_a_refusal_reaches_the_row_too() {
         if is_shown {
             world.pass();
         }
-        world.in_evalai().end = Some(EvalaiEnd::Ended {
-            status: "cancelled".into(),
-        });
+        world.in_evalai().end = Some(EvalaiEnd::Ended(Status::Cancelled));
         let plan = world.pass_to(Cancelled, reasons::ENDED_IN_EVALAI);
         assert!(
             has(&plan, |a| *a == Action::Record(TableUpdate::End)),

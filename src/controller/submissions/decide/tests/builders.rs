@@ -16,6 +16,7 @@ use crate::controller::submissions::view::{
 };
 use crate::pod::report::{Report, ReportPair};
 use crate::pod::run::Stop;
+use crate::services::evalai::Status;
 use leaderboard_api::conditions;
 use leaderboard_api::{
     Attempt, Leaderboard, LeaderboardSpec, PairState, State, Submission, SubmissionStatus, names, reasons,
@@ -75,7 +76,7 @@ fn submission(evalai: bool) -> Submission {
 pub fn info() -> EvalaiInfo {
     EvalaiInfo {
         standing: Standing::Wanted,
-        status: "submitted".into(),
+        status: Status::Submitted,
         phase: Some(7),
         team_id: "42".into(),
         team_name: Some("Team".into()),
@@ -355,7 +356,7 @@ pub fn ended(name: &str, restarts: i32, what: &str, exit_code: i32, second: i64)
             exit_code,
             began: Some(at(second - 50)),
             at: Some(at(second)),
-            own_reason: (verdict.is_none() && !what.is_empty()).then(|| what.into()),
+            own_reason: serde_json::from_value(json!(what)).ok(),
             verdict,
             why: None,
         }),

@@ -8,6 +8,7 @@ use crate::ask::{Answered, Failure, Lookup};
 use crate::controller::submissions::decide::{Action, Plan, Question, SlotUse};
 use crate::controller::submissions::rows::{ForeignRun, Row};
 use crate::controller::submissions::view::{EvalaiInfo, JobEnd, Standing};
+use crate::services::evalai::Status;
 use leaderboard_api::State::{Cancelled, Pending};
 use leaderboard_api::conditions::{ACCEPTED, PUBLISHED, RECORDED, STALLED};
 use leaderboard_api::{Attempt, SubmissionStatus, names, reasons};
@@ -189,7 +190,7 @@ fn when_the_other_run_has_ended_evalai_decides_what_follows() {
     let mut world = ended();
     world.in_evalai().info = Some(EvalaiInfo {
         standing: Standing::Ended,
-        status: "finished".into(),
+        status: Status::Finished,
         ..info()
     });
     let plan = world.pass_to(Cancelled, reasons::ENDED_IN_EVALAI);

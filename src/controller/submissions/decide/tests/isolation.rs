@@ -108,28 +108,31 @@ fn a_run_goes_on_whatever_becomes_of_the_policy() {
 
 #[test]
 fn a_pod_that_was_not_isolated_ends_at_once_and_is_tried_again_uncharged() {
-    let mut world = World::local().with_pod();
-    let mut workspace = ended("workspace", 0, reasons::NOT_ISOLATED, 1, 5);
-    let why = "The Pod could connect to 10.96.0.1:443. Use a network plugin that enforces policies.";
-    workspace.last.as_mut().unwrap().why = Some(why.into());
-    world.see(workspace);
-    world.pass_to(Pending, reasons::STOPPING);
-    let failure = world.status().failure.unwrap();
-    assert_eq!(
-        (failure.reason.as_str(), failure.message.as_str()),
-        (reasons::NOT_ISOLATED, why)
-    );
-    assert_eq!(failure.class, FailureClass::Infrastructure);
-    let mut last = world.clone();
-    last.leaderboard().retries.infrastructure = 0;
-    last.job_gone();
-    let failure = last.pass_to(Failed, reasons::NOT_ISOLATED).status.failure.unwrap();
-    assert_eq!(failure.message, format!("{why} Then resume the submission."));
-    world.job_gone();
-    let plan = world.pass_to(Pending, reasons::REPLACING);
-    assert_eq!(plan.status.retry, 1);
-    // The next Job waits for the policy like the first.
-    world.view.is_policy_in_place = false;
-    world.wait(60);
-    assert!(!creates(&world.pass_to(Pending, reasons::NOT_ISOLATED)));
+    // Of one that was not known to be isolated the run shows the same.
+    for found in ["NotIsolated", "NotKnownIsolated"] {
+        let mut world = World::local().with_pod();
+        let mut workspace = ended("workspace", 0, found, 1, 5);
+        let why = "The Pod could connect to 10.96.0.1:443. Use a network plugin that enforces policies.";
+        workspace.last.as_mut().unwrap().why = Some(why.into());
+        world.see(workspace);
+        world.pass_to(Pending, reasons::STOPPING);
+        let failure = world.status().failure.unwrap();
+        assert_eq!(
+            (failure.reason.as_str(), failure.message.as_str()),
+            (reasons::NOT_ISOLATED, why)
+        );
+        assert_eq!(failure.class, FailureClass::Infrastructure);
+        let mut last = world.clone();
+        last.leaderboard().retries.infrastructure = 0;
+        last.job_gone();
+        let failure = last.pass_to(Failed, reasons::NOT_ISOLATED).status.failure.unwrap();
+        assert_eq!(failure.message, format!("{why} Then resume the submission."));
+        world.job_gone();
+        let plan = world.pass_to(Pending, reasons::REPLACING);
+        assert_eq!(plan.status.retry, 1);
+        // The next Job waits for the policy like the first.
+        world.view.is_policy_in_place = false;
+        world.wait(60);
+        assert!(!creates(&world.pass_to(Pending, reasons::NOT_ISOLATED)));
+    }
 }

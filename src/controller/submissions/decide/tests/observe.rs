@@ -3,6 +3,7 @@
 use super::builders::*;
 use crate::ask::Lookup;
 use crate::controller::submissions::decide::{Action, EvalaiUpdate, Question};
+use crate::services::evalai::Status;
 use leaderboard_api::State::{Failed, Finished, Pending};
 use leaderboard_api::conditions::PUBLISHED;
 use leaderboard_api::{EvalaiMode, reasons};
@@ -39,7 +40,7 @@ fn failed() -> World {
 fn no_end_is_sent_to_evalai() {
     for (mut world, state) in [(finished(), Finished), (failed(), Failed)] {
         // The other program's run goes on.
-        world.in_evalai().info.as_mut().unwrap().status = "partially_evaluated".into();
+        world.in_evalai().info.as_mut().unwrap().status = Status::PartiallyEvaluated;
         let first = world.pass();
         assert_eq!(first.status.state, Some(state));
         let plan = world.pass();

@@ -15,6 +15,7 @@ use crate::controller::submissions::view::{
 };
 use crate::pod::report::Report;
 use crate::pod::run::Stop;
+use crate::services::evalai::Status;
 
 /// One change of the world, after which there is a reconcile.
 #[derive(Clone, Debug)]
@@ -262,9 +263,7 @@ fn evalai_view() -> impl Strategy<Value = EvalaiView> {
         None,
         None,
         Some(EvalaiEnd::Published { at: at(60) }),
-        Some(EvalaiEnd::Ended {
-            status: "cancelled".into(),
-        }),
+        Some(EvalaiEnd::Ended(Status::Cancelled)),
         Some(EvalaiEnd::Refused { message: "no".into() }),
     ];
     let why = select(vec![(None, None), (Some("away".to_owned()), Some("away".to_owned()))]);

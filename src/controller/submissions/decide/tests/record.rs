@@ -3,6 +3,7 @@
 use super::builders::*;
 use crate::controller::submissions::decide::{Action, EvalaiUpdate, Plan, TableUpdate};
 use crate::controller::submissions::view::{EvalaiEnd, EvalaiView, RecordView};
+use crate::services::evalai::Status;
 use leaderboard_api::State::{Cancelled, Finished};
 use leaderboard_api::conditions::{self, RECORDED};
 use leaderboard_api::reasons;
@@ -76,9 +77,7 @@ fn a_cancel_in_evalai_after_a_refusal_is_written_over_the_end_that_the_table_kep
         if is_restarted {
             world.view.record = Some(RecordView::default());
         }
-        world.in_evalai().end = Some(EvalaiEnd::Ended {
-            status: "cancelled".into(),
-        });
+        world.in_evalai().end = Some(EvalaiEnd::Ended(Status::Cancelled));
         let plan = world.pass_to(Cancelled, reasons::ENDED_IN_EVALAI);
         assert!(records(&plan));
         assert_eq!(condition(&plan, RECORDED), ("False".into(), reasons::WAITING.into()));
@@ -132,9 +131,7 @@ fn a_cancel_before_evalais_row_is_known_keeps_what_had_finished_there() {
         let plan = world.pass_to(Cancelled, reason);
         let asked = has(&plan, |a| *a == Action::UpdateEvalai(EvalaiUpdate::Cancelled));
         assert!(asked, "the row is read before anything is written");
-        world.in_evalai().end = Some(EvalaiEnd::Ended {
-            status: "finished".into(),
-        });
+        world.in_evalai().end = Some(EvalaiEnd::Ended(Status::Finished));
         let plan = world.pass_to(Cancelled, reasons::ENDED_IN_EVALAI);
         assert!(!has(&plan, |a| matches!(a, Action::UpdateEvalai(_))));
         let published = condition(&plan, conditions::PUBLISHED);

@@ -5,6 +5,7 @@ use crate::controller::submissions::decide::{Action, EvalaiUpdate, TableUpdate};
 use crate::controller::submissions::view::{EvalaiEnd, JobEnd, ObservedReport};
 use crate::pod::report::Report;
 use crate::pod::run::Stop;
+use crate::services::evalai::Status;
 use leaderboard_api::State::{Cancelled, Finished, Pending, Running};
 use leaderboard_api::{names, reasons};
 
@@ -228,9 +229,7 @@ fn a_cancel_that_comes_after_the_last_route_loses() {
     world.complete();
     world.report(final_report());
     world.pass_to(Finished, reasons::FINISHED);
-    world.in_evalai().end = Some(EvalaiEnd::Ended {
-        status: "cancelled".into(),
-    });
+    world.in_evalai().end = Some(EvalaiEnd::Ended(Status::Cancelled));
     let plan = world.pass_to(Cancelled, reasons::ENDED_IN_EVALAI);
     assert!(has(&plan, |a| *a == Action::Record(TableUpdate::End)));
 }
