@@ -129,7 +129,7 @@ impl Parts for Submission {
             status.conditions.shrink_to_fit();
             status.pairs.shrink_to_fit();
             if let Some(plan) = &mut status.plan {
-                plan.slices.shrink_to_fit();
+                plan.shrink_to_fit();
             }
         }
         submission

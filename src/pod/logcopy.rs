@@ -85,7 +85,7 @@ pub async fn work(
     let tree = Arc::new(Tree::open(&setting.places.logs)?);
     let gatherer = Gatherer::new(&setting.run, Arc::clone(&tree))?;
     let plan = &setting.run.plan;
-    let quota = Quota::new(plan.storage.size_limit.bytes(), plan.slices.len());
+    let quota = Quota::new(plan.storage.size_limit.bytes(), plan.workers());
     let uploader = Uploader::new(archive.clone(), Arc::clone(&tree), quota);
 
     let (end, ending) = shutdown::Stop::new();
@@ -122,7 +122,7 @@ fn ship(
     let task = setting.run.log_group.as_ref().map(|group| {
         let plan = &setting.run.plan;
         let client = LogClient::of_group(aws, group);
-        let pairs = plan.slices.len();
+        let pairs = plan.workers();
         let memory = uploader.memory();
         let shipper = Shipper::new(client, Arc::clone(tree), &plan.run_id, pairs, memory, STREAM_A_DAY);
         tasks.stay("logs to CloudWatch", shipper.run(SHIP_PERIOD, receiver, told))

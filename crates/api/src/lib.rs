@@ -30,6 +30,7 @@ mod retention;
 mod route_slice;
 mod route_subset;
 mod run_id;
+mod run_plan;
 mod shared_text;
 mod state;
 pub mod submission;

@@ -164,7 +164,7 @@ fn sources(wanted: &Logs, pairs: usize) -> Vec<Source> {
 
 fn pairs(submission: &Submission) -> usize {
     let plan = submission.status.as_ref().and_then(|status| status.plan.as_ref());
-    plan.map_or(0, |plan| plan.slices.len())
+    plan.map_or(0, |plan| plan.workers())
 }
 
 /// Prints the lines of several containers so far, one after the other, each with its label.

@@ -194,7 +194,7 @@ impl Rounds {
     }
 
     fn pairs(&self) -> usize {
-        self.setting.run.plan.slices.len()
+        self.setting.run.plan.workers()
     }
 
     /// One round. Returns how long the next one may wait.

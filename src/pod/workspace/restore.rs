@@ -59,8 +59,8 @@ pub async fn restore(
     let limit = run.plan.storage.size_limit.bytes();
     let chosen = choose(
         listing.objects,
-        &Quota::new(limit, run.plan.slices.len()),
-        run.plan.slices.len(),
+        &Quota::new(limit, run.plan.workers()),
+        run.plan.workers(),
     );
     let others = chosen.others.iter().chain(&chosen.of_workers);
     let others: Vec<(String, Stored)> = others

@@ -97,7 +97,7 @@ fn pair_entry(status: &mut SubmissionStatus, id: i32) -> &mut PairStatus {
     let fresh = PairStatus {
         id,
         done: 0,
-        total: pair_total(status, id),
+        total: status.plan.as_ref().map_or(0, |plan| plan.total_of(id)),
         crashes: 0,
         state: PairState::Waiting,
         last: None,
@@ -107,14 +107,6 @@ fn pair_entry(status: &mut SubmissionStatus, id: i32) -> &mut PairStatus {
     let at = status.pairs.partition_point(|p| p.id < id);
     status.pairs.insert(at, fresh);
     &mut status.pairs[at]
-}
-
-fn pair_total(status: &SubmissionStatus, id: i32) -> i32 {
-    let slice = status.plan.as_ref().and_then(|plan| {
-        let slice = plan.slices.get(usize::try_from(id).ok()?.checked_sub(1)?)?;
-        i32::try_from(slice.routes()).ok()?.checked_mul(plan.repetitions)
-    });
-    slice.unwrap_or(0)
 }
 
 /// The failure of a pair that has crashed as often as it may, or cannot start at all. It waits until the cause is settled.

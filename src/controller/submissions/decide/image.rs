@@ -12,9 +12,9 @@ use leaderboard_api::{
 pub(super) fn not_allowed(draft: &PlanBuilder<'_>, leaderboard: &LeaderboardSpec, image: &str) -> Option<Failure> {
     let reference = ImageReference::parse(image).ok().filter(|_| !draft.status.has_run())?;
     let repository = Repository::of(&reference);
-    let own = [&leaderboard.contents.image, &leaderboard.simulator.image];
+    let own = leaderboard.host_images();
     let is_hosts = own
-        .iter()
+        .into_iter()
         .any(|own| ImageReference::parse(own).is_ok_and(|own| Repository::of(&own).is_same(&repository)));
     let team = draft.status.team.as_ref().and_then(|team| team.id.as_deref());
     let patterns = patterns(draft, leaderboard);

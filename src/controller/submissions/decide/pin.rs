@@ -2,7 +2,7 @@
 
 use super::plan_builder::{PlanBuilder, Terms};
 use crate::controller::submissions::view::{EvalaiInfo, Standing};
-use leaderboard_api::{Attempt, LeaderboardSpec, RouteSlice, RunPlan, effective};
+use leaderboard_api::{Attempt, LeaderboardSpec, RunPlan, effective};
 
 pub(super) fn pin(draft: &mut PlanBuilder<'_>, terms: Terms<'_>, image: String) {
     let Terms {
@@ -16,7 +16,7 @@ pub(super) fn pin(draft: &mut PlanBuilder<'_>, terms: Terms<'_>, image: String) 
     } else {
         let resume = resumed || draft.spec().attempt > Attempt::FIRST || draft.is_adopted();
         let plan = effective::plan(leaderboard, track, draft.submission().run_id(), image, resume);
-        let plan = if draft.spec().check { first_route(plan) } else { plan };
+        let plan = if draft.spec().check { plan.of_check() } else { plan };
         RunPlan {
             earlier_attempts: attempts_before(draft, info),
             submission_uid: draft.submission().metadata.uid.clone(),
@@ -39,14 +39,11 @@ fn again(draft: &PlanBuilder<'_>, leaderboard: &LeaderboardSpec, pinned: RunPlan
     if draft.status.retry > 0 || draft.status.job_name.is_some() {
         return pinned;
     }
-    // The images of contents and simulator belong to the attempt and follow the Leaderboard until its first Job is made; all else
-    // belongs to the submission.
+    // The host's images belong to the attempt and follow the Leaderboard until its first Job is made; all else belongs to the submission.
     RunPlan {
         // The same, unless an earlier attempt had none.
         image,
-        contents_image: leaderboard.contents.image.as_str().into(),
-        simulator_image: leaderboard.simulator.image.as_str().into(),
-        ..pinned
+        ..pinned.renewed(leaderboard)
     }
 }
 
@@ -56,31 +53,4 @@ fn attempts_before(draft: &PlanBuilder<'_>, info: Option<&EvalaiInfo>) -> i64 {
     let is_new = draft.spec().attempt == Attempt::FIRST;
     let resumed = info.filter(|info| is_new && info.standing == Standing::Resumed);
     resumed.and_then(|info| info.last_attempt).map_or(0, |last| last.0)
-}
-
-/// The plan of a check: the first route, once, with one pair.
-fn first_route(plan: RunPlan) -> RunPlan {
-    let first = plan.slices.first().map_or(0, |slice| slice.first);
-    RunPlan {
-        slices: vec![RouteSlice { first, last: first }],
-        routes: 1,
-        repetitions: 1,
-        ..plan
-    }
-}
-
-#[cfg(test)]
-mod tests {
-    use super::*;
-    use serde_json::json;
-
-    #[test]
-    fn a_check_drives_the_first_route_once() {
-        let plan = json!({"runId": "check-lb-1", "leaderboardVersion": "V1", "track": "sensors", "codename": "SENSORS",
-                          "slices": [{"first": 4, "last": 9}, {"first": 10, "last": 15}], "routes": 12, "repetitions": 5,
-                          "storage": {"bucket": "b"}, "image": "a:1", "contentsImage": "c:1", "simulatorImage": "s:1"});
-        let plan = first_route(serde_json::from_value(plan).unwrap());
-        assert_eq!(plan.slices, [RouteSlice { first: 4, last: 4 }]);
-        assert_eq!((plan.routes, plan.repetitions), (1, 1));
-    }
 }

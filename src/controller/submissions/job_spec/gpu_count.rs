@@ -21,7 +21,7 @@ pub fn gpus(spec: &LeaderboardSpec, track: Option<&Track>, plan: &RunPlan) -> i6
             json!({"name": member.to_string(), "resources": resources})
         })
     };
-    let containers: Vec<Value> = Pair::first(plan.slices.len()).flat_map(of_pair).collect();
+    let containers: Vec<Value> = Pair::first(plan.workers()).flat_map(of_pair).collect();
     let mut template = json!({"spec": {"containers": containers}});
     let overlay = spec.pod_overrides.as_ref();
     if let Some(overlay) = overlay.filter(|pod| pod_overlay::validate_overlay(pod).is_ok()) {
@@ -38,7 +38,7 @@ pub fn gpus(spec: &LeaderboardSpec, track: Option<&Track>, plan: &RunPlan) -> i6
 /// One device for each pair.
 fn claimed(source: GpuSource<'_>, plan: &RunPlan) -> i64 {
     match source {
-        GpuSource::Claim(_) => i64::try_from(plan.slices.len()).unwrap_or(i64::MAX),
+        GpuSource::Claim(_) => i64::try_from(plan.workers()).unwrap_or(i64::MAX),
         GpuSource::None | GpuSource::PerContainer(_) | GpuSource::NodeIndex(_) => 0,
     }
 }

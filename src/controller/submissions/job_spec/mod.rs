@@ -103,7 +103,7 @@ impl JobInput<'_> {
     }
 
     fn pairs(&self) -> usize {
-        self.plan.slices.len()
+        self.plan.workers()
     }
 
     fn submission_name(&self) -> &str {

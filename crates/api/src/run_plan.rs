@@ -1,0 +1,72 @@
+//! What programs ask of a plan and of a Leaderboard, whatever kind of evaluation they are of.
+//!
+//! Pure. Fields of one kind alone are read here, and in `evaluation`.
+
+use super::{LeaderboardSpec, RouteSlice, RunPlan};
+
+impl RunPlan {
+    /// How many workers share the work.
+    pub fn workers(&self) -> usize {
+        self.slices.len()
+    }
+
+    /// Units of work of one worker, which counts from 1; 0 if the plan has no such worker.
+    pub fn total_of(&self, worker: i32) -> i32 {
+        let index = usize::try_from(worker).ok().and_then(|worker| worker.checked_sub(1));
+        let slice = index.and_then(|index| self.slices.get(index));
+        let units = slice.and_then(|slice| i32::try_from(slice.routes()).ok()?.checked_mul(self.repetitions));
+        units.unwrap_or(0)
+    }
+
+    /// The plan of a check: the first unit of work, once, with one worker.
+    #[must_use]
+    pub fn of_check(self) -> Self {
+        let first = self.slices.first().map_or(0, |slice| slice.first);
+        Self {
+            slices: vec![RouteSlice { first, last: first }],
+            routes: 1,
+            repetitions: 1,
+            ..self
+        }
+    }
+
+    /// The plan with the images that the Leaderboard names now, but for the participant's.
+    #[must_use]
+    pub fn renewed(self, spec: &LeaderboardSpec) -> Self {
+        Self {
+            contents_image: spec.contents.image.as_str().into(),
+            simulator_image: spec.simulator.image.as_str().into(),
+            ..self
+        }
+    }
+
+    /// Gives back memory that its lists do not need.
+    pub fn shrink_to_fit(&mut self) {
+        self.slices.shrink_to_fit();
+    }
+}
+
+impl LeaderboardSpec {
+    /// Images of the host, which are nobody's submission.
+    pub fn host_images(&self) -> [&str; 2] {
+        [&self.contents.image, &self.simulator.image]
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+    use serde_json::json;
+
+    #[test]
+    fn a_check_does_the_first_unit_once() {
+        let plan = json!({"runId": "check-lb-1", "leaderboardVersion": "V1", "track": "sensors", "codename": "SENSORS",
+                          "slices": [{"first": 4, "last": 9}, {"first": 10, "last": 15}], "routes": 12, "repetitions": 5,
+                          "storage": {"bucket": "b"}, "image": "a:1", "contentsImage": "c:1", "simulatorImage": "s:1"});
+        let plan: RunPlan = serde_json::from_value(plan).unwrap();
+        assert_eq!([plan.total_of(0), plan.total_of(1), plan.total_of(3)], [0, 30, 0]);
+        let plan = plan.of_check();
+        assert_eq!(plan.slices, [RouteSlice { first: 4, last: 4 }]);
+        assert_eq!((plan.routes, plan.repetitions, plan.total_of(1)), (1, 1, 1));
+    }
+}
