@@ -24,8 +24,8 @@ use serde_json::json;
 use tokio::time::timeout;
 
 use super::bridge::{LIMIT, StandIn};
-use super::scale::player::ROUTES;
 use super::world::{HOST, NODE, PARTICIPANT, ROUTE, World, ago, running};
+use crate::support::player::ROUTES;
 
 #[tokio::test(flavor = "multi_thread", worker_threads = 2)]
 async fn routes_that_an_agent_prints_are_for_hosts_unless_they_want_it_otherwise() {

@@ -17,9 +17,9 @@ use tokio::process::Child;
 use super::boards::make_table;
 use super::bridge::eventually;
 use super::process::operator;
-use super::scale::player::ROUTES;
 use super::world::World;
 use crate::support::apiserver;
+use crate::support::player::ROUTES;
 use crate::support::tools::loopback;
 use server::{Prometheus, Target};
 

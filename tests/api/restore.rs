@@ -22,9 +22,9 @@ use serde::de::DeserializeOwned;
 use serde_json::{Value, json};
 
 use super::boards::make_table;
-use super::scale::player::ROUTES;
 use super::world::{World, labels, running};
 use crate::support::apiserver::server;
+use crate::support::player::ROUTES;
 
 /// Routes that what still runs has done.
 const DONE: u32 = 12;

@@ -5,7 +5,6 @@
 
 mod board;
 mod cancels;
-pub(super) mod player;
 
 use std::collections::{BTreeMap, BTreeSet};
 use std::time::Duration;
@@ -28,8 +27,8 @@ use super::bridge::StandIn;
 use super::objects::{Kind, create};
 use super::operator::Operator;
 use crate::support::apiserver::server;
+use crate::support::player::{Player, Props, ROUTES};
 use board::make_board;
-use player::{Player, Props, ROUTES};
 
 const BOARD: &str = "carla";
 /// How often it is looked whether the controller goes on.

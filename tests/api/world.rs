@@ -33,8 +33,8 @@ use tokio::time::timeout;
 
 use super::bridge::{LIMIT, StandIn};
 use super::objects::merge;
-use super::scale::player::{Player, Props};
 use crate::support::apiserver;
+use crate::support::player::{Player, Props};
 
 /// A line of the routes file.
 pub(super) const ROUTE: &str = r#"<waypoint x="4711.25" y="-815.5" z="1.0"/>"#;

@@ -4,5 +4,6 @@
 pub mod apiserver;
 pub mod files;
 pub mod ministack;
+pub mod player;
 pub mod throttle;
 pub mod tools;

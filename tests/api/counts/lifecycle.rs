@@ -27,10 +27,10 @@ use super::super::boards::make_table;
 use super::super::bridge::StandIn;
 use super::super::objects::{Kind, create};
 use super::super::operator;
-use super::super::scale::player::{Player, Props, ROUTES};
 use super::Cost;
 use crate::support::apiserver::{Request, server};
 use crate::support::ministack;
+use crate::support::player::{Player, Props, ROUTES};
 
 const BOARD: &str = "carla";
 /// Far longer than anything here takes.
