@@ -21,6 +21,9 @@ mod gate;
 mod old_pipeline;
 #[path = "support/operator.rs"]
 mod operator;
+#[allow(dead_code, reason = "the tests of the API server play more of a cluster")]
+#[path = "support/played.rs"]
+mod played;
 #[path = "support/processes.rs"]
 mod processes;
 #[path = "support/registry.rs"]

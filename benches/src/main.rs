@@ -10,6 +10,13 @@ mod machine;
 mod names;
 mod observed;
 mod operator;
+#[allow(
+    dead_code,
+    clippy::unwrap_used,
+    reason = "it is shared with the tests, and has their part too"
+)]
+#[path = "../../tests/support/played.rs"]
+mod played;
 mod player;
 mod raw;
 mod record;

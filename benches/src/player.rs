@@ -16,6 +16,7 @@ use tokio::task::JoinHandle;
 use crate::api::{self, Meta, Slim};
 use crate::bench::Outcome;
 use crate::observed::{JobStatus, Observed, endless};
+use crate::played::{self, now};
 use crate::storage::{PAIRS, Storage};
 
 /// The node of all Pods.
@@ -216,12 +217,7 @@ impl Stage {
     /// As the Job controller does. Here a Pod has the name of its Job.
     async fn complete(&self, pod: &Meta) -> Outcome<()> {
         let _turn = self.turns.acquire().await?;
-        let now = now();
-        let condition = |kind: &str| json!({"type": kind, "status": "True", "reason": "CompletionsReached", "lastTransitionTime": now, "lastProbeTime": now});
-        let status = json!({"status": {
-            "active": null, "ready": 0, "succeeded": 1, "completionTime": now, "uncountedTerminatedPods": {},
-            "conditions": [condition("SuccessCriteriaMet"), condition("Complete")],
-        }});
+        let status = json!({"status": played::job_complete()});
         api::set_status(&self.client, "jobs", &pod.name, status.to_string().into_bytes()).await?;
         Ok(())
     }
@@ -240,11 +236,6 @@ impl Stage {
     }
 }
 
-/// The time as Kubernetes has it.
-pub fn now() -> String {
-    Timestamp::now().strftime("%Y-%m-%dT%H:%M:%SZ").to_string()
-}
-
 fn unschedulable() -> Value {
     json!({"phase": "Pending", "conditions": [{
         "type": "PodScheduled", "status": "False", "reason": "Unschedulable", "lastTransitionTime": now(),
@@ -254,27 +245,19 @@ fn unschedulable() -> Value {
 
 /// A Pod that runs, or that has ended well.
 fn status(has_ended: bool) -> Value {
-    let now = now();
-    let over = json!({"terminated": {"exitCode": 0, "reason": "Completed", "startedAt": now, "finishedAt": now}});
-    let running = json!({"running": {"startedAt": now}});
-    let container = |name: String, is_over: bool| {
-        json!({
-            "name": name, "image": "registry.example/played:1", "imageID": "registry.example/played@sha256:1",
-            "restartCount": 0, "ready": !is_over, "started": !is_over, "state": if is_over { &over } else { &running },
-        })
+    let (over, running) = (played::ended(0, ""), played::running());
+    let container = |name: &str, is_over: bool| {
+        let (image, id) = ("registry.example/played:1", "registry.example/played@sha256:1");
+        played::container(name, image, id, if is_over { &over } else { &running })
     };
     let sides = [names::simulator_container, names::agent_container];
     let pairs = (1..=PAIRS as usize).flat_map(|pair| sides.map(|side| side(pair)));
-    let containers: Vec<Value> = pairs.map(|name| container(name, has_ended)).collect();
-    json!({
-        "phase": if has_ended { "Succeeded" } else { "Running" },
-        "startTime": now,
-        "conditions": [{"type": "PodScheduled", "status": "True", "lastTransitionTime": now}],
-        "initContainerStatuses": [
-            container(names::CONTAINER_WORKSPACE.into(), true),
-            container(names::CONTAINER_CONTENTS.into(), true),
-            container(names::CONTAINER_LOGCOPY.into(), has_ended),
-        ],
-        "containerStatuses": containers,
-    })
+    let containers: Vec<Value> = pairs.map(|name| container(&name, has_ended)).collect();
+    let init = [
+        container(names::CONTAINER_WORKSPACE, true),
+        container(names::CONTAINER_CONTENTS, true),
+        container(names::CONTAINER_LOGCOPY, has_ended),
+    ];
+    let phase = if has_ended { "Succeeded" } else { "Running" };
+    played::pod(phase, &init, &containers)
 }

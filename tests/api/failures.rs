@@ -10,10 +10,10 @@ use std::time::Duration;
 use evalai_stand_in::model::Status;
 use k8s_openapi::api::batch::v1::Job;
 use k8s_openapi::api::coordination::v1::Lease;
-use k8s_openapi::api::core::v1::{Node, Pod};
-use kube::api::{DeleteParams, Patch, PatchParams, PostParams};
+use k8s_openapi::api::core::v1::Pod;
+use kube::ResourceExt;
+use kube::api::{DeleteParams, PostParams};
 use kube::runtime::wait::await_condition;
-use kube::{Api, ResourceExt};
 use leaderboard_api::names::FAILURE_LOG_KEY;
 use leaderboard_api::{
     Attempt, JobNumber, Leaderboard, State, Submission, SubmissionStatus, conditions, names, reasons,
@@ -24,7 +24,7 @@ use serde_json::json;
 use tokio::time::timeout;
 
 use super::bridge::{LIMIT, StandIn};
-use super::world::{HOST, NODE, PARTICIPANT, ROUTE, World, ago, running};
+use super::world::{HOST, PARTICIPANT, ROUTE, World, ago};
 use crate::support::player::ROUTES;
 
 #[tokio::test(flavor = "multi_thread", worker_threads = 2)]
@@ -145,18 +145,15 @@ async fn a_silent_node_is_replaced_before_the_grace_and_costs_no_attempt() {
     let world = World::new().await;
     world.leaderboard("lb", 1, "Hosts").await;
     let _controller = world.controller();
-    let nodes: Api<Node> = Api::all(world.client.clone());
-    let node = serde_json::from_value(json!({"metadata": {"name": NODE}})).unwrap();
-    nodes.create(&PostParams::default(), &node).await.unwrap();
-    let silent = json!({"status": {"conditions": [{
+    let cluster = world.cluster().on_node("silent");
+    let silent = json!({
         "type": "Ready", "status": "Unknown", "reason": "NodeStatusUnknown", "lastTransitionTime": ago(100),
-    }]}});
-    let patch = Patch::Merge(&silent);
-    nodes.patch_status(NODE, &PatchParams::default(), &patch).await.unwrap();
+    });
+    cluster.node(silent).await;
 
     let (pk, name) = world.submit("lb", 1).await;
     let job = world.job(&name, 0).await;
-    let pod = world.pod(&job, &running()).await;
+    let pod = cluster.running_pod(&job).await.name_any();
     let runs = |s: &SubmissionStatus| s.state == Some(State::Running);
     world.until(&name, "it runs", runs).await;
     let is_told = |status: &'static str| {
@@ -180,7 +177,7 @@ async fn a_silent_node_is_replaced_before_the_grace_and_costs_no_attempt() {
         mark.owner.starts_with("controller-"),
         "what it may still write counts for nobody"
     );
-    world.pod(&next, &running()).await;
+    cluster.running_pod(&next).await;
     let job = next.name_any();
     let is_back = |s: &SubmissionStatus| runs(s) && s.job_name.as_ref() == Some(&job);
     world.until(&name, "it runs again", is_back).await;

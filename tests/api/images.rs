@@ -13,8 +13,9 @@ use tokio::time::timeout;
 
 use super::bridge::LIMIT;
 use super::objects::{Kind, causes, create};
-use super::world::{PARTICIPANT, World, running};
-use crate::support::apiserver;
+use super::world::{PARTICIPANT, World};
+use crate::support::player::running;
+use crate::support::{apiserver, played};
 
 /// A Job's first agent.
 fn agent(job: &Job) -> Container {
@@ -58,9 +59,11 @@ async fn every_later_job_pulls_the_digest_that_the_first_agent_ran() {
     assert_eq!(pulled.image_pull_policy.as_deref(), Some("IfNotPresent"));
 
     let digest = format!("sha256:{}", "a".repeat(64));
-    let mut status = running();
-    status["containerStatuses"][1]["imageID"] = json!(format!("docker.io/r/team-a@{digest}"));
-    world.pod(&first, &status).await;
+    let cluster = world.cluster();
+    let pod = cluster.pod(&first).await;
+    let mut status = running(&pod);
+    played::container_of(&mut status, "agent-1")["imageID"] = json!(format!("docker.io/r/team-a@{digest}"));
+    cluster.set_pod(&pod.name_any(), &status).await;
     let is_pinned = |s: &SubmissionStatus| s.image.as_ref().is_some_and(|image| image.digest == digest);
     world.until(&name, "the digest is pinned", is_pinned).await;
 

@@ -4,13 +4,12 @@
 use std::time::{Duration, Instant};
 
 use k8s_openapi::api::batch::v1::Job;
-use k8s_openapi::api::core::v1::Pod;
 use k8s_openapi::api::networking::v1::NetworkPolicy;
 use k8s_openapi::api::rbac::v1::{Role, RoleBinding};
 use kube::api::{DeleteParams, Patch, PatchParams, PostParams};
 use kube::runtime::wait::await_condition;
 use kube::{Api, Client, ResourceExt};
-use leaderboard_api::{Condition, Leaderboard, Submission, conditions, reasons};
+use leaderboard_api::{Condition, Leaderboard, Submission, conditions, names, reasons};
 use serde_json::{Value, json};
 use tokio::net::TcpListener;
 use tokio::time::timeout;
@@ -19,6 +18,8 @@ use super::bridge::{LIMIT, StandIn};
 use super::objects::{Kind, create};
 use super::operator::Operator;
 use crate::support::apiserver::server;
+use crate::support::played;
+use crate::support::player::Cluster;
 
 const NAME: &str = "carla";
 const POLICY: &str = "leaderboard-carla";
@@ -131,26 +132,11 @@ impl World {
 
     /// A Pod of this Job whose `workspace` has ended with this message.
     async fn pod(&self, job: &Job, message: &Value) {
-        let template = job.spec.as_ref().unwrap().template.metadata.clone().unwrap();
-        let name = format!("{}-x", job.name_any());
-        let pod = json!({
-            "metadata": {"name": name, "labels": template.labels, "annotations": template.annotations},
-            "spec": {
-                "automountServiceAccountToken": false,
-                "initContainers": [{"name": "workspace", "image": "i"}],
-                "containers": [{"name": "agent-1", "image": "i"}],
-            },
-        });
-        let pods = self.api::<Pod>();
-        let pod = serde_json::from_value(pod).unwrap();
-        pods.create(&PostParams::default(), &pod).await.unwrap();
-        let ended = json!({"terminated": {"exitCode": 0, "reason": "Completed", "message": message.to_string(),
-            "startedAt": "2026-11-01T12:00:00Z", "finishedAt": "2026-11-01T12:00:03Z"}});
-        let workspace =
-            json!({"name": "workspace", "image": "i", "imageID": "", "ready": true, "restartCount": 0, "state": ended});
-        let status = Patch::Merge(json!({"status": {"initContainerStatuses": [workspace]}}));
-        let patched = pods.patch_status(&name, &PatchParams::default(), &status).await;
-        patched.unwrap();
+        let cluster = Cluster::new(&self.client, &self.namespace);
+        let pod = cluster.pod(job).await.name_any();
+        let ended = played::ended(0, &message.to_string());
+        let workspace = played::container(names::CONTAINER_WORKSPACE, "i", "", &ended);
+        cluster.set_pod(&pod, &played::pod("Pending", &[workspace], &[])).await;
     }
 }
 

@@ -13,31 +13,19 @@ use k8s_openapi::api::networking::v1::NetworkPolicy;
 use kube::api::{DeleteParams, ListParams, Patch, PatchParams, PostParams};
 use kube::core::NamespaceResourceScope;
 use kube::{Resource, ResourceExt};
-use leaderboard_api::{
-    Attempt, Leaderboard, PairState, State, Submission, SubmissionStatus, conditions, names, reasons,
-};
-use leaderboard_operator::pod::report::{REPORT_KEY, Report, ReportPair, SCHEMA};
+use leaderboard_api::{Attempt, JobNumber, Leaderboard, State, Submission, SubmissionStatus, names, reasons};
+use leaderboard_operator::pod::report::REPORT_KEY;
 use leaderboard_operator::services::archive::Archive;
 use serde::de::DeserializeOwned;
 use serde_json::{Value, json};
 
 use super::boards::make_table;
-use super::world::{World, labels, running};
+use super::world::{World, is_settled};
 use crate::support::apiserver::server;
-use crate::support::player::ROUTES;
+use crate::support::player::{self, ROUTES};
 
 /// Routes that what still runs has done.
 const DONE: u32 = 12;
-
-fn is_settled(status: &SubmissionStatus) -> bool {
-    let is_known = |type_: &str| {
-        let found = conditions::get(&status.conditions, type_);
-        found.is_some_and(|c| c.status == "True" || c.reason == reasons::NOT_REQUIRED)
-    };
-    conditions::is_true(&status.conditions, conditions::FINISHED)
-        && is_known(conditions::PUBLISHED)
-        && is_known(conditions::RECORDED)
-}
 
 /// What was there before the disaster, by what became of it.
 struct Season {
@@ -191,7 +179,7 @@ async fn finish(world: &World, names: [&str; 2]) {
 /// A Pod runs and has stored some routes.
 async fn begin(world: &World, run: &str, name: &str) {
     let job = world.job(name, 0).await;
-    world.pod(&job, &running()).await;
+    world.cluster().running_pod(&job).await;
     report(world, run, name, DONE).await;
     let is_read = |status: &SubmissionStatus| status.progress.as_ref().is_some_and(|p| p.done == 12);
     world.until(name, "its report is read", is_read).await;
@@ -200,53 +188,9 @@ async fn begin(world: &World, run: &str, name: &str) {
 /// What logcopy stores of a run; the last report of one that is complete.
 async fn report(world: &World, run: &str, name: &str, done: u32) {
     let uid = world.api::<Submission>().get(name).await.unwrap().uid().unwrap();
-    let pods = world.api::<Pod>();
-    let pod = pods
-        .get(&format!(
-            "{}-x",
-            names::job(
-                name,
-                leaderboard_api::JobNumber {
-                    attempt: Attempt(1),
-                    retry: 0
-                }
-            )
-        ))
-        .await;
-    let score = f64::from(done) * 100.0 / f64::from(ROUTES);
-    let accuracies: BTreeMap<_, _> = labels().into_iter().map(|label| (label, score)).collect();
-    let is_final = done == ROUTES;
-    let report = Report {
-        schema: SCHEMA,
-        submission_uid: uid,
-        attempt: Attempt(1),
-        pod_uid: pod.unwrap().uid().unwrap(),
-        round: u64::from(done),
-        done,
-        total: ROUTES,
-        pairs: vec![ReportPair {
-            id: 1,
-            done,
-            total: ROUTES,
-            crashes: 0,
-            state: PairState::Running,
-            names_crash: false,
-        }],
-        score: Some(score),
-        route_completion: None,
-        infraction_penalty: None,
-        is_final,
-        eligible: is_final,
-        entry_status: if is_final { "Finished" } else { "Started" }.into(),
-        stopped: None,
-        why: None,
-        warnings: Vec::new(),
-        logs: None,
-        results: json!([{"split": "leaderboard", "show_to_participant": true, "accuracies": accuracies}]).to_string(),
-        partial_results: None,
-        agents_fill_disk: false,
-        files: BTreeMap::new(),
-    };
+    let job = names::job(name, JobNumber::first(Attempt(1)));
+    let pod = world.api::<Pod>().get(&job).await.unwrap().uid().unwrap();
+    let report = player::report(uid, pod, done);
     let s3 = world.aws.aws.s3(None, Some(&world.aws.endpoint));
     let archive = Archive::new(s3, &world.bucket, format!("{run}/"));
     archive

@@ -94,7 +94,7 @@ async fn what_has_ended_is_deleted_after_its_time_and_only_a_resume_runs_again()
 
     // The cluster's garbage collector, which does not run here.
     let (pods, now) = (world.api::<Pod>(), DeleteParams::default().grace_period(0));
-    pods.delete(&format!("{job}-x"), &now).await.unwrap();
+    pods.delete(&job, &now).await.unwrap();
 
     // It goes on from the stored results, and the table counts on.
     resumed_by_a_host(&world, pk);

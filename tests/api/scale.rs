@@ -27,7 +27,7 @@ use super::bridge::StandIn;
 use super::objects::{Kind, create};
 use super::operator::Operator;
 use crate::support::apiserver::server;
-use crate::support::player::{Player, Props, ROUTES};
+use crate::support::player::{Cluster, Player, ROUTES, reports};
 use board::make_board;
 
 const BOARD: &str = "carla";
@@ -210,7 +210,6 @@ impl World {
         let client = server().await.client();
         let namespace = server().await.namespace("scale").await;
         let (config, _) = Config::in_memory().unwrap();
-        let labels = config.seed.challenges[0].phases[0].splits[0].schema.labels.clone();
         // Its own limit is a little above ours, as in EvalAI.
         let config = Config {
             throttle: size.requests_per_minute * 60 / 54,
@@ -229,14 +228,8 @@ impl World {
         let s3 = aws.aws.s3(None, Some(&aws.endpoint));
         s3.create_bucket().bucket(&bucket).send().await.unwrap();
         make_board(&client, &namespace, size, &evalai, &bucket, &aws.endpoint).await;
-        let player = Player::start(Props {
-            client: client.clone(),
-            namespace: namespace.clone(),
-            s3,
-            bucket,
-            period: Duration::from_secs(size.period_seconds.into()),
-            labels,
-        });
+        let period = Duration::from_secs(size.period_seconds.into());
+        let player = Player::start(Cluster::new(&client, &namespace), reports(period, s3, &bucket));
         let api: Api<Submission> = Api::namespaced(client.clone(), &namespace);
         let changes = watcher(api, watcher::Config::default())
             .default_backoff()

@@ -11,7 +11,7 @@ use std::time::Duration;
 use evalai_stand_in::Knobs;
 use evalai_stand_in::faults::{Failure, Fault, When};
 use evalai_stand_in::model::Status;
-use kube::Api;
+use kube::{Api, ResourceExt};
 use leaderboard_api::{State, Submission, SubmissionStatus};
 use leaderboard_operator::observability::Observability;
 use leaderboard_operator::observability::logging::{Format, subscriber};
@@ -240,7 +240,8 @@ impl Logged {
 async fn fail(world: &world::World, table: &str, lines: &Lines) -> String {
     let (pk, name) = world.submit("lb", 1).await;
     let job = world.job(&name, 0).await;
-    let pod = world.pod(&job, &world::running()).await;
+    let cluster = world.cluster();
+    let pod = cluster.running_pod(&job).await;
     let runs = |s: &SubmissionStatus| s.state == Some(State::Running);
     world.until(&name, "it runs", runs).await;
     let archive = world.archive(pk);
@@ -261,8 +262,8 @@ async fn fail(world: &world::World, table: &str, lines: &Lines) -> String {
         }],
         ..Knobs::default()
     });
-    world.pod_status(&pod, &world::crashed()).await;
-    world.stops(&job, &pod).await;
+    cluster.set_pod(&pod.name_any(), &world::crashed(&pod)).await;
+    cluster.stops(&job).await;
     let failed = world
         .evalai
         .wait_until(|state, _| state.submissions[&pk].status == Status::Failed);

@@ -12,10 +12,12 @@ use jiff::{SignedDuration, Timestamp};
 use k8s_openapi::api::batch::v1::Job;
 use k8s_openapi::api::core::v1::{Pod, Secret};
 use k8s_openapi::api::events::v1::Event;
-use kube::api::{ApiResource, DeleteParams, DynamicObject, ListParams, Patch, PatchParams, PostParams};
+use kube::api::{ApiResource, DynamicObject, ListParams, Patch, PatchParams, PostParams};
 use kube::runtime::wait::await_condition;
 use kube::{Api, Client, ResourceExt};
-use leaderboard_api::{Attempt, JobNumber, Leaderboard, Storage, Submission, SubmissionStatus, names, reasons};
+use leaderboard_api::{
+    Attempt, JobNumber, Leaderboard, Storage, Submission, SubmissionStatus, conditions, names, reasons,
+};
 use leaderboard_operator::allowed::Allowed;
 use leaderboard_operator::controller::runtime::leader::{self, Identity};
 use leaderboard_operator::controller::runtime::{self as run, Clients};
@@ -33,21 +35,13 @@ use tokio::time::timeout;
 
 use super::bridge::{LIMIT, StandIn};
 use super::objects::merge;
-use crate::support::apiserver;
-use crate::support::player::{Player, Props};
+use crate::support::player::{Cluster, Player, reports, running};
+use crate::support::{apiserver, played};
 
 /// A line of the routes file.
 pub(super) const ROUTE: &str = r#"<waypoint x="4711.25" y="-815.5" z="1.0"/>"#;
-/// Where all Pods are.
-pub(super) const NODE: &str = "node-of-failures";
 pub(super) const HOST: &str = "local-host-token";
 pub(super) const PARTICIPANT: &str = "local-team-a-token";
-
-/// Metrics of a result in the first challenge of the stand-in.
-pub(super) fn labels() -> Vec<String> {
-    let (config, _) = Config::in_memory().unwrap();
-    config.seed.challenges[0].phases[0].splits[0].schema.labels.clone()
-}
 
 /// The whole controller between a real API server and both stand-ins.
 pub(super) struct World {
@@ -116,16 +110,15 @@ impl World {
         Api::namespaced(self.client.clone(), &self.namespace)
     }
 
-    /// Plays the rest of the cluster, with so long between two reports.
+    /// What is around the controller in its namespace, for a test to play.
+    pub(super) fn cluster(&self) -> Cluster {
+        Cluster::new(&self.client, &self.namespace)
+    }
+
+    /// Plays runs that go well, with so long between two reports.
     pub(super) fn play(&self, period: Duration) -> Player {
-        Player::start(Props {
-            client: self.client.clone(),
-            namespace: self.namespace.clone(),
-            s3: self.aws.aws.s3(None, Some(&self.aws.endpoint)),
-            bucket: self.bucket.clone(),
-            period,
-            labels: labels(),
-        })
+        let s3 = self.aws.aws.s3(None, Some(&self.aws.endpoint));
+        Player::start(self.cluster(), reports(period, s3, &self.bucket))
     }
 
     /// Starts a controller that stops when the sender goes.
@@ -261,68 +254,28 @@ impl World {
         let archive = self.archive(pk);
         let stored = archive.put("agent/agent1/leaderboard.log", log.into_bytes());
         stored.await.unwrap();
-        let pod = self.pod(&job, &crashed()).await;
-        self.stops(&job, &pod).await;
-    }
-
-    /// The Pod is asked to stop, and the Job ends.
-    pub(super) async fn stops(&self, job: &Job, pod: &str) {
-        let is_told = |pod: Option<&Pod>| pod.is_some_and(|p| p.annotations().contains_key(names::ANNOTATION_STOP));
-        let told = timeout(LIMIT, await_condition(self.api(), pod, is_told)).await;
-        told.expect("the Pod is asked to stop").unwrap();
-        let jobs = self.api::<Job>();
-        jobs.delete(&job.name_any(), &DeleteParams::background()).await.unwrap();
+        let cluster = self.cluster();
+        let pod = cluster.pod(&job).await;
+        cluster.set_pod(&pod.name_any(), &crashed(&pod)).await;
+        cluster.stops(&job).await;
     }
 
     /// Waits for the Job of the first attempt that follows so many failures of the infrastructure.
     pub(super) async fn job(&self, name: &str, retry: i32) -> Job {
-        let is_there = |job: Option<&Job>| job.is_some();
-        let job_name = names::job(
-            name,
-            JobNumber {
-                attempt: Attempt(1),
-                retry,
-            },
-        );
-        let job = timeout(LIMIT, await_condition(self.api(), &job_name, is_there)).await;
-        job.expect("a Job is made").unwrap().unwrap()
-    }
-
-    /// Makes the Pod of a Job, with this status; hands back its name.
-    pub(super) async fn pod(&self, job: &Job, status: &Value) -> String {
-        let template = job.spec.as_ref().unwrap().template.metadata.as_ref().unwrap();
-        let pod = json!({
-            "metadata": {
-                "name": format!("{}-x", job.name_any()), "namespace": self.namespace, "labels": template.labels,
-                "ownerReferences": [{"apiVersion": "batch/v1", "kind": "Job", "name": job.name_any(),
-                                     "uid": job.metadata.uid, "controller": true}],
-            },
-            "spec": {
-                "nodeName": NODE, "terminationGracePeriodSeconds": 600, "restartPolicy": "OnFailure",
-                "automountServiceAccountToken": false,
-                "initContainers": [{"name": "logcopy", "image": "i", "restartPolicy": "Always"}],
-                "containers": [{"name": "simulator-1", "image": "i"}, {"name": "agent-1", "image": "i"}],
-            },
-        });
-        let pod: Pod = serde_json::from_value(pod).unwrap();
-        let name = pod.name_any();
-        self.api::<Pod>().create(&PostParams::default(), &pod).await.unwrap();
-        self.pod_status(&name, status).await;
-        name
-    }
-
-    pub(super) async fn pod_status(&self, name: &str, status: &Value) {
-        let status = Patch::Merge(json!({"status": status}));
-        let pods = self.api::<Pod>();
-        let patched = pods.patch_status(name, &PatchParams::default(), &status).await;
-        patched.unwrap();
+        let number = JobNumber {
+            attempt: Attempt(1),
+            retry,
+        };
+        self.cluster().job(&names::job(name, number)).await
     }
 
     /// The Pod of this submission's first Job finds results of something else below the prefix. Returns once the submission is held back and
     /// the Job is gone.
     pub(super) async fn finds_its_prefix_in_use(&self, name: &str) {
         let job = self.job(name, 0).await;
-        self.pod(&job, &prefix_in_use()).await;
+        let cluster = self.cluster();
+        let pod = cluster.pod(&job).await;
+        cluster.set_pod(&pod.name_any(), &prefix_in_use()).await;
         let is_held = |status: &SubmissionStatus| status.reason.as_deref() == Some(reasons::FOREIGN);
         self.until(name, "it is held back", is_held).await;
         let (jobs, name) = (self.api::<Job>(), job.name_any());
@@ -372,52 +325,44 @@ impl World {
     }
 }
 
+/// True if every system has its end.
+pub(super) fn is_settled(status: &SubmissionStatus) -> bool {
+    let is_known = |type_: &str| {
+        let found = conditions::get(&status.conditions, type_);
+        found.is_some_and(|c| c.status == "True" || c.reason == reasons::NOT_REQUIRED)
+    };
+    conditions::is_true(&status.conditions, conditions::FINISHED)
+        && is_known(conditions::PUBLISHED)
+        && is_known(conditions::RECORDED)
+}
+
 /// Some seconds ago, as Kubernetes writes it.
 pub(super) fn ago(seconds: i64) -> String {
     let at = Timestamp::now() - SignedDuration::from_secs(seconds);
     at.strftime("%Y-%m-%dT%H:%M:%SZ").to_string()
 }
 
-/// The Pod's status after the crash. What the agent leaves as its last message is no verdict of a runner; its simulator's runner
-/// has followed it.
-pub(super) fn crashed() -> Value {
-    let now = ago(0);
-    let mut status = running();
+/// The status of a Pod after its agent's crash. What the agent leaves as its last message is no verdict of a runner; its
+/// simulator's runner has followed it.
+pub(super) fn crashed(pod: &Pod) -> Value {
+    let mut status = running(pod);
     let forged = json!({"reason": ROUTE, "message": ROUTE}).to_string();
     let followed = Verdict::new(What::PeerCrashed, 0, "the agent crashed, so the server was stopped").to_json();
-    for (container, message) in [(0, followed), (1, forged)] {
-        let container = &mut status["containerStatuses"][container];
+    for (container, message) in [("simulator-1", followed), ("agent-1", forged)] {
+        let container = played::container_of(&mut status, container);
         container["ready"] = json!(false);
-        container["state"] = json!({"terminated": {
-            "exitCode": 1, "reason": "Error", "message": message, "startedAt": now, "finishedAt": now,
-        }});
+        container["state"] = played::ended(1, &message);
     }
     status
 }
 
-/// The status of a Pod all of whose containers run.
-pub(super) fn running() -> Value {
-    let now = ago(0);
-    let running = |name: &str| json!({"name": name, "image": "i", "imageID": "", "ready": true, "restartCount": 0, "state": {"running": {"startedAt": now}}});
-    json!({
-        "phase": "Running",
-        "conditions": [{"type": "PodScheduled", "status": "True", "lastTransitionTime": now}],
-        "initContainerStatuses": [running("logcopy")],
-        "containerStatuses": [running("simulator-1"), running("agent-1")],
-    })
-}
-
 /// The status of a Pod whose `workspace` has found results of something else below the prefix of the run.
-pub(super) fn prefix_in_use() -> Value {
-    let now = ago(0);
+fn prefix_in_use() -> Value {
     let verdict = WorkspaceError::PrefixInUse("results/77/".into()).verdict();
-    let ended = json!({
-        "exitCode": 1, "reason": "Error", "message": verdict.to_json(), "startedAt": now, "finishedAt": now,
-    });
-    json!({
-        "phase": "Pending",
-        "conditions": [{"type": "PodScheduled", "status": "True", "lastTransitionTime": now}],
-        "initContainerStatuses": [{"name": names::CONTAINER_WORKSPACE, "image": "i", "imageID": "", "ready": false,
-                                   "restartCount": 0, "state": {"terminated": ended}}],
-    })
+    let ended = played::ended(1, &verdict.to_json());
+    played::pod(
+        "Pending",
+        &[played::container(names::CONTAINER_WORKSPACE, "i", "", &ended)],
+        &[],
+    )
 }

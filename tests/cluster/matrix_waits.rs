@@ -8,15 +8,17 @@ use std::time::Duration;
 use evalai_stand_in::faults::Failure;
 use evalai_stand_in::model::Status;
 use futures::FutureExt;
-use k8s_openapi::api::core::v1::{ContainerState, Node, Pod, ResourceQuota};
+use k8s_openapi::api::core::v1::{Container, ContainerState, Node, Pod, ResourceQuota};
 use kube::ResourceExt;
 use kube::api::{Api, DeleteParams, ListParams, Patch, PatchParams, PostParams};
+use leaderboard_api::names::{CONTAINER_CONTENTS, CONTAINER_WORKSPACE};
 use leaderboard_api::{State, Submission, conditions};
 use serde_json::{Value, json};
 
 use super::matrix::{Case, SHOWN, together};
 use crate::evalai::Evalai;
 use crate::operator::controller;
+use crate::played;
 use crate::registry::Registry;
 use crate::scene::{Scene, containers, lay_over, scenario, score, state};
 
@@ -434,20 +436,15 @@ fn fake_node(label: &str) -> Node {
 /// Reports of a Pod what its kubelet would: all of it runs.
 async fn play_kubelet(scene: &Scene, pod: &Pod) {
     let spec = pod.spec.as_ref().unwrap();
-    let now = jiff::Timestamp::now();
-    let runs = |name: &str| {
-        let (ended, running) = (
-            json!({"terminated": {"exitCode": 0, "reason": "Completed"}}),
-            json!({"running": {"startedAt": now}}),
-        );
-        let is_over = ["contents", "workspace"].contains(&name);
-        let state = if is_over { ended } else { running };
-        json!({"name": name, "image": "", "imageID": "", "restartCount": 0, "ready": true, "started": !is_over, "state": state})
+    let (ended, running) = (played::ended(0, ""), played::running());
+    let before = [CONTAINER_CONTENTS, CONTAINER_WORKSPACE];
+    let runs = |container: &Container| {
+        let is_over = before.contains(&container.name.as_str());
+        played::container(&container.name, "", "", if is_over { &ended } else { &running })
     };
-    let first: Vec<_> = spec.init_containers.iter().flatten().map(|c| runs(&c.name)).collect();
-    let then: Vec<_> = spec.containers.iter().map(|c| runs(&c.name)).collect();
-    let status =
-        json!({"phase": "Running", "startTime": now, "initContainerStatuses": first, "containerStatuses": then});
+    let init: Vec<_> = spec.init_containers.iter().flatten().map(runs).collect();
+    let containers: Vec<_> = spec.containers.iter().map(runs).collect();
+    let status = played::pod("Running", &init, &containers);
     let patch = Patch::Merge(json!({"status": status}));
     let pods = scene.api::<Pod>();
     pods.patch_status(&pod.name_any(), &PatchParams::default(), &patch)

@@ -4,6 +4,7 @@
 pub mod apiserver;
 pub mod files;
 pub mod ministack;
+pub mod played;
 pub mod player;
 pub mod throttle;
 pub mod tools;

@@ -1,44 +1,169 @@
-//! Plays what a cluster has besides its API server: the Job controller, kubelets, and the programs in the Pods as S3 and the
-//! controller see them. Each Job gets a Pod that runs at once, reports a route more in every round, and ends when the curtain
-//! falls or when its Pod is asked to stop.
+//! Plays what a cluster has besides its API server: scheduler, kubelet and Job controller. A test that plays a Pod step by step
+//! uses [`Cluster`]; a [`Player`] plays each Job by a script, such as [`reports`].
 
-use std::collections::BTreeMap;
+mod reports;
+
+use std::collections::{BTreeMap, BTreeSet};
+use std::fmt::Debug;
 use std::sync::{Arc, Mutex};
 use std::time::Duration;
 
 use futures::{Stream, StreamExt};
 use jiff::Timestamp;
+use k8s_openapi::NamespaceResourceScope;
 use k8s_openapi::api::batch::v1::Job;
 use k8s_openapi::api::core::v1::{Container, Node, Pod};
-use kube::api::{Api, Patch, PatchParams, PostParams};
+use kube::api::{Api, DeleteParams, Patch, PatchParams, PostParams};
+use kube::runtime::wait::await_condition;
 use kube::runtime::{WatchStreamExt, watcher};
 use kube::{Client, Resource, ResourceExt};
-use leaderboard_api::{Attempt, PairState, names};
-use leaderboard_operator::pod::report::{REPORT_KEY, Report, ReportPair, SCHEMA};
+use leaderboard_api::names;
 use leaderboard_operator::pod::run::Stop;
-use leaderboard_operator::services::archive::Archive;
+use serde::de::DeserializeOwned;
 use serde_json::{Value, json};
 use tokio::sync::{oneshot, watch};
 use tokio::task::JoinHandle;
+use tokio::time::timeout;
 
-/// The node of all Pods.
+pub use self::reports::{ROUTES, report, reports};
+use super::played;
+
+/// The node of Pods where a test names no other.
 const NODE: &str = "played";
-/// Routes of every run.
-pub const ROUTES: u32 = 1000;
+/// Longest wait for something that the controller does.
+const LIMIT: Duration = Duration::from_mins(2);
+/// Init containers that have ended before the agents run.
+const BEFORE: [&str; 2] = [names::CONTAINER_WORKSPACE, names::CONTAINER_CONTENTS];
 
-/// What the play needs.
-pub struct Props {
-    pub client: Client,
-    pub namespace: String,
-    pub s3: aws_sdk_s3::Client,
-    pub bucket: String,
-    /// Time between two reports.
-    pub period: Duration,
-    /// Metrics of a result.
-    pub labels: Vec<String>,
+/// A namespace in which a test acts for the cluster.
+#[derive(Clone)]
+pub struct Cluster {
+    client: Client,
+    namespace: String,
+    /// The node of its Pods.
+    node: &'static str,
 }
 
-/// When what was seen, by name of the Submission.
+impl Cluster {
+    pub fn new(client: &Client, namespace: &str) -> Self {
+        Self {
+            client: client.clone(),
+            namespace: namespace.to_owned(),
+            node: NODE,
+        }
+    }
+
+    /// The same with a node of its own.
+    pub fn on_node(self, node: &'static str) -> Self {
+        Self { node, ..self }
+    }
+
+    /// Makes the node, with this condition. One that is there already stays as it is.
+    pub async fn node(&self, condition: Value) {
+        let node = json!({"metadata": {"name": self.node}, "status": {"conditions": [condition]}});
+        let node: Node = serde_json::from_value(node).unwrap();
+        match Api::all(self.client.clone())
+            .create(&PostParams::default(), &node)
+            .await
+        {
+            Err(kube::Error::Api(status)) if status.is_already_exists() => {}
+            made => drop(made.unwrap()),
+        }
+    }
+
+    fn api<K>(&self) -> Api<K>
+    where
+        K: Resource<Scope = NamespaceResourceScope, DynamicType = ()>,
+    {
+        Api::namespaced(self.client.clone(), &self.namespace)
+    }
+
+    /// Waits for a Job.
+    pub async fn job(&self, name: &str) -> Job {
+        let is_there = |job: Option<&Job>| job.is_some();
+        let job = timeout(LIMIT, await_condition(self.api(), name, is_there)).await;
+        job.unwrap_or_else(|_| panic!("no Job {name}")).unwrap().unwrap()
+    }
+
+    /// Makes the Pod of a Job, on the node. It has the Job's name.
+    pub async fn pod(&self, job: &Job) -> Pod {
+        let template = serde_json::to_value(&job.spec.as_ref().unwrap().template).unwrap();
+        let mut pod = json!({"metadata": template["metadata"], "spec": template["spec"]});
+        pod["metadata"]["name"] = json!(job.name_any());
+        pod["metadata"]["ownerReferences"] = json!([job.controller_owner_ref(&())]);
+        pod["spec"]["nodeName"] = json!(self.node);
+        let pod = serde_json::from_value(pod).unwrap();
+        self.api().create(&PostParams::default(), &pod).await.unwrap()
+    }
+
+    /// Makes the Pod of a Job with all of its containers running.
+    pub async fn running_pod(&self, job: &Job) -> Pod {
+        let pod = self.pod(job).await;
+        self.set_pod(&pod.name_any(), &running(&pod)).await;
+        pod
+    }
+
+    pub async fn set_pod(&self, name: &str, status: &Value) {
+        set_status(&self.api::<Pod>(), name, status).await;
+    }
+
+    pub async fn set_job(&self, job: &Job, status: &Value) {
+        set_status(&self.api::<Job>(), &job.name_any(), status).await;
+    }
+
+    /// Waits until a Pod is asked to stop, and deletes its Job.
+    pub async fn stops(&self, job: &Job) {
+        let pod = job.name_any();
+        let asked = timeout(LIMIT, await_condition(self.api(), &pod, is_asked_to_stop)).await;
+        asked.expect("the Pod is asked to stop").unwrap();
+        let jobs = self.api::<Job>();
+        jobs.delete(&pod, &DeleteParams::background()).await.unwrap();
+    }
+}
+
+fn is_asked_to_stop(pod: Option<&Pod>) -> bool {
+    pod.is_some_and(|pod| pod.annotations().contains_key(names::ANNOTATION_STOP))
+}
+
+/// Status of a Pod all of whose containers run, of images that no registry has named.
+pub fn running(pod: &Pod) -> Value {
+    status(pod, "Running", |_| String::new(), &played::running())
+}
+
+/// Status of a Pod whose `workspace` and `contents` have ended well, and all of whose other containers have this state.
+pub fn status(pod: &Pod, phase: &str, image_id: impl Fn(&str) -> String, state: &Value) -> Value {
+    let spec = pod.spec.as_ref().unwrap();
+    let over = played::ended(0, "");
+    let status = |container: &Container| {
+        let image = container.image.as_deref().unwrap_or_default();
+        let is_over = BEFORE.contains(&container.name.as_str());
+        played::container(
+            &container.name,
+            image,
+            &image_id(image),
+            if is_over { &over } else { state },
+        )
+    };
+    let init: Vec<_> = spec.init_containers.iter().flatten().map(status).collect();
+    let containers: Vec<_> = spec.containers.iter().map(status).collect();
+    played::pod(phase, &init, &containers)
+}
+
+async fn set_status<K>(api: &Api<K>, name: &str, status: &Value)
+where
+    K: Resource + Clone + Debug + DeserializeOwned,
+{
+    let patch = Patch::Merge(json!({ "status": status }));
+    let patched = async || api.patch_status(name, &PatchParams::default(), &patch).await;
+    let answer = match patched().await {
+        // The server may close a connection while a request is on its way; the same patch twice is one.
+        Err(kube::Error::Service(_)) => patched().await,
+        answer => answer,
+    };
+    answer.unwrap();
+}
+
+/// Moments by name of the Submission.
 #[derive(Clone, Debug, Default)]
 pub struct Seen {
     /// The stop reached the Pod.
@@ -54,23 +179,61 @@ pub struct Player {
 }
 
 struct Stage {
-    props: Props,
     curtain: watch::Sender<bool>,
     /// Receivers of a stop, by name of the Pod.
     cues: Mutex<BTreeMap<String, oneshot::Sender<()>>>,
     seen: Mutex<Seen>,
 }
 
+/// One Job of the play, with its Pod.
+pub struct Part {
+    pub cluster: Cluster,
+    pub job: Job,
+    pub pod: Pod,
+    pub cue: Cue,
+    stage: Arc<Stage>,
+}
+
+/// What ends a part.
+pub struct Cue {
+    stop: oneshot::Receiver<()>,
+    curtain: watch::Receiver<bool>,
+}
+
+impl Cue {
+    /// Waits until the Pod is asked to stop, or the curtain falls: then there is no stop.
+    pub async fn comes(&mut self) -> Option<Stop> {
+        tokio::select! {
+            biased;
+            _ = &mut self.stop => Some(Stop::Cancel),
+            _ = self.curtain.wait_for(|is_down| *is_down) => None,
+        }
+    }
+}
+
+impl Part {
+    /// Notes that the run has ended.
+    pub fn has_ended(&self) {
+        let submission = self.job.labels()[names::LABEL_SUBMISSION].clone();
+        let mut seen = self.stage.seen.lock().unwrap();
+        seen.ended.insert(submission, Timestamp::now());
+    }
+}
+
 impl Player {
-    pub fn start(props: Props) -> Self {
+    /// Plays every Job of the namespace by this script.
+    pub fn start<F, P>(cluster: Cluster, script: F) -> Self
+    where
+        F: Fn(Part) -> P + Send + Sync + 'static,
+        P: Future<Output = ()> + Send + 'static,
+    {
         let stage = Arc::new(Stage {
-            props,
             curtain: watch::Sender::new(false),
             cues: Mutex::default(),
             seen: Mutex::default(),
         });
-        let jobs = tokio::spawn(watch_jobs(Arc::clone(&stage)));
-        let pods = tokio::spawn(watch_pods(Arc::clone(&stage)));
+        let pods = tokio::spawn(watch_pods(cluster.clone(), Arc::clone(&stage)));
+        let jobs = tokio::spawn(watch_jobs(cluster, Arc::clone(&stage), script));
         Self {
             stage,
             watches: [jobs, pods],
@@ -98,40 +261,50 @@ impl Drop for Player {
 /// Every object as it appears and changes.
 fn all<K>(api: Api<K>) -> impl Stream<Item = K> + Send
 where
-    K: Resource + Clone + std::fmt::Debug + serde::de::DeserializeOwned + Send + 'static,
+    K: Resource + Clone + Debug + DeserializeOwned + Send + 'static,
 {
     let events = watcher(api, watcher::Config::default()).default_backoff();
     events.applied_objects().filter_map(async |event| event.ok())
 }
 
-/// A node whose kubelet speaks. It stays for the next player.
-async fn make_node(client: &Client) {
-    let node = json!({
-        "metadata": {"name": NODE},
-        "status": {"conditions": [{"type": "Ready", "status": "True", "reason": "KubeletReady"}]},
-    });
-    let node: Node = serde_json::from_value(node).unwrap();
-    match Api::all(client.clone()).create(&PostParams::default(), &node).await {
-        Err(kube::Error::Api(status)) if status.is_already_exists() => {}
-        made => drop(made.unwrap()),
-    }
-}
-
-async fn watch_jobs(stage: Arc<Stage>) {
-    make_node(&stage.props.client).await;
-    let mut known = std::collections::BTreeSet::new();
-    let mut jobs = std::pin::pin!(all(stage.jobs()));
+async fn watch_jobs<F, P>(cluster: Cluster, stage: Arc<Stage>, script: F)
+where
+    F: Fn(Part) -> P + Send + Sync + 'static,
+    P: Future<Output = ()> + Send + 'static,
+{
+    cluster
+        .node(json!({"type": "Ready", "status": "True", "reason": "KubeletReady"}))
+        .await;
+    let script = Arc::new(script);
+    let mut known = BTreeSet::new();
+    let mut jobs = std::pin::pin!(all(cluster.api::<Job>()));
     while let Some(job) = jobs.next().await {
-        if known.insert(job.uid()) {
-            tokio::spawn(play(Arc::clone(&stage), job));
+        if !known.insert(job.uid()) {
+            continue;
         }
+        let (cluster, stage, script) = (cluster.clone(), Arc::clone(&stage), Arc::clone(&script));
+        tokio::spawn(async move {
+            let (cue, stop) = oneshot::channel();
+            stage.cues.lock().unwrap().insert(job.name_any(), cue);
+            let pod = cluster.pod(&job).await;
+            let curtain = stage.curtain.subscribe();
+            let cue = Cue { stop, curtain };
+            script(Part {
+                cluster,
+                job,
+                pod,
+                cue,
+                stage,
+            })
+            .await;
+        });
     }
 }
 
-async fn watch_pods(stage: Arc<Stage>) {
-    let mut pods = std::pin::pin!(all(stage.pods()));
+async fn watch_pods(cluster: Cluster, stage: Arc<Stage>) {
+    let mut pods = std::pin::pin!(all(cluster.api::<Pod>()));
     while let Some(pod) = pods.next().await {
-        if !pod.annotations().contains_key(names::ANNOTATION_STOP) {
+        if !is_asked_to_stop(Some(&pod)) {
             continue;
         }
         let cue = stage.cues.lock().unwrap().remove(&pod.name_any());
@@ -143,188 +316,4 @@ async fn watch_pods(stage: Arc<Stage>) {
             let _ = cue.send(());
         }
     }
-}
-
-impl Stage {
-    fn jobs(&self) -> Api<Job> {
-        Api::namespaced(self.props.client.clone(), &self.props.namespace)
-    }
-
-    fn pods(&self) -> Api<Pod> {
-        Api::namespaced(self.props.client.clone(), &self.props.namespace)
-    }
-}
-
-async fn play(stage: Arc<Stage>, job: Job) {
-    let name = job.name_any();
-    let (cue, mut stop) = oneshot::channel();
-    stage.cues.lock().unwrap().insert(name.clone(), cue);
-    let pod = stage
-        .pods()
-        .create(&PostParams::default(), &pod_of(&job))
-        .await
-        .unwrap();
-    let running = json!({"status": pod_status("Running", &pod, &running_state())});
-    set_status(&stage.pods(), &name, &running).await;
-    let started = json!({"status": {"active": 1, "ready": 1, "startTime": Timestamp::now().to_string()}});
-    set_status(&stage.jobs(), &name, &started).await;
-
-    let archive = Archive::new(
-        stage.props.s3.clone(),
-        &stage.props.bucket,
-        format!("{}/", job.labels()[names::LABEL_RUN]),
-    );
-    let mut curtain = stage.curtain.subscribe();
-    // Not all at the same moment, as Pods are not.
-    let first = tokio::time::Instant::now() + stage.props.period.mul_f64(fastrand::f64());
-    let mut tick = tokio::time::interval_at(first, stage.props.period);
-    let mut report = first_report(&stage, &job, &pod);
-    let stopped = loop {
-        tokio::select! {
-            biased;
-            _ = &mut stop => break Some(Stop::Cancel),
-            _ = curtain.wait_for(|down| *down) => break None,
-            _ = tick.tick() => {}
-        }
-        report.round += 1;
-        report.done = u32::try_from(report.round).unwrap().min(ROUTES - 1);
-        put(&stage, &archive, &mut report).await;
-    };
-    report.is_final = true;
-    report.round += 1;
-    report.stopped = stopped;
-    if stopped.is_none() {
-        report.done = ROUTES;
-    }
-    put(&stage, &archive, &mut report).await;
-    end(&stage, &job, &pod).await;
-}
-
-fn pod_of(job: &Job) -> Pod {
-    let template = serde_json::to_value(&job.spec.as_ref().unwrap().template).unwrap();
-    let mut pod = json!({"metadata": template["metadata"], "spec": template["spec"]});
-    pod["metadata"]["name"] = json!(job.name_any());
-    pod["metadata"]["ownerReferences"] = json!([job.controller_owner_ref(&())]);
-    pod["spec"]["nodeName"] = json!(NODE);
-    serde_json::from_value(pod).unwrap()
-}
-
-fn running_state() -> Value {
-    json!({"running": {"startedAt": Timestamp::now().strftime("%Y-%m-%dT%H:%M:%SZ").to_string()}})
-}
-
-fn ended_state() -> Value {
-    let now = Timestamp::now().strftime("%Y-%m-%dT%H:%M:%SZ").to_string();
-    json!({"terminated": {"exitCode": 0, "reason": "Completed", "startedAt": now, "finishedAt": now}})
-}
-
-/// A status in which all init containers but the sidecar are done.
-fn pod_status(phase: &str, pod: &Pod, state: &Value) -> Value {
-    let spec = pod.spec.as_ref().unwrap();
-    let container = |container: &Container, state: &Value| {
-        let repository = container
-            .image
-            .as_deref()
-            .and_then(|image| image.split(['@', ':']).next());
-        json!({
-            "name": container.name, "image": container.image, "restartCount": 0,
-            "imageID": format!("{}@sha256:{}", repository.unwrap_or_default(), "a".repeat(64)),
-            "ready": state.get("running").is_some(), "started": state.get("running").is_some(), "state": state,
-        })
-    };
-    let init = spec.init_containers.iter().flatten().map(|c| {
-        let is_sidecar = c.name == names::CONTAINER_LOGCOPY;
-        let ended = ended_state();
-        container(c, if is_sidecar { state } else { &ended })
-    });
-    let now = Timestamp::now().strftime("%Y-%m-%dT%H:%M:%SZ").to_string();
-    json!({
-        "phase": phase,
-        "startTime": now,
-        "conditions": [{"type": "PodScheduled", "status": "True", "lastTransitionTime": now}],
-        "initContainerStatuses": init.collect::<Vec<_>>(),
-        "containerStatuses": spec.containers.iter().map(|c| container(c, state)).collect::<Vec<_>>(),
-    })
-}
-
-async fn set_status<K>(api: &Api<K>, name: &str, status: &Value)
-where
-    K: Resource + Clone + std::fmt::Debug + serde::de::DeserializeOwned,
-{
-    let patched = async || {
-        api.patch_status(name, &PatchParams::default(), &Patch::Merge(status))
-            .await
-    };
-    let answer = match patched().await {
-        // The server may close a connection while a request is on its way; the same patch twice is one.
-        Err(kube::Error::Service(_)) => patched().await,
-        answer => answer,
-    };
-    answer.unwrap();
-}
-
-fn first_report(stage: &Stage, job: &Job, pod: &Pod) -> Report {
-    let report = Report {
-        schema: SCHEMA,
-        submission_uid: job.owner_references()[0].uid.clone(),
-        attempt: Attempt(1),
-        pod_uid: pod.uid().unwrap(),
-        round: 0,
-        done: 0,
-        total: ROUTES,
-        pairs: Vec::new(),
-        score: None,
-        route_completion: None,
-        infraction_penalty: None,
-        is_final: false,
-        eligible: true,
-        entry_status: "Started".into(),
-        stopped: None,
-        why: None,
-        warnings: Vec::new(),
-        logs: None,
-        results: String::new(),
-        partial_results: None,
-        agents_fill_disk: false,
-        files: BTreeMap::new(),
-    };
-    assert!(!stage.props.labels.is_empty());
-    report
-}
-
-async fn put(stage: &Stage, archive: &Archive, report: &mut Report) {
-    let score = f64::from(report.done) * 100.0 / f64::from(ROUTES);
-    let accuracies: BTreeMap<_, _> = stage.props.labels.iter().map(|label| (label.clone(), score)).collect();
-    report.score = Some(score);
-    report.results =
-        json!([{"split": "leaderboard", "show_to_participant": true, "accuracies": accuracies}]).to_string();
-    report.pairs = vec![ReportPair {
-        id: 1,
-        done: report.done,
-        total: ROUTES,
-        crashes: 0,
-        state: PairState::Running,
-        names_crash: false,
-    }];
-    if report.is_final && report.stopped.is_none() {
-        report.entry_status = "Finished".into();
-    }
-    let bytes = serde_json::to_vec(report).unwrap();
-    archive.put(REPORT_KEY, bytes).await.unwrap();
-}
-
-async fn end(stage: &Stage, job: &Job, pod: &Pod) {
-    let name = job.name_any();
-    let ended = json!({"status": pod_status("Succeeded", pod, &ended_state())});
-    set_status(&stage.pods(), &name, &ended).await;
-    let now = Timestamp::now();
-    let time = now.strftime("%Y-%m-%dT%H:%M:%SZ").to_string();
-    let condition = |kind: &str| json!({"type": kind, "status": "True", "reason": "CompletionsReached", "lastTransitionTime": time, "lastProbeTime": time});
-    let complete = json!({"status": {
-        "active": null, "ready": 0, "succeeded": 1, "completionTime": time, "uncountedTerminatedPods": {},
-        "conditions": [condition("SuccessCriteriaMet"), condition("Complete")],
-    }});
-    set_status(&stage.jobs(), &name, &complete).await;
-    let mut seen = stage.seen.lock().unwrap();
-    seen.ended.insert(job.labels()[names::LABEL_SUBMISSION].clone(), now);
 }

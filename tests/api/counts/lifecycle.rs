@@ -13,7 +13,7 @@ use kube::api::{Api, PostParams};
 use kube::core::NamespaceResourceScope;
 use kube::runtime::wait::await_condition;
 use kube::{Client, Resource};
-use leaderboard_api::{Leaderboard, State, Submission, conditions, names, reasons};
+use leaderboard_api::{Leaderboard, State, Submission, conditions, names};
 use leaderboard_operator::observability::Observability;
 use leaderboard_operator::observability::shutdown::Stop;
 use leaderboard_operator::observability::traces::Traces;
@@ -30,7 +30,7 @@ use super::super::operator;
 use super::Cost;
 use crate::support::apiserver::{Request, server};
 use crate::support::ministack;
-use crate::support::player::{Player, Props, ROUTES};
+use crate::support::player::{Cluster, Player, ROUTES, reports};
 
 const BOARD: &str = "carla";
 /// Far longer than anything here takes.
@@ -154,7 +154,6 @@ pub struct World {
     table: ministack::Proxy,
     evalai: Option<Handle>,
     bucket: String,
-    labels: Vec<String>,
 }
 
 impl World {
@@ -170,7 +169,6 @@ impl World {
         let client = server().await.client();
         let namespace = server().await.namespace("counts").await;
         let (config, _) = Config::in_memory().unwrap();
-        let labels = config.seed.challenges[0].phases[0].splits[0].schema.labels.clone();
         let evalai = if scenario.has_evalai {
             let listener = TcpListener::bind("127.0.0.1:0").await.unwrap();
             let config = Config { throttle: 0, ..config };
@@ -189,7 +187,6 @@ impl World {
             aws,
             evalai,
             bucket,
-            labels,
         };
         world.make_board(scenario, seconds).await;
         world
@@ -287,14 +284,9 @@ impl World {
 
     /// Plays the rest of the cluster. No report comes before the last one.
     pub(super) fn play(&self) -> Player {
-        Player::start(Props {
-            client: self.client.clone(),
-            namespace: self.namespace.clone(),
-            s3: self.aws.aws.s3(None, Some(&self.aws.endpoint)),
-            bucket: self.bucket.clone(),
-            period: NO_REPORT,
-            labels: self.labels.clone(),
-        })
+        let s3 = self.aws.aws.s3(None, Some(&self.aws.endpoint));
+        let cluster = Cluster::new(&self.client, &self.namespace);
+        Player::start(cluster, reports(NO_REPORT, s3, &self.bucket))
     }
 
     pub(super) async fn until(&self, name: &str, what: &str, holds: impl Fn(&Submission) -> bool) {
@@ -322,15 +314,7 @@ pub(super) fn is_read(request: &Request) -> bool {
 }
 
 fn is_settled(submission: &Submission) -> bool {
-    let conditions = submission.status.as_ref().map(|status| status.conditions.as_slice());
-    let conditions = conditions.unwrap_or_default();
-    let is_known = |type_: &str| {
-        let found = conditions::get(conditions, type_);
-        found.is_some_and(|c| c.status == "True" || c.reason == reasons::NOT_REQUIRED)
-    };
-    conditions::is_true(conditions, conditions::FINISHED)
-        && is_known(conditions::PUBLISHED)
-        && is_known(conditions::RECORDED)
+    submission.status.as_ref().is_some_and(super::super::world::is_settled)
 }
 
 /// A controller on a thread of its own.
