@@ -1,7 +1,9 @@
 //! Checkpoints as an evaluator writes them, built from a few numbers.
 #![allow(dead_code, reason = "each test file uses its part")]
 
+use std::fmt::Write as _;
 use std::io::Write as _;
+use std::path::Path;
 
 use leaderboard_results::{Checkpoint, Format, Merged, Plan, Refusal, Slice, Strictness, Verify, merge, read_worker};
 use serde_json::{Map, Value, json};
@@ -152,4 +154,21 @@ pub fn merged(plan: &Plan, files: &[Option<Value>]) -> Result<Merged, Refusal> {
 pub fn say(line: &str) {
     // In one piece, among the lines of the harness. A test does not fail because nobody reads it.
     let _ = std::io::stderr().write_all(format!("{line}\n").as_bytes());
+}
+
+/// Compares refusals with their file in `tests/refusals`: for each what was refused, its kind, and the participant's words.
+/// UPDATE_GOLDEN=1 writes it; read the difference then.
+pub fn assert_refusals(name: &str, refusals: &[(String, Refusal)]) {
+    let mut text = String::new();
+    for (what, refusal) in refusals {
+        let kind = format!("{refusal:?}");
+        let kind = kind.split([' ', '(']).next().unwrap_or_default();
+        writeln!(text, "{what}\n    {kind}: {refusal}\n    {}", refusal.next_step()).unwrap();
+    }
+    let file = Path::new(env!("CARGO_MANIFEST_DIR")).join(format!("tests/refusals/{name}.txt"));
+    if std::env::var_os("UPDATE_GOLDEN").is_some() {
+        return std::fs::write(file, text).unwrap();
+    }
+    let known = std::fs::read_to_string(file).unwrap_or_default();
+    assert_eq!(text, known, "{name}: set UPDATE_GOLDEN=1 and read the difference");
 }
