@@ -4,6 +4,43 @@
 //! A case is opened before its cause and closed when its end is known; one that is neither closed nor filtered out is shown
 //! as failed. Each line is printed at once, and `make test` prints the table at its end. The cases are in the modules
 //! `matrix_*`, and in tests of their own that other modules have.
+//!
+//! The unit tests of decisions make up Pods, events and nodes. What they assume of the real ones has one case here each; a case that
+//! differs only in what is decided belongs to the unit tests.
+//!
+//! | fact of the kubelet, the scheduler or the Job controller | case |
+//! |---|---|
+//! | no node fits: `PodScheduled` False, `Unschedulable`, the scheduler's words | no node fits |
+//! | a quota refuses the Pod: event `FailedCreate` of the Job, no Pod | quota exceeded |
+//! | `ErrImagePull` and `ImagePullBackOff`, "not found" | image missing |
+//! | the same, "401 Unauthorized" | image unauthorised |
+//! | the same, "no match for platform" | image for another machine |
+//! | `InvalidImageName`, "couldn't parse image name" | name of the contents' image that is none |
+//! | a pull that hangs: `PodInitializing` without words, all statuses frozen, a deletion without effect | registry that never answers |
+//! | `CreateContainerConfigError`, "secret … not found" | missing Secret |
+//! | `CreateContainerConfigError`, "image will run as root" | image of root where the Pod forbids it |
+//! | the agent's program is not in the image | command missing in the image |
+//! | the kernel can't execute the agent's program | exec format error |
+//! | an init container ends with another code than 0 and is tried again, phase `Pending` | contents fail |
+//! | the termination log of an init container | workspace can't reach S3 |
+//! | a container that ended starts again in its Pod: `restartCount`, `lastState` | agent crashes once |
+//! | the termination log of a container is whatever its image writes | agent forges its verdict |
+//! | both containers of a pair start again | simulator crashes once |
+//! | `OOMKilled` | agent out of memory always |
+//! | `Evicted`, the words about a container's disk, and a new Pod of the same Job | evicted for disk by the agent |
+//! | `DisruptionTarget`, `EvictionByEvictionAPI` | Pod evicted |
+//! | a Pod that is deleted gets a successor from its Job | Pod deleted by hand |
+//! | the Pod of a deleted Job stops by itself | Job deleted by hand |
+//! | the Pod of a node that is deleted is gone | node lost |
+//! | taints of nodes are seen while Pods run | node about to be taken away |
+//! | an annotation reaches the files of a container that runs | cancel while it runs |
+//! | an init container gets SIGTERM, with the Pod's grace | cancel in the contents |
+//! | a Pod whose image can't be pulled is deleted at once | cancel while an image can't be pulled |
+//! | a sidecar that dies starts again, and nothing else does | logcopy killed, and S3 away and back |
+//! | containers run on without their kubelet | kubelet of the node killed |
+//!
+//! The unit tests alone have `UnexpectedAdmissionError`, `PreemptionByScheduler`, a node that falls silent, and what autoscalers
+//! report: nothing on one machine makes them.
 
 use std::any::Any;
 use std::fs::OpenOptions;

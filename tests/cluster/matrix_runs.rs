@@ -118,6 +118,14 @@ fn of_images(other_machines: String, private: &Registry) -> Vec<Row> {
             "no match for platform",
             "Pending ImagePull; Failed ImagePlatform (participant, charged); EvalAI failed",
         ),
+        Row {
+            then: Then::GiveUp("couldn't parse image name"),
+            ..row(
+                "name of the contents' image that is none",
+                json!({"contents": {"image": "leaderboard.example/Contents:1"}}),
+                "Pending ImagePull; Failed ImagePull (infrastructure, not charged); EvalAI failed",
+            )
+        },
         // It ends long before startSeconds.
         row(
             "image of root where the Pod forbids it",
@@ -133,11 +141,6 @@ fn of_agents() -> Vec<Row> {
     let memory = json!({"agent": {"resources": {"limits": {"memory": "96Mi"}}}});
     let no_more_time = json!({"deadlines": {"runSeconds": 4, "idleSeconds": 3, "readySeconds": 1}});
     vec![
-        row(
-            "agent out of memory once",
-            with(agent("oom@1:once"), memory.clone()),
-            "Finished; EvalAI finished",
-        ),
         row(
             "agent out of memory always",
             with(agent("oom@1"), memory),
@@ -304,14 +307,14 @@ async fn run(scene: &Scene, evalai: &Evalai, phase: u64, row: Row) {
     case.close();
 }
 
-/// Waits until the kubelet has tried the agent's image.
+/// Waits until the kubelet has tried an image in vain.
 pub async fn await_pull_error(scene: &Scene, name: &str) {
     let pod = scene.first_pod(name, LIMIT).await.name_any();
     let is_error = |container: &ContainerStatus| {
         let waiting = container.state.as_ref().and_then(|state| state.waiting.as_ref());
         matches!(
             waiting.and_then(|waiting| waiting.reason.as_deref()),
-            Some("ErrImagePull" | "ImagePullBackOff")
+            Some("ErrImagePull" | "ImagePullBackOff" | "InvalidImageName")
         )
     };
     let tried = |pod: Option<&Pod>| pod.is_some_and(|pod| containers(pod).iter().any(is_error));

@@ -41,10 +41,7 @@ async fn each_wait_shows_why_and_goes_on_once_it_is_fixed() {
             node_lost(scene).boxed_local(),
             evalai_away(scene, "EvalAI hangs", Failure::Hang).boxed_local(),
             evalai_away(scene, "EvalAI says 503", Failure::Status(503)).boxed_local(),
-            evalai_away(scene, "EvalAI says 500 in HTML", Failure::Html500).boxed_local(),
-            evalai_away(scene, "EvalAI says 429", Failure::Status(429)).boxed_local(),
             no_node(scene).boxed_local(),
-            no_node_in_time(scene).boxed_local(),
             unknown_leaderboard(scene).boxed_local(),
             unknown_track(scene).boxed_local(),
             quota(scene).boxed_local(),
@@ -236,22 +233,6 @@ async fn no_node(scene: &Scene) {
     case.also(state(&still).unwrap().as_str());
     scene.change_submission("no-node", &json!({"cancel": true})).await;
     case.ends(scene, "no-node", LIMIT).await;
-    case.close();
-}
-
-async fn no_node_in_time(scene: &Scene) {
-    let mut case = Case::open(
-        "no node fits within scheduleSeconds",
-        "Pending Unschedulable; Failed ScheduleDeadline (infrastructure, not charged)",
-    );
-    board(scene, "no-node-yet", json!({"tracks": nowhere()})).await;
-    case.cause();
-    scene.submit_to("no-node-yet", "no-node-yet", "agent:standard").await;
-    case.shows(scene, "no-node-yet", "Unschedulable", "didn't match").await;
-    scene
-        .change_leaderboard("no-node-yet", &json!({"deadlines": {"scheduleSeconds": 1}}))
-        .await;
-    case.ends(scene, "no-node-yet", LIMIT).await;
     case.close();
 }
 
