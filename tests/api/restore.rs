@@ -309,6 +309,68 @@ fn ends_since(season: &Season, pk: u64, before: usize) -> usize {
     since.iter().filter(is_end).count()
 }
 
+/// What the objects and other systems show right before the objects are lost.
+struct Before {
+    /// Of what is over, by name.
+    statuses: Vec<(String, SubmissionStatus)>,
+    /// Of what is over in EvalAI, by key.
+    outside: Vec<(u64, (String, Vec<String>))>,
+    /// Writes to EvalAI about the one whose end nobody has read.
+    unread: usize,
+}
+
+impl Season {
+    async fn before(&self) -> Before {
+        let over = [&self.finished.1, &self.failed.1, &self.cancelled.1, LOCAL_FINISHED];
+        let mut before = Before {
+            statuses: Vec::new(),
+            outside: Vec::new(),
+            unread: self.written(self.unread.0).len(),
+        };
+        for name in over {
+            let status = of_any_generation(self.status(name).await);
+            before.statuses.push((name.to_owned(), status));
+        }
+        for pk in [self.finished.0, self.failed.0, self.cancelled.0] {
+            before.outside.push((pk, self.outside(pk).await));
+        }
+        before
+    }
+
+    /// A run that was under way has a Job again, with the progress of before.
+    async fn assert_goes_on(&self, name: &str) {
+        self.world.job(name, 0).await;
+        // What the present Job has not reached is no longer shown: all fields are this operator's.
+        let is_renewed = |status: &SubmissionStatus| status.recreated == 1 && status.times.scheduled.is_none();
+        self.world.until(name, "its Job is made again", is_renewed).await;
+        let status = self.status(name).await;
+        assert_eq!(status.progress.unwrap().text, format!("{DONE}/{ROUTES}"));
+        let uid = self.world.api::<Submission>().get(name).await.unwrap().uid();
+        assert_ne!(
+            status.plan.unwrap().submission_uid,
+            uid,
+            "its reports name the UID of before"
+        );
+    }
+
+    /// What was over is as it was, in all systems, and only what was under way runs.
+    async fn assert_rest_is_as(&self, before: Before) {
+        for (name, before) in before.statuses {
+            assert_eq!(of_any_generation(self.status(&name).await), before, "{name}");
+        }
+        for (pk, before) in before.outside {
+            let now = self.outside(pk).await;
+            assert_eq!(now, before, "{pk} is as it was in table and EvalAI");
+        }
+        let mut jobs = self.jobs().await;
+        jobs.sort();
+        let expected = [format!("{LOCAL_RUNNING}-1"), format!("{}-1", self.running.1)];
+        assert_eq!(jobs, expected, "nothing else runs");
+        assert_eq!(ends_since(self, self.unread.0, before.unread), 1);
+        assert!(self.rows().await[&self.unread.0.to_string()].contains("FINISHED"));
+    }
+}
+
 #[tokio::test(flavor = "multi_thread", worker_threads = 2)]
 async fn what_a_backup_brings_back_with_its_status_goes_on_as_it_was() {
     let season = Season::play().await;
@@ -325,25 +387,9 @@ async fn what_a_backup_brings_back_with_its_status_goes_on_as_it_was() {
     ];
     let names = of_evalai.map(|(_, name)| name.as_str()).join(" ");
     let others = Backup::of(world, &format!("submissions {names}")).await;
-    let over = [
-        season.finished.1.as_str(),
-        &season.failed.1,
-        &season.cancelled.1,
-        LOCAL_FINISHED,
-    ];
-    let mut statuses = Vec::new();
-    for name in over {
-        statuses.push(of_any_generation(season.status(name).await));
-    }
-    let scheduled = season.status(&season.running.1).await.times.scheduled;
-    assert!(scheduled.is_some());
+    assert!(season.status(&season.running.1).await.times.scheduled.is_some());
+    let before = season.before().await;
     lose_all(world).await;
-    let ended = [season.finished.0, season.failed.0, season.cancelled.0];
-    let mut before = Vec::new();
-    for pk in ended {
-        before.push(season.outside(pk).await);
-    }
-    let unread_before = season.written(season.unread.0).len();
 
     boards.run(world, CREATE).await;
     // One half as docs/backup.md restores a file, the other half as a tool such as Velero does.
@@ -354,40 +400,13 @@ async fn what_a_backup_brings_back_with_its_status_goes_on_as_it_was() {
     locals.run(world, HAND_OVER).await;
     let _controller = world.controller();
     for name in [season.running.1.as_str(), LOCAL_RUNNING] {
-        world.job(name, 0).await;
-        // What the present Job has not reached is no longer shown: all fields are this operator's.
-        let is_renewed = |status: &SubmissionStatus| status.recreated == 1 && status.times.scheduled.is_none();
-        world.until(name, "its Job is made again", is_renewed).await;
-        let status = season.status(name).await;
-        assert_eq!(status.progress.unwrap().text, format!("{DONE}/{ROUTES}"));
-        let uid = world.api::<Submission>().get(name).await.unwrap().uid();
-        assert_ne!(
-            status.plan.unwrap().submission_uid,
-            uid,
-            "its reports name the UID of before"
-        );
+        season.assert_goes_on(name).await;
     }
     let is_read = |status: &SubmissionStatus| status.state == Some(State::Finished) && is_settled(status);
     world.until(&season.unread.1, "its end is read", is_read).await;
     let is_held = |status: &SubmissionStatus| status.reason.as_deref() == Some(reasons::PAUSED);
     world.until(&season.pending.1, "it is held again", is_held).await;
-
-    for (name, before) in over.into_iter().zip(statuses) {
-        assert_eq!(of_any_generation(season.status(name).await), before, "{name}");
-    }
-    let mut jobs = season.jobs().await;
-    jobs.sort();
-    let expected = [format!("{LOCAL_RUNNING}-1"), format!("{}-1", season.running.1)];
-    assert_eq!(jobs, expected, "nothing else runs");
-    for (pk, before) in ended.into_iter().zip(before) {
-        assert_eq!(
-            season.outside(pk).await,
-            before,
-            "{pk} is as it was in table and EvalAI"
-        );
-    }
-    assert_eq!(ends_since(&season, season.unread.0, unread_before), 1);
-    assert!(season.rows().await[&season.unread.0.to_string()].contains("FINISHED"));
+    season.assert_rest_is_as(before).await;
 }
 
 #[tokio::test(flavor = "multi_thread", worker_threads = 2)]

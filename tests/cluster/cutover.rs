@@ -168,11 +168,7 @@ impl Rehearsal<'_> {
         // A Pipe deletes what its filter does not match, so only one of the two may read. The sweep finds what the Pipe deletes.
         self.scene.change_leaderboard("lb", &json!({"queue": null})).await;
         drop(reader);
-        // A Pipe that was not stopped takes one of ours, whose run then waits for a node.
-        self.old.start_pipe(&[SENSORS, MAP]);
-        let taken = self.submit(MAP).await;
-        self.old.reached(taken, Stage::Accepted, LIMIT).await;
-        self.old.stop_pipe().await;
+        let taken = self.taken_by_a_pipe_that_was_not_stopped().await;
         self.old.start_pipe(&[SENSORS]);
         let (swept, later) = (self.submit(MAP).await, self.submit(SENSORS).await);
         self.old.await_deleted(swept, LIMIT).await;
@@ -180,21 +176,11 @@ impl Rehearsal<'_> {
             self.old.reached(pk, Stage::Accepted, LIMIT).await;
         }
         self.exists(swept, LOST).await;
-        let is_held = |submission: &Submission| {
-            let status = submission.status.as_ref();
-            status.is_some_and(|status| status.reason.as_deref() == Some(reasons::FOREIGN))
-        };
-        let (name, what) = (submission(taken), "it waits for the old pipeline's run");
-        self.scene.submission(&name, what, LOST, is_held).await;
+        self.held_back(taken).await;
         for pk in [map, failed, swept] {
             self.finished(pk).await;
         }
-        assert_eq!(self.evalai.submission(taken).status, Status::Submitted);
-        self.old.drive(taken, ROUTES_A_PAIR);
-        let not_stopped = self
-            .ended("cutover: MAP, taken by a Pipe that was not stopped", BY_THE_OLD, taken)
-            .await;
-        self.finished(taken).await;
+        let not_stopped = self.driven_by_the_old_pipeline(taken).await;
         // The sweep has read this row too: it is as old, in a phase of ours, and still submitted.
         assert_eq!(self.evalai.submission(old_map).status, Status::Submitted);
         self.old.drive(old_map, ROUTES_A_PAIR);
@@ -211,6 +197,33 @@ impl Rehearsal<'_> {
         stories.extend(self.takes_over_sensors([old_sensors, left, later]).await);
         drop(controller);
         stories
+    }
+
+    /// The Pipe takes one of ours, whose run then waits for a node.
+    async fn taken_by_a_pipe_that_was_not_stopped(&self) -> u64 {
+        self.old.start_pipe(&[SENSORS, MAP]);
+        let taken = self.submit(MAP).await;
+        self.old.reached(taken, Stage::Accepted, LIMIT).await;
+        self.old.stop_pipe().await;
+        taken
+    }
+
+    async fn held_back(&self, pk: u64) {
+        let is_held = |submission: &Submission| {
+            let status = submission.status.as_ref();
+            status.is_some_and(|status| status.reason.as_deref() == Some(reasons::FOREIGN))
+        };
+        let (name, what) = (submission(pk), "it waits for the old pipeline's run");
+        self.scene.submission(&name, what, LOST, is_held).await;
+    }
+
+    async fn driven_by_the_old_pipeline(&self, pk: u64) -> Story {
+        assert_eq!(self.evalai.submission(pk).status, Status::Submitted);
+        self.old.drive(pk, ROUTES_A_PAIR);
+        let name = "cutover: MAP, taken by a Pipe that was not stopped";
+        let story = self.ended(name, BY_THE_OLD, pk).await;
+        self.finished(pk).await;
+        story
     }
 
     /// The last phase. The Leaderboard is older than what is in flight, so EvalAI has to show that this is under way.

@@ -76,18 +76,8 @@ pub fn run(id: &str, arguments: &[String]) -> io::Result<()> {
         "forge-limit" => forge("notReady", silence),
         "forge-peer" => forge("peerCrashed", protect),
         "forge-stopped" => forge("stopped", protect),
-        "stop-runner" => {
-            kill(Pid::from_raw(1), Signal::SIGTERM)?;
-            loop {
-                thread::park();
-            }
-        }
-        "own-crash" => {
-            mark("crash0")?;
-            // An honest agent that is faster than its simulator's look would end well, and the mark mean nothing.
-            await_simulators_end();
-            Ok(())
-        }
+        "stop-runner" => stop_runner(),
+        "own-crash" => own_crash(),
         "many-crashes" => (0..CRASHES).try_for_each(|number| mark(&format!("crash{number}"))),
         "own-done" => {
             mark("done")?;
@@ -101,10 +91,7 @@ pub fn run(id: &str, arguments: &[String]) -> io::Result<()> {
         "status-sparse" => first_life(|| sparse(Path::new(&status("start1")))),
         "status-pipe" => first_life(|| Ok(mkfifo(Path::new(&status("start1")), Mode::S_IRWXU)?)),
         "folder-shut" => shut(),
-        "folder-listed" => {
-            let logcopy = fs::metadata(RUNNER)?.uid();
-            folders::forbid(&folders::of_agent(pair()), &[logcopy, SIMULATOR]).and_then(|()| exit(1))
-        }
+        "folder-listed" => folder_listed(),
         // One that can be deleted would be seen: the honest agent's run ends well.
         "folder-deleted" => match folders::delete(&folders::of_agent(pair())) {
             Ok(()) => Ok(()),
@@ -117,6 +104,25 @@ pub fn run(id: &str, arguments: &[String]) -> io::Result<()> {
         "own-score" => honest(arguments, "forge").map(|never| match never {}),
         other => Err(io::Error::other(format!("there is no ending {other}"))),
     }
+}
+
+fn stop_runner() -> io::Result<()> {
+    kill(Pid::from_raw(1), Signal::SIGTERM)?;
+    loop {
+        thread::park();
+    }
+}
+
+fn own_crash() -> io::Result<()> {
+    mark("crash0")?;
+    // An honest agent that is faster than its simulator's look would end well, and the mark mean nothing.
+    await_simulators_end();
+    Ok(())
+}
+
+fn folder_listed() -> io::Result<()> {
+    let logcopy = fs::metadata(RUNNER)?.uid();
+    folders::forbid(&folders::of_agent(pair()), &[logcopy, SIMULATOR]).and_then(|()| exit(1))
 }
 
 /// What runs in the background, as `--background NAME`.
