@@ -20,7 +20,7 @@ use super::gate::Gate;
 use super::scene::{Scene, say};
 
 /// What the programs log, unless `LEADERBOARD_TEST_LOG` sets it otherwise.
-const LOG: &str = "info,leaderboard_operator=debug";
+const LOG: &str = "info,leaderboard=debug";
 /// Name of each test's Lease, in its namespace.
 pub const LEASE: &str = "operator";
 /// Between the end of a program and its next start, as the kubelet has it.
