@@ -11,6 +11,7 @@ pub mod controller;
 pub mod crds;
 pub mod kubernetes;
 mod lock;
+pub mod object_key;
 pub mod observability;
 pub mod page;
 pub mod pod;

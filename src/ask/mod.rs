@@ -10,14 +10,12 @@
 //! second read. The last answer stays readable until then, with the question that it answers. A write is no question: nothing may
 //! replace one that is under way.
 
-mod service;
+pub mod question;
 mod state;
 #[cfg(test)]
 mod tests;
 
-use std::fmt::Debug;
 use std::sync::{Arc, Mutex};
-use std::time::Duration;
 
 use futures::StreamExt;
 use futures::stream::FuturesUnordered;
@@ -26,82 +24,11 @@ use tokio::time::Instant;
 use tracing::Instrument;
 
 use crate::lock::lock;
+use crate::object_key::ObjectKey;
 use crate::observability::about::LogSpan;
 use crate::observability::tasks::Tasks;
-use crate::services::ObjectKey;
-pub use service::Service;
+use question::{Ask, Failure, Lookup};
 use state::{State, Work};
-
-/// One kind of question. Everything that makes an older answer useless is part of the question: the attempt, a digest, a stage.
-pub trait Ask: Clone + Debug + PartialEq + Send + 'static {
-    /// What is found.
-    type Answer: Debug + Send + Sync + 'static;
-    /// Reads under way at once.
-    const AT_ONCE: usize;
-    /// Reads under way at once of one bucket, table or server: one that hangs leaves the rest to the others.
-    const AT_ONCE_OF_A_SERVICE: usize;
-    /// Time that one read may take.
-    const LONGEST: Duration;
-
-    /// The service that a read may wait for.
-    fn service(&self) -> Service;
-
-    /// After which pause the question is asked again, counted from its answer; None: the answer is good as long as anybody wants it.
-    /// `failures` counts those in a row.
-    fn again(&self, result: &Result<Self::Answer, Failure>, failures: u32) -> Option<Duration>;
-}
-
-/// Why a question has no answer yet.
-#[derive(Clone, Debug, PartialEq, Eq)]
-pub struct Failure {
-    /// Waiting alone does not help: somebody has to do something.
-    pub is_refused: bool,
-    pub why: String,
-}
-
-/// What is known of an object.
-#[derive(Clone, Debug)]
-pub struct Lookup<Q: Ask> {
-    /// How long the present question has waited; None: it is answered, or there is none.
-    pub waited: Option<Duration>,
-    /// The last answer, which may be one to an older question.
-    pub last: Option<Answered<Q>>,
-}
-
-/// An answer.
-#[derive(Debug)]
-pub struct Answered<Q: Ask> {
-    pub question: Q,
-    /// How long ago the question was sent: the answer shows nothing that has happened since.
-    pub sent_ago: Duration,
-    pub result: Arc<Result<Q::Answer, Failure>>,
-}
-
-impl<Q: Ask> Clone for Answered<Q> {
-    fn clone(&self) -> Self {
-        Self {
-            question: self.question.clone(),
-            sent_ago: self.sent_ago,
-            result: Arc::clone(&self.result),
-        }
-    }
-}
-
-impl<Q: Ask> Default for Lookup<Q> {
-    fn default() -> Self {
-        Self {
-            waited: None,
-            last: None,
-        }
-    }
-}
-
-impl<Q: Ask> Lookup<Q> {
-    /// The last answer, if it is one to this very question.
-    pub fn answer_to(&self, question: &Q) -> Option<&Answered<Q>> {
-        self.last.as_ref().filter(|last| last.question == *question)
-    }
-}
 
 /// Called with the object that has an answer.
 pub type Wake = Box<dyn Fn(&ObjectKey) + Send + Sync>;

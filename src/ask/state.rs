@@ -6,9 +6,9 @@ use std::time::Duration;
 
 use tokio::time::Instant;
 
-use super::{Answered, Ask, Failure, Lookup, Service};
+use super::question::{Answered, Ask, Failure, Lookup, Service};
+use crate::object_key::ObjectKey;
 use crate::observability::about::LogSpan;
-use crate::services::ObjectKey;
 
 /// How long a question is kept that nobody repeats.
 pub(super) const KEPT: Duration = Duration::from_mins(10);

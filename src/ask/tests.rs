@@ -1,9 +1,11 @@
 //! Tests of asking, with a clock that stands still until everything waits.
 
 use std::sync::Arc;
+use std::time::Duration;
 
 use tokio::sync::{mpsc, watch};
 
+use super::question::Service;
 use super::state::KEPT;
 use super::*;
 use crate::observability::shutdown::Stop;

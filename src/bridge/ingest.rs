@@ -14,6 +14,7 @@ use thiserror::Error;
 use tracing::Span;
 
 use super::message::Message;
+use super::route::{NotIngested, Outcome};
 use crate::kubernetes::{CallError, call_within};
 use crate::observability::about;
 use crate::services::evalai::Swept;
@@ -114,44 +115,6 @@ pub enum Ingest {
     IdTaken(String),
 }
 
-/// What was done.
-#[derive(Clone, Debug, PartialEq, Eq)]
-pub enum Outcome {
-    /// A Submission was created.
-    Created,
-    /// Its attempt was raised to this number.
-    Bumped(Attempt),
-    /// The attempt that is asked for does not begin, which is noted.
-    Refused,
-    /// EvalAI's row was run before, and no message has announced that it is to be run again: none is made.
-    NotNew,
-    /// It was known already.
-    Repeat,
-    /// The old one is being deleted: come back when it is gone.
-    Deleting,
-    /// Its present attempt is being stopped: come back when that has ended.
-    Stopping,
-    /// The name belongs to another leaderboard, challenge or phase; the text names them.
-    IdTaken(String),
-}
-
-impl std::fmt::Display for Outcome {
-    fn fmt(&self, f: &mut std::fmt::Formatter<'_>) -> std::fmt::Result {
-        match self {
-            Self::Created => f.write_str("created"),
-            Self::Bumped(attempt) => write!(f, "resumed as attempt {attempt}"),
-            Self::Refused => {
-                f.write_str("it has ended, and no further attempt begins; its condition Stalled shows why")
-            }
-            Self::NotNew => f.write_str("it was run before and no message has announced another run, so none is made"),
-            Self::Repeat => f.write_str("known already"),
-            Self::Deleting => f.write_str("the old one is still being deleted"),
-            Self::Stopping => f.write_str("its present attempt is still being stopped"),
-            Self::IdTaken(owner) => write!(f, "the name is taken by {owner}; rename or delete that"),
-        }
-    }
-}
-
 /// Why nothing could be done.
 #[derive(Debug, Error)]
 pub enum IngestError {
@@ -164,6 +127,15 @@ pub enum IngestError {
     /// Others changed the object each time.
     #[error("Submission {name} changed {ROUNDS} times while it was to be bumped; it is retried")]
     Contended { name: String },
+}
+
+impl From<IngestError> for NotIngested {
+    fn from(error: IngestError) -> Self {
+        match error {
+            IngestError::Refused { text, .. } => Self::Refused(text),
+            IngestError::Call(_) | IngestError::Contended { .. } => Self::Unknown,
+        }
+    }
 }
 
 /// Decides what an incoming submission means for the object of its name, read uncached.
@@ -345,7 +317,7 @@ pub async fn apply(api: &Api<Submission>, leaderboard: &str, incoming: &Incoming
     let mut known = None;
     let outcome = rounds(api, leaderboard, incoming, &mut known).await;
     if let Some(known) = known {
-        about::identify(known.spec.attempt, known.metadata.uid.as_deref().unwrap_or_default());
+        about::identify(known.spec.attempt.0, known.metadata.uid.as_deref().unwrap_or_default());
     }
     // The first line of each attempt.
     match &outcome {

@@ -55,8 +55,8 @@ fn served(all: Vec<Arc<Leaderboard>>, allowed: &Allowed) -> Vec<Arc<Leaderboard>
 #[cfg(test)]
 mod tests {
     use super::*;
-    use crate::bridge::route::tests::{board, with_queue};
     use crate::bridge::sqs::desired;
+    use crate::bridge::tests::{board, with_queue};
 
     #[test]
     fn a_queue_that_a_leaderboard_may_not_name_is_not_read() {

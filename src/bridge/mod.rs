@@ -27,7 +27,6 @@ use crate::kubernetes::{Clients, Namespaces, Shape, spawn_watch};
 use crate::observability::Observability;
 use crate::observability::tasks::TaskFailed;
 use crate::services::aws::Aws;
-use crate::services::meter::Meter;
 use leaderboard_api::Leaderboard;
 use pollers::{Problems, Shared, follow};
 use sqs::{Connection, Pulse, SqsQueue, desired};
@@ -86,7 +85,7 @@ pub async fn run(clients: Clients, aws: Aws, scope: Scope, telemetry: Observabil
     for outcome in route::OUTCOMES {
         telemetry.metrics.messages.total.of([outcome]);
     }
-    let aws = aws.counted_by(Meter::for_metrics(&telemetry.metrics));
+    let aws = aws.counted_by(telemetry.metrics.meter());
     let pulse = Arc::new(pulse(&shared));
     let open = |url: &str, way: &Connection| SqsQueue {
         url: url.to_owned(),

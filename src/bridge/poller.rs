@@ -14,11 +14,11 @@ use tokio::time::Instant;
 use tracing::Instrument;
 
 use super::ages::Ages;
-use super::ingest::{self, Incoming, IngestError, Outcome};
+use super::ingest::{self, Incoming, IngestError};
 use super::leaderboards::Leaderboards;
 use super::message;
 use super::pollers::Shared;
-use super::route::{self, DeadReason, Envelope, Later, MessageOutcome, Rules};
+use super::route::{self, DeadReason, Envelope, Later, MessageOutcome, Outcome, Rules};
 use super::source::{Received, Source, named};
 use crate::backoff::Backoff;
 use crate::kubernetes::call_within;
@@ -238,7 +238,7 @@ impl<S: Source> Poller<S> {
                 let span = ingest::span(&namespace, &leaderboard, incoming.submission);
                 let ingested = self.ingest(&namespace, &leaderboard, &incoming).instrument(span).await;
                 ingested.map_or(MessageOutcome::Lapse, |ingested| {
-                    route::settle(&envelope, &ingested, rules, now_ms())
+                    route::settle(&envelope, &ingested.map_err(Into::into), rules, now_ms())
                 })
             }
             (_, outcome) => outcome,

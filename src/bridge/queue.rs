@@ -4,13 +4,14 @@
 
 use std::time::Duration;
 
+use aws_sdk_sqs::Client;
 use aws_sdk_sqs::config::http::HttpResponse;
 use aws_sdk_sqs::error::{ProvideErrorMetadata, SdkError};
+use aws_sdk_sqs::operation::receive_message::ReceiveMessageOutput;
 use aws_sdk_sqs::types::{
     ChangeMessageVisibilityBatchRequestEntry, DeleteMessageBatchRequestEntry, Message, MessageAttributeValue,
     MessageSystemAttributeName, QueueAttributeName,
 };
-use aws_sdk_sqs::{Client, operation::receive_message::ReceiveMessageOutput};
 use thiserror::Error;
 
 use super::dead_letter::{self, DeadLetter};
@@ -18,6 +19,7 @@ use super::route::DeadReason;
 use super::source::Received;
 use crate::services::fault::{self, Fault};
 use crate::services::meter::Meter;
+use crate::services::metered::Metered;
 
 /// How long a receive waits for a message, in seconds: the longest that SQS allows.
 const LONG_POLL: i32 = 20;

@@ -4,11 +4,8 @@
 
 use std::sync::Arc;
 
-use kube::ResourceExt;
-
-use super::ingest::{IngestError, Outcome};
 use super::message::{Malformed, Message};
-use leaderboard_api::{Foreign, Leaderboard, Queue};
+use leaderboard_api::{Attempt, Foreign, Leaderboard, Queue, ResourceExt};
 
 /// First wait of a message that can't be used yet, in seconds; it doubles with each receive.
 const FIRST_WAIT: i32 = 30;
@@ -243,7 +240,7 @@ pub fn route(
 /// What becomes of a message after its Submission was, or could not be, created or bumped.
 pub fn settle(
     envelope: &Envelope,
-    outcome: &Result<Outcome, IngestError>,
+    outcome: &Result<Outcome, NotIngested>,
     rules: &Rules,
     now_ms: i64,
 ) -> MessageOutcome {
@@ -255,11 +252,11 @@ pub fn settle(
         Ok(Outcome::Stopping) => later(envelope.receives, SHORT_WAIT, Later::Stopping),
         Ok(Outcome::IdTaken(owner)) => MessageOutcome::Dead(DeadReason::IdTaken(owner.clone())),
         // Definitions that are newer or older than this program may refuse what others accept.
-        Err(IngestError::Refused { .. }) if !is_overdue(envelope, rules, now_ms) => {
+        Err(NotIngested::Refused(_)) if !is_overdue(envelope, rules, now_ms) => {
             later(envelope.receives, LONGEST_WAIT, Later::Refused)
         }
-        Err(IngestError::Refused { text, .. }) => MessageOutcome::Dead(DeadReason::Refused(text.clone())),
-        Err(_) => MessageOutcome::Lapse,
+        Err(NotIngested::Refused(text)) => MessageOutcome::Dead(DeadReason::Refused(text.clone())),
+        Err(NotIngested::Unknown) => MessageOutcome::Lapse,
     }
 }
 
@@ -280,6 +277,53 @@ fn later(receives: i32, longest: i32, why: Later) -> MessageOutcome {
     }
 }
 
+/// Why there is no outcome.
+#[derive(Clone, Debug, PartialEq, Eq)]
+pub enum NotIngested {
+    /// The API server refuses the Submission, in its own words.
+    Refused(String),
+    /// It may pass.
+    Unknown,
+}
+
+/// What was done.
+#[derive(Clone, Debug, PartialEq, Eq)]
+pub enum Outcome {
+    /// A Submission was created.
+    Created,
+    /// Its attempt was raised to this number.
+    Bumped(Attempt),
+    /// The attempt that is asked for does not begin, which is noted.
+    Refused,
+    /// EvalAI's row was run before, and no message has announced that it is to be run again: none is made.
+    NotNew,
+    /// It was known already.
+    Repeat,
+    /// The old one is being deleted: come back when it is gone.
+    Deleting,
+    /// Its present attempt is being stopped: come back when that has ended.
+    Stopping,
+    /// The name belongs to another leaderboard, challenge or phase; the text names them.
+    IdTaken(String),
+}
+
+impl std::fmt::Display for Outcome {
+    fn fmt(&self, f: &mut std::fmt::Formatter<'_>) -> std::fmt::Result {
+        match self {
+            Self::Created => f.write_str("created"),
+            Self::Bumped(attempt) => write!(f, "resumed as attempt {attempt}"),
+            Self::Refused => {
+                f.write_str("it has ended, and no further attempt begins; its condition Stalled shows why")
+            }
+            Self::NotNew => f.write_str("it was run before and no message has announced another run, so none is made"),
+            Self::Repeat => f.write_str("known already"),
+            Self::Deleting => f.write_str("the old one is still being deleted"),
+            Self::Stopping => f.write_str("its present attempt is still being stopped"),
+            Self::IdTaken(owner) => write!(f, "the name is taken by {owner}; rename or delete that"),
+        }
+    }
+}
+
 #[cfg(test)]
 #[path = "route_tests.rs"]
-pub(super) mod tests;
+mod tests;

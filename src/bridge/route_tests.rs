@@ -1,16 +1,14 @@
 //! Tables of what becomes of each message.
 
 use std::collections::BTreeSet;
-use std::time::Duration;
 
 use serde_json::json;
 
 use super::*;
-use crate::kubernetes::CallError;
 use leaderboard_api::Attempt;
 
 /// A Leaderboard of challenge 1 with phases 2 and 3, created at this second.
-pub(in crate::bridge) fn board(name: &str, second: i64) -> Leaderboard {
+fn board(name: &str, second: i64) -> Leaderboard {
     let created = jiff::Timestamp::from_second(second).unwrap().to_string();
     serde_json::from_value(json!({
         "apiVersion": "leaderboard.carla.org/v1alpha1",
@@ -28,7 +26,7 @@ pub(in crate::bridge) fn board(name: &str, second: i64) -> Leaderboard {
     .unwrap()
 }
 
-pub(in crate::bridge) fn with_queue(mut board: Leaderboard, url: &str) -> Arc<Leaderboard> {
+fn with_queue(mut board: Leaderboard, url: &str) -> Arc<Leaderboard> {
     board.spec.queue = Some(serde_json::from_value(json!({"url": url})).unwrap());
     Arc::new(board)
 }
@@ -271,25 +269,8 @@ fn a_message_whose_submission_cannot_run_is_given_up_and_one_whose_row_is_hidden
 
 #[test]
 fn each_outcome_of_ingest_settles_its_message() {
-    let refused = || {
-        Err(IngestError::Refused {
-            name: "submission-7".into(),
-            text: "spec.image is wrong".into(),
-        })
-    };
-    let timeout = || {
-        Err(IngestError::Call(CallError::Silent {
-            what: "the creation",
-            object: "Submission submission-7".into(),
-            limit: Duration::from_secs(8),
-        }))
-    };
-    let contended = || {
-        Err(IngestError::Contended {
-            name: "submission-7".into(),
-        })
-    };
-    let cases: Vec<(Result<Outcome, IngestError>, i64, MessageOutcome)> = vec![
+    let refused = || Err(NotIngested::Refused("spec.image is wrong".into()));
+    let cases: Vec<(Result<Outcome, NotIngested>, i64, MessageOutcome)> = vec![
         (Ok(Outcome::Created), 0, MessageOutcome::Delete(Done::Created)),
         (Ok(Outcome::Bumped(Attempt(2))), 0, MessageOutcome::Delete(Done::Bumped)),
         (Ok(Outcome::Repeat), 0, MessageOutcome::Delete(Done::Repeat)),
@@ -307,8 +288,7 @@ fn each_outcome_of_ingest_settles_its_message() {
             901,
             MessageOutcome::Dead(DeadReason::Refused("spec.image is wrong".into())),
         ),
-        (timeout(), 90_000, MessageOutcome::Lapse),
-        (contended(), 90_000, MessageOutcome::Lapse),
+        (Err(NotIngested::Unknown), 90_000, MessageOutcome::Lapse),
     ];
     let rules = rules(&one());
     for (outcome, age, want) in cases {

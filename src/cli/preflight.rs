@@ -109,7 +109,7 @@ async fn unready(http: &reqwest::Client, address: SocketAddr) -> Option<String> 
         // A Service without a ready Pod refuses, or does not answer.
         Err(error) => Some(format!(
             "no replica is ready: {}; see the log of its Pods",
-            client_errors::chain(&error)
+            leaderboard_api::text::chain(&error)
         )),
     }
 }

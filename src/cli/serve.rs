@@ -13,6 +13,7 @@ use crate::bridge;
 use crate::controller::runtime as run;
 use crate::controller::runtime::leader::{self, Identity};
 use crate::controller::settings::Settings;
+use crate::controller::submissions::job_spec::OwnImage;
 use crate::kubernetes::{Clients, Namespaces, watch_client};
 use crate::observability::health::HealthServer;
 use crate::observability::logging::{self, Format};
@@ -22,9 +23,11 @@ use crate::observability::shutdown::on_signals;
 use crate::observability::traces::otlp;
 use crate::observability::{Observability, REVISION};
 use crate::page::Page;
-use crate::pod::places::{Pace, Places, Setting};
+use crate::pod::judge::Pace;
+use crate::pod::places::{Places, Setting};
+use crate::pod::run::ENV_CHECKSUMS;
 use crate::pod::{logcopy as logcopy_program, ownlog, workspace as workspace_program};
-use crate::services::aws::{Aws, ENV_CHECKSUMS};
+use crate::services::aws::Aws;
 use leaderboard_api::client_errors;
 use leaderboard_api::names::OPERATOR;
 
@@ -51,7 +54,7 @@ pub(super) fn bridge(options: Server) -> ExitCode {
 }
 
 pub(super) fn workspace(options: &InPod) -> ExitCode {
-    ownlog::start(&Places::below(&options.root).logs, ownlog::WORKSPACE_LOG);
+    ownlog::start(&Places::below(&options.root).logs, crate::pod::keys::WORKSPACE_LOG);
     start_logged("workspace", THREADS_IN_POD, || async {
         let setting = setting(options)?;
         workspace_program::main(setting).await.map_err(|e| e.to_string())
@@ -60,7 +63,7 @@ pub(super) fn workspace(options: &InPod) -> ExitCode {
 
 pub(super) fn logcopy(options: &InPod) -> ExitCode {
     // Its log is one of the results as well.
-    ownlog::start(&Places::below(&options.root).logs, ownlog::OWN_LOG);
+    ownlog::start(&Places::below(&options.root).logs, crate::pod::keys::OWN_LOG);
     start_logged("logcopy", THREADS_IN_POD, || async {
         let setting = setting(options)?;
         let stop = on_signals().map_err(|e| e.to_string())?;
@@ -135,10 +138,12 @@ async fn lead(options: Controller) -> Result<(), String> {
     let lease = options.scope.lease(identity);
     let aws = Aws::load("controller").await;
     let settings = Settings {
-        image: options.image,
-        image_pull_policy: options.image_pull_policy,
-        region: aws.region(),
-        checksums: std::env::var(ENV_CHECKSUMS).ok(),
+        own: OwnImage {
+            image: options.image,
+            pull_policy: options.image_pull_policy,
+            region: aws.region(),
+            checksums: std::env::var(ENV_CHECKSUMS).ok(),
+        },
         operator: lease.installation(),
         namespaces: Namespaces::of(options.server.namespaces),
         has_cluster_rights: options.scope.cluster_rights,

@@ -4,11 +4,11 @@
 //! Its name holds the hash of what it asks for: a template cannot be edited under the Jobs that are running.
 
 use kube::core::{ApiResource, DynamicObject, GroupVersionKind};
-use leaderboard_api::{ClaimOf, GpuSource, Leaderboard, LeaderboardSpec};
 use serde_json::{Value, json};
 use sha2::{Digest, Sha256};
 
-use super::objects::child_of;
+use crate::controller::owner::child_of;
+use leaderboard_api::{ClaimOf, GpuSource, Leaderboard, LeaderboardSpec};
 
 /// Bytes of the hash in a name.
 const HASH_BYTES: usize = 5;

@@ -8,6 +8,7 @@ pub mod gpu_claims;
 pub mod leaderboards;
 pub mod network_policy;
 pub mod objects;
+pub mod owner;
 pub mod runtime;
 pub mod settings;
 pub mod slots;

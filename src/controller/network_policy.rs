@@ -12,7 +12,7 @@ use k8s_openapi::api::networking::v1::{
 use k8s_openapi::apimachinery::pkg::apis::meta::v1::LabelSelector;
 use k8s_openapi::apimachinery::pkg::util::intstr::IntOrString;
 
-use super::objects::child_of;
+use crate::controller::owner::child_of;
 use leaderboard_api::ranges::{self, Range};
 use leaderboard_api::{Dns, Egress, Leaderboard, names};
 

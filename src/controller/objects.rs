@@ -1,15 +1,13 @@
 //! What is read off any object: its key, its owner, and what marks it as ours. Pure.
 
-use std::collections::BTreeMap;
 use std::fmt;
 
-use k8s_openapi::apimachinery::pkg::apis::meta::v1::{ObjectMeta, OwnerReference};
 use kube::runtime::reflector::ObjectRef;
 use kube::{Resource, ResourceExt};
 use tracing::Span;
 
+use crate::object_key::ObjectKey;
 use crate::observability::about::{self, LogSpan};
-use crate::services::ObjectKey;
 use leaderboard_api::{Leaderboard, Submission, names};
 
 /// Puts an object into its work queue.
@@ -50,7 +48,7 @@ pub fn span_of(submission: &Submission) -> Span {
     about::submission(
         full_name(submission),
         &spec.leaderboard_name,
-        submission.present_attempt(),
+        submission.present_attempt().0,
         uid(submission),
     )
 }
@@ -61,7 +59,7 @@ pub fn log_span_of(submission: &Submission) -> LogSpan {
     LogSpan::of(
         full_name(submission),
         &spec.leaderboard_name,
-        submission.present_attempt(),
+        submission.present_attempt().0,
         uid(submission),
     )
 }
@@ -70,33 +68,6 @@ fn full_name(submission: &Submission) -> impl fmt::Display {
     let meta = &submission.metadata;
     let (namespace, name) = (meta.namespace.as_deref(), meta.name.as_deref());
     fmt::from_fn(move |f| write!(f, "{}/{}", namespace.unwrap_or_default(), name.unwrap_or_default()))
-}
-
-/// The reference by which a child goes with its owner.
-pub fn owner_reference<K: Resource<DynamicType = ()>>(owner: &K) -> OwnerReference {
-    OwnerReference {
-        api_version: K::api_version(&()).into_owned(),
-        kind: K::kind(&()).into_owned(),
-        name: owner.meta().name.clone().unwrap_or_default(),
-        uid: uid_of(owner),
-        controller: Some(true),
-        block_owner_deletion: Some(true),
-    }
-}
-
-/// The metadata of an object that the operator makes for a Leaderboard.
-pub fn child_of(leaderboard: &Leaderboard, name: String) -> ObjectMeta {
-    let of = leaderboard.metadata.name.clone().unwrap_or_default();
-    ObjectMeta {
-        name: Some(name),
-        namespace: leaderboard.metadata.namespace.clone(),
-        labels: Some(BTreeMap::from([
-            (names::LABEL_MANAGED_BY.into(), names::OPERATOR.into()),
-            (names::LABEL_LEADERBOARD.into(), of),
-        ])),
-        owner_references: Some(vec![owner_reference(leaderboard)]),
-        ..ObjectMeta::default()
-    }
 }
 
 /// The Leaderboard that a Submission names.

@@ -1,19 +1,14 @@
 //! What the command line sets.
 
 use crate::allowed::Allowed;
+use crate::controller::submissions::job_spec::OwnImage;
 use crate::kubernetes::Namespaces;
 
 /// Settings that come from the command line.
 #[derive(Clone, Debug)]
 pub struct Settings {
-    /// The operator's own image, which Pods use for `workspace` and `logcopy`.
-    pub image: String,
-    /// Pull policy of that image.
-    pub image_pull_policy: Option<String>,
-    /// AWS region of the operator, handed on to Pods.
-    pub region: Option<String>,
-    /// When S3 is sent checksums, as the operator's environment has it; handed on to Pods.
-    pub checksums: Option<String>,
+    /// What Pods get of the operator.
+    pub own: OwnImage,
     /// Name of this installation, `<namespace>/<name>` of its Lease.
     pub operator: String,
     /// Which namespaces are served.

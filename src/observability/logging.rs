@@ -31,7 +31,7 @@ pub enum Format {
 /// Why logging could not be set up.
 #[derive(Debug, thiserror::Error)]
 pub enum LoggingError {
-    #[error("the log filter {filter:?} can't be read: {source}; write for example info,leaderboard_operator=debug")]
+    #[error("the log filter {filter:?} can't be read: {source}; write for example info,leaderboard=debug")]
     Filter { filter: String, source: ParseError },
     #[error("logging was set up twice in this process")]
     Twice,
@@ -76,6 +76,8 @@ where
 
 #[cfg(test)]
 pub(crate) mod tests {
+    use super::super::about;
+    use super::super::trace_id::TraceId;
     use super::*;
     use std::io::Write;
     use std::sync::{Arc, Mutex};
@@ -264,10 +266,10 @@ pub(crate) mod tests {
     #[test]
     fn no_log_line_dumps_a_data_structure() {
         let mut found = Vec::new();
-        sources(
-            &std::path::Path::new(env!("CARGO_MANIFEST_DIR")).join("src"),
-            &mut found,
-        );
+        let root = std::path::Path::new(env!("CARGO_MANIFEST_DIR"));
+        for folder in ["src", "crates"] {
+            sources(&root.join(folder), &mut found);
+        }
         let mut dumps = Vec::new();
         for path in found {
             let text = std::fs::read_to_string(&path).unwrap();
@@ -280,5 +282,40 @@ pub(crate) mod tests {
             );
         }
         assert!(dumps.is_empty(), "write it with % or as a text:\n{}", dumps.join("\n"));
+    }
+
+    #[test]
+    fn work_of_another_task_logs_with_the_fields_of_who_asked_for_it() {
+        let lines = Lines::default();
+        let _guard = lines.collect();
+        let log = about::LogSpan::of("ns/one", "carla", 2, "uid");
+        tracing::warn!("nothing is known");
+        log.span().in_scope(|| tracing::warn!(why = "slow", "late"));
+        let found = lines.take_json();
+        assert_eq!(found.len(), 2);
+        assert_eq!(found[0].get("submission"), None);
+        let fields = ["submission", "leaderboard", "attempt", "trace_id", "why", "message"].map(|name| &found[1][name]);
+        let trace = TraceId::of("uid").to_string();
+        let expected = serde_json::json!(["ns/one", "carla", 2, trace, "slow", "late"]);
+        assert_eq!(serde_json::json!(fields), expected);
+    }
+
+    #[test]
+    fn what_comes_in_is_identified_once_its_object_is_known() {
+        let lines = Lines::default();
+        let _guard = lines.collect();
+        about::incoming("ns/one", "carla").in_scope(|| {
+            tracing::info!("before");
+            about::identify(3, "uid");
+            tracing::info!("after");
+        });
+        let found = lines.take_json();
+        assert_eq!((found[0].get("attempt"), found[0].get("trace_id")), (None, None));
+        assert_eq!(found[0]["submission"], "ns/one");
+        assert_eq!(
+            (&found[1]["attempt"], &found[1]["submission"]),
+            (&3.into(), &"ns/one".into())
+        );
+        assert_eq!(found[1]["trace_id"], TraceId::of("uid").to_string());
     }
 }

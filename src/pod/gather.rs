@@ -8,15 +8,17 @@ use std::collections::BTreeMap;
 use std::path::PathBuf;
 use std::sync::Arc;
 
-use leaderboard_results::{Checkpoint, Files, Merged, Plan, Refusal, Slice, Strictness, read_worker};
-use leaderboard_runner::protocol::{KEPT_CHECKPOINT, Pair, Progress};
+use bytes::Bytes;
+use sha2::{Digest, Sha256};
 
 use super::keys::{EVALAI, MERGED, checkpoint_path};
 use super::report::{ReportPair, StoredFile};
-use super::run::{Run, STATUS_FOLDER, results_format};
+use super::run::{Run, STATUS_FOLDER};
 use super::tree::{Stamp, Tree, TreeError};
-use super::upload::Object;
+use crate::pod::carla::results_format;
 use leaderboard_api::{PairState, Verify};
+use leaderboard_results::{Checkpoint, Files, Merged, Plan, Refusal, Slice, Strictness, read_worker};
+use leaderboard_runner::protocol::{KEPT_CHECKPOINT, Pair, Progress};
 
 /// The merged file under EvalAI's name.
 const METADATA: &str = "evalai/metadata.json";
@@ -493,4 +495,25 @@ impl Worker {
 /// Which checkpoint, why, and what to do.
 fn reason(refusal: &Refusal) -> String {
     format!("{refusal}. {}", refusal.next_step())
+}
+
+/// A result that is stored from memory. Its content is shared, never copied.
+#[derive(Clone, Debug, PartialEq, Eq)]
+pub struct Object {
+    /// Its content.
+    pub bytes: Bytes,
+    /// Size and digest of it.
+    pub digest: StoredFile,
+}
+
+impl Object {
+    /// With its digest.
+    pub fn new(bytes: impl Into<Bytes>) -> Self {
+        let bytes = bytes.into();
+        let digest = StoredFile {
+            size: bytes.len() as u64,
+            sha256: hex::encode(Sha256::digest(&bytes)),
+        };
+        Self { bytes, digest }
+    }
 }

@@ -2,7 +2,6 @@
 //!
 //! Used by all programs of the Pod that read, store or count files.
 
-use super::ownlog::OWN_LOG;
 use super::run::console;
 use leaderboard_runner::protocol::Pair;
 
@@ -12,6 +11,13 @@ pub const MERGED: &str = "agent/agent_results.json";
 pub const EVALAI: &str = "evalai/";
 /// Before the key of a refused checkpoint: no agent can put a file of its own there.
 pub const REFUSED: &str = "logcopy/refused/";
+
+/// The log of logcopy, below the root of the `logs` volume.
+pub const OWN_LOG: &str = "logcopy/logcopy.log";
+/// The log of `workspace`.
+pub const WORKSPACE_LOG: &str = "logcopy/workspace.log";
+/// What the host's contents print; the runner writes it.
+pub const CONTENTS_LOG: &str = "contents/contents.log";
 
 /// The folder of an agent, without a slash at its end.
 pub fn agent_folder(pair: Pair) -> String {

@@ -12,7 +12,6 @@ use std::path::Path;
 use std::sync::Arc;
 use std::time::{Duration, Instant};
 
-use leaderboard_runner::protocol::StatusFile;
 use tokio::sync::watch;
 use tokio::task::JoinHandle;
 
@@ -32,6 +31,7 @@ use crate::observability::tasks::{TaskFailed, Tasks};
 use crate::services::archive::{Archive, ArchiveError};
 use crate::services::aws::Aws;
 use crate::services::logs::LogClient;
+use leaderboard_runner::protocol::StatusFile;
 use round::{News, Rounds, Why};
 
 /// Longest last flush after SIGTERM; the Pod's grace is 600 s and the containers had their part of it.
@@ -254,8 +254,10 @@ mod tests {
     use std::future::{pending, ready};
     use std::sync::mpsc;
 
+    use aws_config::{BehaviorVersion, Region};
+    use aws_credential_types::Credentials;
+
     use super::*;
-    use crate::controller::fixtures;
     use crate::pod::upload::Haste;
     use crate::pod::upload::send::Window;
     use crate::pod::upload::wanted::Wanted;
@@ -286,6 +288,17 @@ mod tests {
         assert_eq!(began.elapsed(), LANDING);
         assert_eq!(unless_stopped(round_of(3600), pending()).await, Some(3600));
     }
+    async fn aws(endpoint: &str) -> Aws {
+        let config = aws_config::defaults(BehaviorVersion::latest())
+            .http_client(aws_smithy_http_client::Builder::new().build_http())
+            .region(Region::new("us-east-1"))
+            .credentials_provider(Credentials::new("test", "test", None, None, "tests"))
+            .endpoint_url(endpoint)
+            .load()
+            .await;
+        Aws::from_config(config)
+    }
+
     #[tokio::test]
     async fn a_disk_that_hangs_does_not_hide_the_stop() {
         let folder = tempfile::tempdir().unwrap();
@@ -302,7 +315,7 @@ mod tests {
         let stamp = tree.file("agent/agent1/log").unwrap().unwrap().1;
         // Nothing is stored here, only how the file is read is tested.
         let nowhere = "http://127.0.0.1:9";
-        let s3 = fixtures::aws(nowhere).await.s3(None, Some(nowhere));
+        let s3 = aws(nowhere).await.s3(None, Some(nowhere));
         let mut uploader = Uploader::new(Archive::new(s3, "b", ""), Arc::clone(&tree), Quota::new(1 << 20, 1));
         let (_end, ending) = shutdown::Stop::new();
         let tasks = Tasks::new(ending);

@@ -4,6 +4,7 @@
 //! are read. The programs know S3 and the Pod's volumes; they know no Kubernetes API, no EvalAI and no DynamoDB.
 #![cfg_attr(not(test), deny(clippy::indexing_slicing, clippy::arithmetic_side_effects))]
 
+pub mod carla;
 pub mod daily;
 #[cfg(test)]
 #[path = "tests/fixtures.rs"]
@@ -13,6 +14,7 @@ pub mod identity;
 pub mod isolation;
 pub mod judge;
 pub mod keys;
+pub mod layout;
 pub mod logcopy;
 mod name_files;
 pub mod ownlog;
@@ -23,6 +25,7 @@ pub mod schema;
 pub mod ship;
 pub mod tree;
 pub mod upload;
+pub mod verdict;
 pub mod watch;
 pub mod workspace;
 

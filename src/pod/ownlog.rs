@@ -11,12 +11,6 @@ use std::sync::Mutex;
 use tracing_subscriber::EnvFilter;
 use tracing_subscriber::fmt::writer::MakeWriterExt;
 
-/// logcopy's, below the root of the `logs` volume.
-pub const OWN_LOG: &str = "logcopy/logcopy.log";
-/// workspace's.
-pub const WORKSPACE_LOG: &str = "logcopy/workspace.log";
-/// What the host's contents print; the runner writes it.
-pub const CONTENTS_LOG: &str = "contents/contents.log";
 /// Bytes it may have.
 const LIMIT: u64 = 16 << 20;
 /// The last line: there is more than this file holds.

@@ -4,13 +4,13 @@
 
 use std::net::{IpAddr, SocketAddr};
 use std::path::{Path, PathBuf};
-use std::time::Duration;
 
 use super::run::{
     ENV_POD_UID, ENV_ROLE_ARN, ENV_RUN, IDENTITY, IDENTITY_TOKEN_FILE, LOGS, PODINFO, RUNNER, RUNNER_IN_IMAGE, Run,
     SCHEMA, STATUS_FOLDER, STOP_FILE, TOOLS,
 };
 use super::schema::is_read;
+use crate::pod::judge::Pace;
 
 /// Files and folders.
 #[derive(Clone, Debug, PartialEq, Eq)]
@@ -59,61 +59,6 @@ impl Places {
     /// The status files' root.
     pub fn status(&self) -> PathBuf {
         self.logs.join(STATUS_FOLDER)
-    }
-}
-
-/// How long the programs wait for what they cannot observe.
-#[derive(Clone, Copy, Debug, PartialEq, Eq)]
-pub struct Pace {
-    /// From complete results to the end, when an agent does not report that it is done.
-    pub settle: Duration,
-    /// Without a change in the agents' folders, they count as stopped.
-    pub quiet: Duration,
-    /// From a cancel to the last round, when they are never quiet: the runner's grace and a margin.
-    pub grace: Duration,
-    /// Smallest time between two rounds.
-    pub least: Duration,
-    /// Longest pause after rounds that failed.
-    pub backoff: Duration,
-    /// Shortest time that logs get in a round of a running run.
-    pub logs: Duration,
-    /// What a file that is being sent gets beyond the time for logs in a round: the next report waits that long at most.
-    pub in_air: Duration,
-    /// How long a network plugin may take until it enforces the policy of a new Pod.
-    pub enforced_within: Duration,
-}
-
-impl Default for Pace {
-    fn default() -> Self {
-        Self {
-            settle: Duration::from_secs(30),
-            quiet: Duration::from_secs(5),
-            grace: Duration::from_secs(25),
-            least: Duration::from_secs(1),
-            backoff: Duration::from_mins(1),
-            logs: Duration::from_secs(10),
-            in_air: Duration::from_mins(1),
-            enforced_within: Duration::from_mins(1),
-        }
-    }
-}
-
-impl Pace {
-    /// All times divided: for runs that take seconds.
-    #[must_use]
-    pub fn faster(self, times: u32) -> Self {
-        let part = |whole: Duration| whole.checked_div(times).unwrap_or(whole);
-        Self {
-            settle: part(self.settle),
-            quiet: part(self.quiet),
-            grace: part(self.grace),
-            least: part(self.least),
-            backoff: part(self.backoff),
-            // A network gets no faster.
-            logs: self.logs,
-            in_air: self.in_air,
-            enforced_within: part(self.enforced_within),
-        }
     }
 }
 

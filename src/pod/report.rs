@@ -5,10 +5,12 @@
 
 use std::collections::BTreeMap;
 
-use leaderboard_api::text::one_line;
+use jiff::Timestamp;
 use serde::{Deserialize, Serialize};
+use sha2::{Digest, Sha256};
 
 use super::schema::is_read;
+use leaderboard_api::text::one_line;
 use leaderboard_api::{Attempt, PairState};
 
 /// Key of the report below the run's prefix.
@@ -226,4 +228,36 @@ impl Report {
     pub fn belongs_to(&self, uid: &str, attempt: Attempt) -> bool {
         self.submission_uid == uid && self.attempt == attempt
     }
+}
+
+/// Tells one stored object from another by its bytes.
+#[derive(Clone, Copy, Debug, Default, PartialEq, Eq)]
+pub struct ContentId([u8; 16]);
+
+impl ContentId {
+    pub fn of(bytes: &[u8]) -> Self {
+        let mut id = [0; 16];
+        id.copy_from_slice(&Sha256::digest(bytes)[..16]);
+        Self(id)
+    }
+}
+
+/// Until when what cannot be read is waited for. After that it is left out.
+#[derive(Clone, Copy, Debug, PartialEq, Eq)]
+pub struct Patience {
+    /// Texts that are of another round than the report: they hardly change.
+    pub unfit: Timestamp,
+    /// Texts that the bucket does not give out.
+    pub unread: Timestamp,
+    /// The report itself.
+    pub report: Timestamp,
+}
+
+impl Patience {
+    /// Nothing is left out.
+    pub const ENDLESS: Self = Self {
+        unfit: Timestamp::MAX,
+        unread: Timestamp::MAX,
+        report: Timestamp::MAX,
+    };
 }

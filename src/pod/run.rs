@@ -4,8 +4,7 @@
 
 use serde::{Deserialize, Serialize};
 
-use leaderboard_api::{Attempt, Enforcement, LeaderboardVersion, LogGroup, RunPlan, Verify};
-use leaderboard_results::Format;
+use leaderboard_api::{Attempt, Enforcement, LogGroup, RunPlan, Verify};
 use leaderboard_runner::protocol::Pair;
 
 /// Environment variable with the JSON of [`Run`].
@@ -46,14 +45,6 @@ pub fn console_name(pair: Pair) -> String {
 /// The same below the `logs` volume, and below the run's prefix.
 pub fn console(pair: Pair) -> String {
     format!("simulator/{}", console_name(pair))
-}
-
-/// The format of the results of a version.
-pub fn results_format(version: LeaderboardVersion) -> Format {
-    match version {
-        LeaderboardVersion::V1 => Format::V1,
-        LeaderboardVersion::V2 => Format::V2,
-    }
 }
 
 /// One attempt of one submission, as its Pod needs to know it.
@@ -135,3 +126,6 @@ impl Stop {
             .find(|s| s.as_str() == text.trim())
     }
 }
+
+/// Variable of the SDK that says when S3 is sent a checksum: `when_supported`, or `when_required` for stores that know none.
+pub const ENV_CHECKSUMS: &str = "AWS_REQUEST_CHECKSUM_CALCULATION";

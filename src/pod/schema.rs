@@ -17,7 +17,7 @@ mod tests {
     use super::*;
     use crate::pod::report::{OWNER_SCHEMA, Owner, Report, ReportError, SCHEMA as REPORT_SCHEMA};
     use crate::pod::run::{Run, SCHEMA as RUN_SCHEMA};
-    use crate::pod::workspace::{NotAVerdict, VERDICT_SCHEMA, WorkspaceReason, WorkspaceVerdict};
+    use crate::pod::verdict::{NotAVerdict, VERDICT_SCHEMA, WorkspaceReason, WorkspaceVerdict};
     use leaderboard_api::Attempt;
 
     const REPORT_1: &str = include_str!("golden/report-1.json");

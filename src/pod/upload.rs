@@ -16,12 +16,10 @@ use std::io;
 use std::os::unix::fs::FileExt;
 use std::time::Duration;
 
-use hyper::body::Bytes;
 use serde::{Deserialize, Serialize};
 use sha2::{Digest, Sha256};
 
 use super::daily::Daily;
-use super::report::StoredFile;
 use super::tree::{Stamp, Tree, TreeError};
 use crate::services::archive::MIN_PART;
 
@@ -66,27 +64,6 @@ impl Stored {
 
     fn is_unknown(&self) -> bool {
         self.stamp.inode == 0 && self.etag.is_none() && self.fingerprint.is_empty()
-    }
-}
-
-/// A result that is stored from memory. Its content is shared, never copied.
-#[derive(Clone, Debug, PartialEq, Eq)]
-pub struct Object {
-    /// Its content.
-    pub bytes: Bytes,
-    /// Size and digest of it.
-    pub digest: StoredFile,
-}
-
-impl Object {
-    /// With its digest.
-    pub fn new(bytes: impl Into<Bytes>) -> Self {
-        let bytes = bytes.into();
-        let digest = StoredFile {
-            size: bytes.len() as u64,
-            sha256: hex::encode(Sha256::digest(&bytes)),
-        };
-        Self { bytes, digest }
     }
 }
 

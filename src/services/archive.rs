@@ -13,11 +13,11 @@ use aws_sdk_s3::error::{ProvideErrorMetadata, SdkError};
 use aws_sdk_s3::primitives::ByteStream;
 use futures::stream::{self, StreamExt, TryStreamExt};
 use hyper::body::Bytes;
-use sha2::{Digest, Sha256};
 use tokio::io::AsyncWriteExt;
 
 use crate::services::aws::Aws;
 use crate::services::meter::Meter;
+use crate::services::metered::Metered;
 use leaderboard_api::{RunId, Storage, effective};
 
 pub use error::{ArchiveError, Cause};
@@ -41,18 +41,6 @@ pub struct Archive {
     prefix: String,
     meter: Meter,
     keeping: Keeping,
-}
-
-/// Tells one stored object from another by its bytes.
-#[derive(Clone, Copy, Debug, Default, PartialEq, Eq)]
-pub struct ContentId([u8; 16]);
-
-impl ContentId {
-    pub fn of(bytes: &[u8]) -> Self {
-        let mut id = [0; 16];
-        id.copy_from_slice(&Sha256::digest(bytes)[..16]);
-        Self(id)
-    }
 }
 
 /// An object with its content.

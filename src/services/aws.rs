@@ -9,13 +9,12 @@ use std::time::Duration;
 use aws_config::retry::RetryConfig;
 use aws_config::{AppName, BehaviorVersion, Region, SdkConfig};
 use aws_sdk_s3::config::{RequestChecksumCalculation, ResponseChecksumValidation};
-use aws_smithy_http_client::tls::{Provider, rustls_provider::CryptoMode};
+use aws_smithy_http_client::tls::Provider;
+use aws_smithy_http_client::tls::rustls_provider::CryptoMode;
 
 use super::meter::Meter;
 use leaderboard_api::names::OPERATOR;
 
-/// Variable of the SDK that says when S3 is sent a checksum: `when_supported`, or `when_required` for stores that know none.
-pub const ENV_CHECKSUMS: &str = "AWS_REQUEST_CHECKSUM_CALCULATION";
 /// Where nothing sets the region.
 pub const USUAL_REGION: &str = "us-east-1";
 /// Time an AWS call may take, with its retries.

@@ -6,7 +6,6 @@ use std::error::Error;
 
 use aws_sdk_sqs::config::http::HttpResponse;
 use aws_sdk_sqs::error::{ProvideErrorMetadata, SdkError};
-use leaderboard_api::client_errors;
 
 /// The kinds of failure that callers treat differently.
 #[derive(Clone, Copy, Debug, PartialEq, Eq, Hash)]
@@ -122,7 +121,7 @@ where
             None => format!("{code} (HTTP {})", answer.raw().status().as_u16()),
         };
     }
-    client_errors::chain(error)
+    leaderboard_api::text::chain(error)
 }
 
 #[cfg(test)]

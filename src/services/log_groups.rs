@@ -11,6 +11,7 @@ use aws_sdk_cloudwatchlogs::types::LogGroup as Described;
 use super::aws::Aws;
 use super::fault::{self, Fault};
 use super::meter::Meter;
+use crate::services::metered::Metered;
 use leaderboard_api::LogGroup;
 
 /// Why a log group is not as the Leaderboard wants it.

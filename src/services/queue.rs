@@ -7,6 +7,7 @@ use aws_sdk_sqs::types::QueueAttributeName;
 
 use super::aws::Aws;
 use super::fault::{self, Fault};
+use crate::services::metered::Metered;
 use leaderboard_api as api;
 
 /// Why a queue could not be checked.

@@ -27,6 +27,7 @@ pub use recorder::Recorder;
 use crate::services::aws::Aws;
 use crate::services::fault::{self, Fault};
 use crate::services::meter::Meter;
+use crate::services::metered::Metered;
 use leaderboard_api as api;
 
 /// Column with the attempt, a number.

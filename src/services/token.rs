@@ -11,25 +11,8 @@ use jiff::{SignedDuration, Timestamp};
 use serde_json::{Map, Value};
 use sha2::{Digest, Sha256};
 
-use super::aws::Aws;
-use super::fault;
-
 /// How long before its end a token's renewal is asked for.
 const WARN_BEFORE: SignedDuration = SignedDuration::from_hours(30 * 24);
-
-/// Where a token comes from.
-#[derive(Clone, PartialEq, Eq)]
-pub enum TokenSource {
-    /// The text of a key of a Kubernetes Secret, already read.
-    Literal(String),
-    /// A key of a JSON object in AWS Secrets Manager.
-    SecretsManager {
-        id: String,
-        key: String,
-        region: Option<String>,
-        endpoint: Option<String>,
-    },
-}
 
 /// The scheme before the token in the `Authorization` header.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
@@ -69,52 +52,6 @@ pub enum TokenError {
     /// The entry holds no such key.
     #[error("the entry {id} of Secrets Manager has no text under the key {key}; check token.secretsManager.key")]
     NoKey { id: String, key: String },
-}
-
-impl TokenSource {
-    /// Reads the token. Only Secrets Manager needs the network.
-    pub async fn read(&self, aws: &Aws) -> Result<Token, TokenError> {
-        match self {
-            Self::Literal(text) => Token::parse(text),
-            Self::SecretsManager {
-                id,
-                key,
-                region,
-                endpoint,
-            } => {
-                let text = secret_text(aws, id, region.as_deref(), endpoint.as_deref()).await;
-                let text = text.map_err(|why| TokenError::Unreadable { id: id.clone(), why })?;
-                Token::parse(&entry(id, key, &text)?)
-            }
-        }
-    }
-}
-
-impl fmt::Debug for TokenSource {
-    fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
-        match self {
-            Self::Literal(_) => f.write_str("Literal(…)"),
-            Self::SecretsManager { id, key, .. } => write!(f, "SecretsManager({id}, {key})"),
-        }
-    }
-}
-
-/// The text of an entry of Secrets Manager; an error shows what the service has answered.
-async fn secret_text(aws: &Aws, id: &str, region: Option<&str>, endpoint: Option<&str>) -> Result<String, String> {
-    let request = aws.secrets(region, endpoint).get_secret_value().secret_id(id).send();
-    let answer = aws.meter().aws("secretsmanager", "GetSecretValue", request).await;
-    let answer = answer.map_err(|error| fault::sentence(&error))?;
-    Ok(answer.secret_string().unwrap_or_default().to_owned())
-}
-
-/// The text under a key of the entry's JSON object.
-fn entry(id: &str, key: &str, text: &str) -> Result<String, TokenError> {
-    let fields: Map<String, Value> = serde_json::from_str(text).unwrap_or_default();
-    let found = fields.get(key).and_then(Value::as_str).map(str::to_owned);
-    found.ok_or_else(|| TokenError::NoKey {
-        id: id.into(),
-        key: key.into(),
-    })
 }
 
 impl Token {
@@ -297,21 +234,5 @@ mod tests {
     fn the_value_is_in_no_debug() {
         let token = Token::parse("local-host-token").unwrap();
         assert_eq!(format!("{token:?}"), "Token { scheme: Bearer, expires: None, .. }");
-        assert_eq!(
-            format!("{:?}", TokenSource::Literal("local-host-token".into())),
-            "Literal(…)"
-        );
-    }
-
-    #[test]
-    fn a_key_of_the_entry_is_found_or_named() {
-        assert_eq!(
-            entry("evalai", "auth_token", r#"{"auth_token": "x", "other": 1}"#),
-            Ok("x".into())
-        );
-        for text in ["", "x", "[]", "{}", r#"{"auth_token": 1}"#] {
-            let error = entry("evalai", "auth_token", text).unwrap_err().to_string();
-            assert!(error.contains("evalai") && error.contains("auth_token"), "{error}");
-        }
     }
 }

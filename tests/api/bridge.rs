@@ -15,10 +15,15 @@ use kube::api::{Api, ApiResource, DynamicObject, ListParams, Patch, PatchParams,
 use kube::runtime::wait::await_condition;
 use kube::runtime::{WatchStreamExt, watcher};
 use kube::{Client, ResourceExt};
+use serde_json::{Value, json};
+use tokio::sync::watch;
+
+use crate::support::{apiserver, ministack};
 use leaderboard_api::{Attempt, Ingested, Leaderboard, Submission, names};
 use leaderboard_operator::allowed::Allowed;
 use leaderboard_operator::bridge;
-use leaderboard_operator::bridge::ingest::{self, Incoming, Outcome, Source};
+use leaderboard_operator::bridge::ingest::{self, Incoming, Source};
+use leaderboard_operator::bridge::route::Outcome;
 use leaderboard_operator::kubernetes::{Clients, Namespaces};
 use leaderboard_operator::observability::Observability;
 use leaderboard_operator::observability::metrics::Program;
@@ -26,10 +31,6 @@ use leaderboard_operator::observability::shutdown::Stop;
 use leaderboard_operator::observability::tasks::TaskFailed;
 use leaderboard_operator::services::aws::Aws;
 use leaderboard_operator::services::evalai::Swept;
-use serde_json::{Value, json};
-use tokio::sync::watch;
-
-use crate::support::{apiserver, ministack};
 
 /// Far longer than anything here takes, so that a busy machine fails no test.
 pub(super) const LIMIT: Duration = Duration::from_mins(2);

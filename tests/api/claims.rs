@@ -5,9 +5,6 @@ use k8s_openapi::api::batch::v1::Job;
 use kube::api::{DeleteParams, DynamicObject, ListParams, Patch, PatchParams, PostParams};
 use kube::runtime::wait::await_condition;
 use kube::{Api, Client, ResourceExt};
-use leaderboard_api::{Leaderboard, Submission, conditions, reasons};
-use leaderboard_operator::controller::gpu_claims::{resource, template};
-use leaderboard_operator::controller::leaderboards::claims::{Claims, keep, remove_others};
 use serde_json::{Value, json};
 use tokio::time::timeout;
 
@@ -15,6 +12,10 @@ use super::bridge::{LIMIT, StandIn};
 use super::objects::{Kind, create};
 use super::operator::Operator;
 use crate::support::apiserver::server;
+use leaderboard_api::{Leaderboard, Submission, conditions, reasons};
+use leaderboard_operator::controller::gpu_claims::{resource, template};
+use leaderboard_operator::controller::leaderboards::claims::{keep, remove_others};
+use leaderboard_operator::controller::leaderboards::view::Claims;
 
 const NAME: &str = "carla";
 

@@ -19,21 +19,22 @@ use evalai_stand_in::model::{FileState, Status as Stored};
 use evalai_stand_in::submissions::{NewSubmission, create};
 use evalai_stand_in::{Config, Handle, Knobs};
 use jiff::{SignedDuration, Timestamp};
+use serde_json::{Map, json};
+use tokio::net::TcpListener;
+use tokio::sync::mpsc;
+use tokio::time::Instant;
+
 use leaderboard_api::Attempt;
 use leaderboard_operator::observability::about::LogSpan;
 use leaderboard_operator::observability::shutdown::Stop;
 use leaderboard_operator::observability::tasks::Tasks;
-use leaderboard_operator::services::archive::ContentId;
+use leaderboard_operator::pod::report::ContentId;
 use leaderboard_operator::services::evalai::{
     Changed, DesiredUpdate, Ended, Hub, ImageAnswer, Key, Misfit, Options, Outcome, Outline, Patience, Payload,
     Progress, Publisher, Run, Status, StoredResult, Subject, SubmissionState, SweepRow, Target, Timeouts, Timing,
 };
 use leaderboard_operator::services::meter::Meter;
 use leaderboard_operator::services::token::Token;
-use serde_json::{Map, json};
-use tokio::net::TcpListener;
-use tokio::sync::mpsc;
-use tokio::time::Instant;
 
 /// A stand-in, a hub that speaks to it, and what the controller would hold.
 struct World {

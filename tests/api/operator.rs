@@ -3,18 +3,20 @@
 use std::time::Duration;
 
 use kube::{Client, Config};
-use leaderboard_operator::allowed::Allowed;
-use leaderboard_operator::controller::runtime::leader::{self, Identity, Timing};
-use leaderboard_operator::controller::runtime::{self as run, Clients, RunError};
-use leaderboard_operator::controller::settings::Settings;
-use leaderboard_operator::kubernetes::{Namespaces, watch_client};
-use leaderboard_operator::observability::Observability;
-use leaderboard_operator::observability::shutdown::Stop;
-use leaderboard_operator::services::aws::Aws;
 use tokio::sync::watch;
 use tokio::task::JoinHandle;
 
 use crate::support::apiserver::server;
+use leaderboard_operator::allowed::Allowed;
+use leaderboard_operator::controller::runtime as run;
+use leaderboard_operator::controller::runtime::leader::{self, Identity, Timing};
+use leaderboard_operator::controller::runtime::{Clients, RunError};
+use leaderboard_operator::controller::settings::Settings;
+use leaderboard_operator::controller::submissions::job_spec::OwnImage;
+use leaderboard_operator::kubernetes::{Namespaces, watch_client};
+use leaderboard_operator::observability::Observability;
+use leaderboard_operator::observability::shutdown::Stop;
+use leaderboard_operator::services::aws::Aws;
 
 /// Longer than it takes to end, with a write to EvalAI under way.
 const END_LIMIT: Duration = Duration::from_mins(3);
@@ -121,10 +123,11 @@ fn lease(namespace: &str) -> leader::Settings {
 /// What the command line would set, for an operator that serves a namespace.
 pub fn settings(namespace: &str) -> Settings {
     Settings {
-        image: "operator:1".into(),
-        image_pull_policy: None,
-        region: Some("us-east-1".into()),
-        checksums: None,
+        own: OwnImage {
+            image: "operator:1".into(),
+            region: Some("us-east-1".into()),
+            ..OwnImage::default()
+        },
         operator: format!("{namespace}/{LEASE_NAME}"),
         namespaces: Namespaces::of([namespace.to_owned()]),
         has_cluster_rights: false,

@@ -8,17 +8,17 @@ use std::sync::atomic::{AtomicBool, Ordering};
 use aws_sdk_dynamodb::types::{
     AttributeDefinition, AttributeValue, BillingMode, KeySchemaElement, KeyType, ScalarAttributeType,
 };
-use leaderboard_api as api;
-use leaderboard_operator::observability::about::LogSpan;
-use leaderboard_operator::observability::shutdown::Stop;
-use leaderboard_operator::observability::tasks::Tasks;
-use leaderboard_operator::services::ObjectKey;
-use leaderboard_operator::services::table::{Recorder, Row, Table, Written};
 use serde_json::json;
 use tokio::sync::mpsc;
 
 use super::bridge::{LIMIT, StandIn};
 use crate::support::throttle::Throttle;
+use leaderboard_api as api;
+use leaderboard_operator::object_key::ObjectKey;
+use leaderboard_operator::observability::about::LogSpan;
+use leaderboard_operator::observability::shutdown::Stop;
+use leaderboard_operator::observability::tasks::Tasks;
+use leaderboard_operator::services::table::{Recorder, Row, Table, Written};
 
 fn client(stand_in: &StandIn) -> aws_sdk_dynamodb::Client {
     stand_in.aws.dynamodb(None, Some(&stand_in.endpoint))

@@ -22,6 +22,7 @@ use leaderboard_operator::allowed::Allowed;
 use leaderboard_operator::controller::runtime::leader::{self, Identity};
 use leaderboard_operator::controller::runtime::{self as run, Clients};
 use leaderboard_operator::controller::settings::Settings;
+use leaderboard_operator::controller::submissions::job_spec::OwnImage;
 use leaderboard_operator::kubernetes::Namespaces;
 use leaderboard_operator::observability::Observability;
 use leaderboard_operator::observability::shutdown::Stop;
@@ -141,10 +142,10 @@ impl World {
         };
         let lease = leader::Settings::new(&self.namespace, lease, Identity::random("test"));
         let settings = Settings {
-            image: image.into(),
-            image_pull_policy: None,
-            region: None,
-            checksums: None,
+            own: OwnImage {
+                image: image.into(),
+                ..OwnImage::default()
+            },
             operator: lease.installation(),
             namespaces: Namespaces::of([self.namespace.clone()]),
             has_cluster_rights: false,

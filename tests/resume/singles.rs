@@ -3,15 +3,15 @@
 use std::time::{Duration, Instant};
 
 use fastrand::Rng;
-use leaderboard_api::LeaderboardVersion;
-use leaderboard_operator::pod::places::Pace;
-use leaderboard_runner::protocol::{Mark, Side, StatusFile};
 use nix::sys::signal::Signal;
 
 use super::kubelet::{Kubelet, Name, members};
 use super::results::{report, results};
 use super::submission::{FASTER, Submission};
 use crate::ministack::{Proxy, server};
+use leaderboard_api::LeaderboardVersion;
+use leaderboard_operator::pod::judge::Pace;
+use leaderboard_runner::protocol::{Mark, Side, StatusFile};
 
 const LIMIT: Duration = Duration::from_mins(1);
 

@@ -2,22 +2,7 @@
 //!
 //! Called wherever an error of a library reaches a log line, a probe's body or a status. Pure.
 
-use std::error::Error;
-
-/// An error and what caused it, joined by `: `. A cause whose text the error before already holds is left out.
-pub fn chain(error: &(dyn Error + 'static)) -> String {
-    let mut text = error.to_string();
-    let mut next = error.source();
-    while let Some(cause) = next {
-        let more = cause.to_string();
-        if !text.contains(&more) {
-            text.push_str(": ");
-            text.push_str(&more);
-        }
-        next = cause.source();
-    }
-    text
-}
+use crate::text::chain;
 
 /// An error of the API server's client. The server's own words where it has answered.
 pub fn kube(error: &kube::Error) -> String {

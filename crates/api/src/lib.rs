@@ -40,6 +40,9 @@ mod team;
 pub mod text;
 mod waiting;
 
+/// Name, namespace and UID of an object.
+pub use kube::ResourceExt;
+
 pub use attempt::Attempt;
 pub use conditions::Condition;
 pub use evalai_mode::EvalaiMode;

@@ -3,6 +3,7 @@
 //! A stranger writes the name of a team or an image, and much of what a registry, a kubelet or a container reports. Such a text
 //! goes through [`one_line`] where it enters: from there on it can be shown on a terminal, in a log and on a page.
 
+use std::error::Error;
 /// Longest name of a team or of another thing that a stranger has named, in characters.
 pub const LONGEST_NAME: usize = 256;
 /// Longest message of another program that is shown, in characters.
@@ -53,6 +54,21 @@ pub fn is_harmful(c: char) -> bool {
             | '\u{200b}' | '\u{200e}'..='\u{200f}'
             | '\u{2028}'..='\u{202e}' | '\u{2060}'..='\u{206f}'
             | '\u{feff}' | '\u{fff9}'..='\u{fffb}' | '\u{e0000}'..='\u{e007f}')
+}
+
+/// An error and what caused it, joined by `: `. A cause whose text the error before already holds is left out.
+pub fn chain(error: &(dyn Error + 'static)) -> String {
+    let mut text = error.to_string();
+    let mut next = error.source();
+    while let Some(cause) = next {
+        let more = cause.to_string();
+        if !text.contains(&more) {
+            text.push_str(": ");
+            text.push_str(&more);
+        }
+        next = cause.source();
+    }
+    text
 }
 
 #[cfg(test)]

@@ -162,7 +162,7 @@ pub(super) fn of_kubeconfig(error: &(dyn StdError + 'static)) -> Error {
         }
         next = cause.source();
     }
-    Error::Config(phrase(&text::chain(error)))
+    Error::Config(phrase(&leaderboard_api::text::chain(error)))
 }
 
 /// A text of another program in one line and without a full stop.
@@ -189,7 +189,7 @@ fn credentials(error: &(dyn StdError + 'static)) -> Option<String> {
                 AuthError::AuthExecParse(_) => {
                     "the program that the kubeconfig names for credentials printed something else".to_owned()
                 }
-                other => phrase(&text::chain(other)),
+                other => phrase(&leaderboard_api::text::chain(other)),
             });
         }
         next = error.source();

@@ -6,9 +6,10 @@ use std::path::PathBuf;
 use std::str::FromStr;
 use std::time::Duration;
 
-use crate::graphics::Needs;
-use crate::protocol::{Member, Pair, Side};
 use thiserror::Error;
+
+use crate::needs::Needs;
+use crate::protocol::{Member, Pair, Side};
 
 pub const USAGE: &str = "\
 usage: leaderboard-runner simulator --pair N --status DIR --port P [options] -- CMD ARGS...

@@ -4,19 +4,14 @@
 //! A server without a GPU would end with a message that names no cause, or draw in software for hours.
 
 use std::ffi::{OsStr, OsString};
-use std::fmt;
 use std::fs;
 use std::os::unix::ffi::OsStrExt;
 use std::os::unix::fs::FileTypeExt;
 use std::path::{Path, PathBuf};
-use std::str::FromStr;
 
 use thiserror::Error;
 
-/// Variable of a simulator: which of several GPUs is its pair's, from 0.
-pub const INDEX: &str = "LEADERBOARD_GPU_INDEX";
-/// What the runner puts in place of `$(NAME)` in a server's words, and gives it as a variable: the number of its graphics adapter.
-pub const ADAPTER: &str = "LEADERBOARD_GRAPHICS_ADAPTER";
+use crate::needs::{ADAPTER, INDEX, Needs};
 
 /// Device nodes are called so, with the number behind.
 const DEVICE: &str = "nvidia";
@@ -49,44 +44,6 @@ const LIBRARY_FOLDERS: [&str; 10] = [
 /// The linker's list of libraries, which holds their names as they are.
 const LIBRARY_CACHE: &str = "etc/ld.so.cache";
 const LIBRARY_VARIABLE: &str = "LD_LIBRARY_PATH";
-
-/// What a server draws with.
-#[derive(Debug, Clone, Copy, PartialEq, Eq)]
-pub enum Needs {
-    /// Not known: only that there is a GPU counts.
-    Any,
-    Vulkan,
-    OpenGl,
-}
-
-impl Needs {
-    const NAMES: [(Self, &str); 3] = [(Self::Any, "any"), (Self::Vulkan, "vulkan"), (Self::OpenGl, "opengl")];
-}
-
-impl fmt::Display for Needs {
-    fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
-        f.write_str(
-            Self::NAMES
-                .iter()
-                .find(|(known, _)| known == self)
-                .map_or("", |(_, name)| name),
-        )
-    }
-}
-
-/// A text that names nothing to draw with.
-#[derive(Debug, PartialEq, Eq, Error)]
-#[error("what a server draws with is any, vulkan or opengl")]
-pub struct NotANeed;
-
-impl FromStr for Needs {
-    type Err = NotANeed;
-
-    fn from_str(text: &str) -> Result<Self, NotANeed> {
-        let known = Self::NAMES.iter().find(|(_, name)| *name == text);
-        known.map(|(needs, _)| *needs).ok_or(NotANeed)
-    }
-}
 
 /// Why a server cannot draw here.
 #[derive(Debug, PartialEq, Eq, Error)]
@@ -192,6 +149,7 @@ pub fn with_adapter(word: &OsStr, adapter: usize) -> OsString {
 
 #[cfg(test)]
 mod tests {
+    use crate::needs::NotANeed;
     use std::os::unix::fs::symlink;
 
     use tempfile::TempDir;

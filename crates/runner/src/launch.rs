@@ -7,6 +7,8 @@ use std::io;
 use std::path::{Path, PathBuf};
 use std::process::{Command, Stdio};
 
+use thiserror::Error;
+
 use crate::checkpoint;
 use crate::decide::Cause;
 use crate::group::{self, Group};
@@ -15,7 +17,6 @@ use crate::tee::Tee;
 use leaderboard_runner::args::{Job, Role};
 use leaderboard_runner::expand::expand;
 use leaderboard_runner::graphics::{self, NoGraphics};
-use thiserror::Error;
 
 /// Why no command runs.
 #[derive(Debug, Error)]
@@ -86,7 +87,10 @@ fn server(job: &Job) -> Result<Command, NoGraphics> {
                 .iter()
                 .map(|word| graphics::with_adapter(word, adapter))
                 .collect();
-            group::command(&words, &[(graphics::ADAPTER, adapter.to_string().into())])
+            group::command(
+                &words,
+                &[(leaderboard_runner::needs::ADAPTER, adapter.to_string().into())],
+            )
         }
     };
     for name in unset {

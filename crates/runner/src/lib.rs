@@ -7,5 +7,6 @@
 pub mod args;
 pub mod expand;
 pub mod graphics;
+pub mod needs;
 pub mod protocol;
 pub mod verdict;

@@ -7,25 +7,13 @@ use std::collections::BTreeSet;
 use k8s_openapi::api::batch::v1::Job;
 use kube::api::{DeleteParams, DynamicObject, ListParams, Patch, PatchParams};
 use kube::{Api, Client, ResourceExt};
-use leaderboard_api::text::sentence;
-use leaderboard_api::{ClaimOf, GpuSource, Leaderboard, names};
 
 use crate::controller::gpu_claims::{resource, source, template};
+use crate::controller::leaderboards::view::Claims;
 use crate::controller::objects::uid_of;
 use crate::kubernetes::{CallError, call};
-
-/// How the template of a Leaderboard stands.
-#[derive(Clone, Debug, Default, PartialEq, Eq)]
-pub enum Claims {
-    /// Its workers claim nothing.
-    #[default]
-    NotRequired,
-    InPlace,
-    /// The API server does not serve claims.
-    NotServed,
-    /// It is not there, and why.
-    Missing(String),
-}
+use leaderboard_api::text::sentence;
+use leaderboard_api::{ClaimOf, GpuSource, Leaderboard, names};
 
 /// Puts the template in place, or looks for the host's. Never fails: what is wrong is shown.
 pub async fn keep(client: &Client, leaderboard: &Leaderboard) -> Claims {

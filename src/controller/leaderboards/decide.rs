@@ -4,21 +4,15 @@ use std::sync::Arc;
 
 use jiff::Timestamp;
 use k8s_openapi::apimachinery::pkg::apis::meta::v1::Time;
-use kube::ResourceExt;
 
-use super::claims::Claims;
-use super::isolation;
-use super::reach::Unreachable;
 use super::refusal::Refusal;
-use super::standing::EvalaiStanding;
-use super::state::Policy;
+use super::view::{Claims, EvalaiStanding, Policy, Unreachable};
 use crate::controller::submissions::decide::previous_controller;
-use crate::pod::workspace::WorkspaceVerdict;
-use crate::services::evalai::{InboxTrouble, Usage};
+use crate::pod::verdict::WorkspaceVerdict;
 use leaderboard_api::conditions::{self, Truth};
 use leaderboard_api::leaderboard::Counts;
 use leaderboard_api::{
-    Evalai, EvalaiBacklog, EvalaiUse, Leaderboard, LeaderboardStatus, TableUse, TeamUse, Track, TrackStatus, effective,
+    Evalai, EvalaiUse, Leaderboard, LeaderboardStatus, ResourceExt, TableUse, TeamUse, Track, TrackStatus, effective,
     names, reasons,
 };
 
@@ -66,7 +60,7 @@ pub struct LeaderboardView {
     /// Until when nothing is written to EvalAI, because the controller before may still have requests under way.
     pub evalai_writes_from: Option<Timestamp>,
     /// How the requests of its token are used.
-    pub usage: Option<Usage>,
+    pub usage: Option<EvalaiUse>,
     /// Rows that have waited for its table for a while.
     pub rows_waiting: Option<usize>,
 }
@@ -89,7 +83,7 @@ pub fn decide(view: &LeaderboardView) -> LeaderboardPlan {
     }
     status.counts = Some(view.counts);
     status.gpu_use.clone_from(&view.gpu_use);
-    status.evalai = view.usage.filter(|_| view.refusal.is_none()).map(evalai_use);
+    status.evalai = view.usage.clone().filter(|_| view.refusal.is_none());
     status.table = view.rows_waiting.filter(|waiting| *waiting > 0).map(table_use);
     status.tracks = tracks(leaderboard);
     let now = Time(view.now);
@@ -99,7 +93,8 @@ pub fn decide(view: &LeaderboardView) -> LeaderboardPlan {
     if let Some(ready) = ready(view) {
         set(&mut status, conditions::READY, with_notes(view, ready));
     }
-    let isolated = isolation::condition(leaderboard, &view.policy, view.measured.as_ref());
+    let isolated =
+        crate::controller::leaderboards::isolated::condition(leaderboard, &view.policy, view.measured.as_ref());
     set(&mut status, conditions::ISOLATED, isolated);
     let deleting = leaderboard.metadata.deletion_timestamp.is_some();
     let is_in_use = view.in_use > 0 || view.pods > 0;
@@ -117,18 +112,6 @@ pub fn decide(view: &LeaderboardView) -> LeaderboardPlan {
         _ => None,
     };
     LeaderboardPlan { status, finalizer }
-}
-
-fn evalai_use(usage: Usage) -> EvalaiUse {
-    let waiting = i32::try_from(usage.waiting).unwrap_or(i32::MAX);
-    EvalaiUse {
-        requests_last_minute: i32::try_from(usage.used).unwrap_or(i32::MAX),
-        requests_per_minute: i32::try_from(usage.limit).unwrap_or(i32::MAX),
-        backlog: usage.last_expected.map(|at| EvalaiBacklog {
-            waiting,
-            last_expected_time: Time(at),
-        }),
-    }
 }
 
 fn table_use(waiting: usize) -> TableUse {
@@ -237,10 +220,8 @@ fn evalai(standing: &EvalaiStanding) -> (Truth, &'static str, String) {
     match standing {
         EvalaiStanding::NoToken(why) => no(reasons::TOKEN_MISSING, why.clone()),
         EvalaiStanding::TokenRefused(why) => no(reasons::TOKEN_REFUSED, why.clone()),
-        EvalaiStanding::QueueUnread(InboxTrouble { is_refused: true, why }) => {
-            no(reasons::QUEUE_UNREACHABLE, why.clone())
-        }
-        EvalaiStanding::QueueUnread(InboxTrouble { why, .. }) => {
+        EvalaiStanding::QueueUnread { is_refused: true, why } => no(reasons::QUEUE_UNREACHABLE, why.clone()),
+        EvalaiStanding::QueueUnread { why, .. } => {
             let message = format!("EvalAI's queue has not been read for minutes: {why}. It is retried each minute.");
             (Truth::Unknown, reasons::QUEUE_UNREACHABLE, message)
         }

@@ -1,7 +1,8 @@
 //! What a Leaderboard's status shows, as tables.
 
-use super::*;
 use serde_json::json;
+
+use super::*;
 
 fn leaderboard(name: &str, second: i64, phase: i64, server: &str, prefix: &str) -> Arc<Leaderboard> {
     let spec = json!({
@@ -15,29 +16,6 @@ fn leaderboard(name: &str, second: i64, phase: i64, server: &str, prefix: &str) 
     object.metadata.uid = Some(name.into());
     object.metadata.creation_timestamp = Some(Time(Timestamp::from_second(second).unwrap()));
     Arc::new(object)
-}
-
-const USAGE: Usage = Usage {
-    used: 3,
-    limit: 54,
-    waiting: 0,
-    last_expected: None,
-};
-
-#[test]
-fn the_status_shows_how_many_results_wait_for_evalai_and_when_the_last_is_expected() {
-    let at = Timestamp::from_second(3600).unwrap();
-    let waiting = Usage {
-        waiting: 812,
-        last_expected: Some(at),
-        ..USAGE
-    };
-    let backlog = EvalaiBacklog {
-        waiting: 812,
-        last_expected_time: Time(at),
-    };
-    assert_eq!(evalai_use(waiting).backlog, Some(backlog));
-    assert_eq!(evalai_use(USAGE).backlog, None);
 }
 
 fn view(mine: &Arc<Leaderboard>, all: &[Arc<Leaderboard>]) -> LeaderboardView {
@@ -61,7 +39,11 @@ fn view(mine: &Arc<Leaderboard>, all: &[Arc<Leaderboard>]) -> LeaderboardView {
         place_notes: Vec::new(),
         evalai: EvalaiStanding::Fits { note: None },
         evalai_writes_from: None,
-        usage: Some(USAGE),
+        usage: Some(EvalaiUse {
+            requests_last_minute: 3,
+            requests_per_minute: 54,
+            backlog: None,
+        }),
         rows_waiting: None,
     }
 }
@@ -360,11 +342,9 @@ fn a_policy_that_is_not_in_place_is_why_nothing_can_run() {
 #[test]
 fn what_is_wrong_with_evalai_is_shown() {
     let one = leaderboard("one", 1, 7, "https://e", "a/");
-    let unread = |is_refused| {
-        EvalaiStanding::QueueUnread(InboxTrouble {
-            is_refused,
-            why: "x".into(),
-        })
+    let unread = |is_refused| EvalaiStanding::QueueUnread {
+        is_refused,
+        why: "x".into(),
     };
     let cases = [
         (EvalaiStanding::NoToken("x".into()), "False", reasons::TOKEN_MISSING),

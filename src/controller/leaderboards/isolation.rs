@@ -1,6 +1,6 @@
 //! The NetworkPolicy of a Leaderboard's Pods: applied before all else, restored, and measured by each run.
 //!
-//! `keep` writes it, `restore` as soon as somebody else has changed it; `measured` reads what the Pods found; `condition` is pure and says what follows for `Isolated`.
+//! `keep` writes it, `restore` as soon as somebody else has changed it; `measured` reads what the Pods found.
 
 use std::sync::Arc;
 use std::time::Duration;
@@ -13,17 +13,17 @@ use kube::api::{Patch, PatchParams};
 use kube::runtime::reflector::ObjectRef;
 use kube::{Api, Client, ResourceExt};
 
-use super::state::{Applied, Entry, Found, LeaderboardState, POLICY_AGAIN, Policy, RESYNC, SOONEST};
+use super::state::{Applied, Entry, Found, LeaderboardState, POLICY_AGAIN, RESYNC, SOONEST};
+use crate::controller::leaderboards::view::Policy;
 use crate::controller::network_policy::{is_in_place, network_policy};
 use crate::controller::objects::{Wake, key_of, uid_of};
 use crate::controller::slots::Slots;
 use crate::controller::stores::Stores;
 use crate::kubernetes::objects::Pod;
 use crate::kubernetes::{WatchEvents, call};
-use crate::pod::workspace::{NotAVerdict, WorkspaceReason, WorkspaceVerdict};
-use leaderboard_api::conditions::{self, Truth};
+use crate::pod::verdict::{NotAVerdict, WorkspaceReason, WorkspaceVerdict};
 use leaderboard_api::text::sentence;
-use leaderboard_api::{Enforcement, Leaderboard, PolicySource, names, reasons};
+use leaderboard_api::{Enforcement, Leaderboard, PolicySource, conditions, names, reasons};
 
 /// Policies that are restored at once.
 const RESTORED_AT_ONCE: usize = 16;
@@ -277,37 +277,6 @@ fn finding(pod: &Pod) -> Option<(Option<Timestamp>, WorkspaceVerdict)> {
     is_finding.then_some((end.finished_at.as_ref().map(|at| at.0), verdict))
 }
 
-/// What `Isolated` shows.
-pub(super) fn condition(
-    leaderboard: &Leaderboard,
-    policy: &Policy,
-    measured: Option<&WorkspaceVerdict>,
-) -> (Truth, &'static str, String) {
-    match policy {
-        Policy::External => {
-            let message = "network.policy is External: no NetworkPolicy is applied, and the cluster's own are trusted.";
-            (Truth::Unknown, reasons::EXTERNAL, message.into())
-        }
-        Policy::Refused(why) => (Truth::False, reasons::FORBIDDEN, why.clone()),
-        Policy::NotApplied(why) => (Truth::False, reasons::NOT_APPLIED, why.clone()),
-        Policy::InPlace if leaderboard.spec.network.enforcement == Enforcement::Off => {
-            let message =
-                "The NetworkPolicy is in place. Whether it is enforced is not measured: network.enforcement is Off.";
-            (Truth::Unknown, reasons::NOT_MEASURED, message.into())
-        }
-        Policy::InPlace => measured.map_or_else(
-            || {
-                let message = "The NetworkPolicy is in place. The next run measures whether it is enforced.";
-                (Truth::Unknown, reasons::NOT_MEASURED, message.into())
-            },
-            |found| {
-                let (truth, reason) = shown(found.reason);
-                (truth, reason, found.message.clone())
-            },
-        ),
-    }
-}
-
 /// What the condition shows that a Pod which is gone had found, for this generation.
 fn known(leaderboard: &Leaderboard) -> Option<WorkspaceVerdict> {
     let known = leaderboard.condition(conditions::ISOLATED)?;
@@ -320,14 +289,6 @@ fn known(leaderboard: &Leaderboard) -> Option<WorkspaceVerdict> {
         _ => return None,
     };
     Some(WorkspaceVerdict::new(reason, known.message.to_string()))
-}
-
-fn shown(found: WorkspaceReason) -> (Truth, &'static str) {
-    match found {
-        WorkspaceReason::Enforced => (Truth::True, reasons::ENFORCED),
-        WorkspaceReason::NotMeasured | WorkspaceReason::NotKnownIsolated => (Truth::Unknown, reasons::NOT_MEASURED),
-        _ => (Truth::False, reasons::NOT_ENFORCED),
-    }
 }
 
 #[cfg(test)]

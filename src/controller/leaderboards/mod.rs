@@ -6,6 +6,7 @@
 
 pub mod claims;
 pub mod decide;
+pub mod isolated;
 pub mod isolation;
 pub mod looks;
 pub mod operator;
@@ -17,7 +18,9 @@ mod reach;
 mod refusal;
 pub mod standing;
 pub mod state;
+pub mod token;
 mod tried_pods;
+pub mod view;
 
 use std::sync::Arc;
 use std::time::Duration;
@@ -41,7 +44,8 @@ use isolation::Policies;
 use leaderboard_api::{Leaderboard, names};
 use looks::Look;
 use probe::Probe;
-use state::{COUNTS_EVERY, LeaderboardState, Looked, Policy, RESYNC, SOONEST};
+use state::{COUNTS_EVERY, LeaderboardState, Looked, RESYNC, SOONEST};
+use view::Policy;
 
 /// The first look at a spec gets so long before the status shows that it is under way: mostly it takes less, and saves a write.
 const FIRST_LOOK: Duration = Duration::from_secs(2);
@@ -210,7 +214,7 @@ fn observe(
         place_notes: probe.reach.notes(now),
         evalai: standing::standing(hub, leaderboard, probe.token(leaderboard), now),
         evalai_writes_from: hub.writes_from(),
-        usage: hub.usage(&key),
+        usage: hub.usage(&key).map(standing::evalai_use),
         rows_waiting: rows_waiting(uses, leaderboard),
     }
 }

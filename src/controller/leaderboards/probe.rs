@@ -8,23 +8,25 @@ use std::time::Duration;
 use jiff::{SignedDuration, Timestamp};
 use k8s_openapi::api::core::v1::Secret;
 use kube::{Api, Client, ResourceExt};
-use leaderboard_results::metrics;
 
-use super::claims::{self, Claims};
+use super::claims;
 use super::places::{self, Readings};
 use super::priority;
 use super::reach::{AwsResource, Reach};
 use super::tried_pods::{TriedPods, try_pods};
+use crate::controller::leaderboards::token::TokenSource;
+use crate::controller::leaderboards::view::Claims;
 use crate::controller::objects::key_of;
 use crate::controller::settings::Settings;
 use crate::controller::stores::Stores;
 use crate::kubernetes::call;
 use crate::observability::metrics::leader::{self, Gauge};
-use crate::pod::run::results_format;
+use crate::pod::carla::results_format;
 use crate::services::aws::Aws;
 use crate::services::evalai::Target;
-use crate::services::token::{Token, TokenSource};
+use crate::services::token::Token;
 use leaderboard_api::{EvalaiMode, Leaderboard, Token as TokenPlace};
+use leaderboard_results::metrics;
 
 /// A token is looked at again after this long.
 const AGAIN: SignedDuration = SignedDuration::from_mins(5);

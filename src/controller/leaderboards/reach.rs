@@ -10,6 +10,7 @@ use std::time::Duration;
 use jiff::{SignedDuration, Timestamp};
 
 use crate::backoff::Backoff;
+use crate::controller::leaderboards::view::Unreachable;
 use leaderboard_api::conditions::Truth;
 use leaderboard_api::reasons;
 use leaderboard_api::text::sentence;
@@ -56,17 +57,6 @@ pub enum Finding {
     Hidden(String),
     /// No answer, or one that asks to ask later.
     Silent(String),
-}
-
-/// What is shown of a Leaderboard whose places cannot all be reached.
-#[derive(Clone, Debug, PartialEq, Eq)]
-pub struct Unreachable {
-    /// Never True.
-    pub truth: Truth,
-    /// Of the gravest.
-    pub reason: &'static str,
-    /// Of all.
-    pub message: String,
 }
 
 /// What is known of all places of one Leaderboard.

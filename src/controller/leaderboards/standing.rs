@@ -3,31 +3,15 @@
 use std::sync::Arc;
 
 use jiff::Timestamp;
+use k8s_openapi::apimachinery::pkg::apis::meta::v1::Time;
 
 use super::reach::capitalized;
+use super::view::EvalaiStanding;
 use crate::controller::objects::key_of;
-use crate::services::evalai::{Hub, InboxTrouble, Labels};
+use crate::services::evalai::{Hub, InboxTrouble, Labels, Usage};
 use crate::services::token::Token;
-use leaderboard_api::Leaderboard;
 use leaderboard_api::text::sentence;
-
-/// How a Leaderboard stands with EvalAI.
-#[derive(Clone, Debug, PartialEq, Eq)]
-pub enum EvalaiStanding {
-    NotRequired,
-    NoToken(String),
-    TokenRefused(String),
-    /// Its queue in EvalAI is not read.
-    QueueUnread(InboxTrouble),
-    /// Its phases or labels do not fit the challenge.
-    Misfit(String),
-    /// Not checked yet, or EvalAI does not answer.
-    Unchecked(Option<String>),
-    Fits {
-        /// Something to be shown although it works, such as a token that ends soon.
-        note: Option<String>,
-    },
-}
+use leaderboard_api::{EvalaiBacklog, EvalaiUse, Leaderboard};
 
 /// How it stands, with what was found where the Leaderboard names its token.
 pub(super) fn standing(
@@ -50,9 +34,8 @@ pub(super) fn standing(
         return EvalaiStanding::TokenRefused(why);
     }
     match hub.inbox_trouble(key) {
-        Some(trouble) if trouble.is_refused => return EvalaiStanding::QueueUnread(trouble),
-        Some(trouble) if labels.as_ref().is_none_or(Labels::ok) => {
-            return EvalaiStanding::QueueUnread(trouble);
+        Some(InboxTrouble { is_refused, why }) if is_refused || labels.as_ref().is_none_or(Labels::ok) => {
+            return EvalaiStanding::QueueUnread { is_refused, why };
         }
         _ => {}
     }
@@ -95,6 +78,19 @@ fn ends_soon(token: &Token, now: Timestamp) -> Option<String> {
     })
 }
 
+/// How the requests of its token are used, as the status shows it.
+pub(super) fn evalai_use(usage: Usage) -> EvalaiUse {
+    let waiting = i32::try_from(usage.waiting).unwrap_or(i32::MAX);
+    EvalaiUse {
+        requests_last_minute: i32::try_from(usage.used).unwrap_or(i32::MAX),
+        requests_per_minute: i32::try_from(usage.limit).unwrap_or(i32::MAX),
+        backlog: usage.last_expected.map(|at| EvalaiBacklog {
+            waiting,
+            last_expected_time: Time(at),
+        }),
+    }
+}
+
 #[cfg(test)]
 mod tests {
     use super::*;
@@ -126,5 +122,27 @@ mod tests {
             "The leaderboard of phase 2 also has Speed, Comfort, which the operator never sends and which stay empty; remove them from its schema, or check spec.leaderboardVersion. EvalAI's token ends \
              on 2027-01-01."
         );
+    }
+
+    #[test]
+    fn the_status_shows_how_many_results_wait_for_evalai_and_when_the_last_is_expected() {
+        let at = Timestamp::from_second(3600).unwrap();
+        let idle = Usage {
+            used: 3,
+            limit: 54,
+            waiting: 0,
+            last_expected: None,
+        };
+        let busy = Usage {
+            waiting: 812,
+            last_expected: Some(at),
+            ..idle
+        };
+        let backlog = EvalaiBacklog {
+            waiting: 812,
+            last_expected_time: Time(at),
+        };
+        assert_eq!(evalai_use(busy).backlog, Some(backlog));
+        assert_eq!(evalai_use(idle).backlog, None);
     }
 }

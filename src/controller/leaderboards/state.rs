@@ -8,8 +8,9 @@ use jiff::Timestamp;
 use tokio::time::Instant;
 
 use super::probe::Probe;
+use crate::controller::leaderboards::view::Policy;
 use crate::lock::lock;
-use crate::pod::workspace::WorkspaceVerdict;
+use crate::pod::verdict::WorkspaceVerdict;
 
 /// A status whose counts alone have changed is written at most this often.
 pub(super) const COUNTS_EVERY: Duration = Duration::from_secs(5);
@@ -21,18 +22,6 @@ const SHOWS: Duration = Duration::from_secs(15);
 pub(super) const POLICY_AGAIN: Duration = Duration::from_secs(10);
 /// A Leaderboard is reconciled this often without any cause.
 pub(super) const RESYNC: Duration = Duration::from_mins(1);
-
-/// How the policy of a Leaderboard stands.
-#[derive(Clone, Debug, PartialEq, Eq)]
-pub enum Policy {
-    InPlace,
-    /// The cluster has its own.
-    External,
-    /// The API server refuses it, and why.
-    Refused(String),
-    /// It could not be applied, or came out otherwise, and why.
-    NotApplied(String),
-}
 
 /// The last apply.
 #[derive(Clone, Debug)]

@@ -45,7 +45,7 @@ pub(super) async fn try_pods(client: &Client, settings: &Settings, leaderboard: 
     });
     let pods: Vec<TrackPods> = pods.collect();
     let hosts = match leaderboard.spec.network.dns {
-        Dns::None => endpoints::of_pods(&leaderboard.spec, settings.region.as_deref()).await,
+        Dns::None => endpoints::of_pods(&leaderboard.spec, settings.own.region.as_deref()).await,
         Dns::Cluster => Ok(Vec::new()),
     };
     let mut templates = jobs.iter().map(|(_, job)| template(job));
@@ -100,7 +100,7 @@ fn sample_job(settings: &Settings, leaderboard: &Leaderboard, track: &Track) -> 
         leaderboard,
         plan: &plan,
         number: JobNumber::default(),
-        settings,
+        own: &settings.own,
         failed_nodes: &[],
         now: Timestamp::now(),
     }))

@@ -21,7 +21,7 @@ use crate::controller::slots;
 use crate::controller::stores::Stores;
 use crate::kubernetes::objects::{Job, Pod};
 use crate::kubernetes::{Store, WatchEvent};
-use crate::services::ObjectKey;
+use crate::object_key::ObjectKey;
 use crate::services::evalai::Changed;
 use leaderboard_api::{Leaderboard, Submission, conditions, names};
 

@@ -18,7 +18,7 @@ use crate::bridge::route::{DeadReason, Hindrance, OUTCOMES, Rules};
 use crate::bridge::source::{Received, SetAside, Source, named};
 use crate::controller::leaderboards::operator;
 use crate::controller::objects::key_of;
-use crate::services::ObjectKey;
+use crate::object_key::ObjectKey;
 use crate::services::evalai::answer::{About, Answer};
 use crate::services::evalai::request::{Reply, Request};
 use crate::services::evalai::{Hub, Row};

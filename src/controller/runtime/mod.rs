@@ -41,14 +41,13 @@ use crate::controller::submissions::phases::Phase;
 use crate::kubernetes::objects::Event;
 use crate::kubernetes::preflight::{self, await_kinds};
 use crate::kubernetes::{Writer, spawn_uncached};
+use crate::object_key::ObjectKey;
 use crate::observability::Observability;
 use crate::observability::readiness::Readiness;
 use crate::observability::tasks::TaskFailed;
 use crate::page::Page;
-use crate::services::ObjectKey;
 use crate::services::aws::Aws;
 use crate::services::evalai::{Changed, Hub, Options, PayloadReader, SweepRow, Timeouts, Timing};
-use crate::services::meter::Meter;
 use crate::services::table;
 use backoff::BackoffMap;
 use context::Context;
@@ -113,7 +112,7 @@ pub async fn run(
             client: clients.api,
             watch_client: clients.watch,
             settings,
-            aws: aws.counted_by(Meter::for_metrics(&telemetry.metrics)),
+            aws: aws.counted_by(telemetry.metrics.meter()),
             watches,
             telemetry,
         };
@@ -392,7 +391,7 @@ fn hub(
         sweep,
         timing: Timing::default(),
         timeouts: Timeouts::default(),
-        meter: Meter::for_metrics(&telemetry.metrics),
+        meter: telemetry.metrics.meter(),
         tasks: telemetry.tasks.clone(),
     })
 }

@@ -8,7 +8,8 @@ use kube::{Api, Client, ResourceExt};
 use tokio::sync::mpsc;
 use tracing::Instrument;
 
-use crate::bridge::ingest::{self, Incoming, Outcome, Source};
+use crate::bridge::ingest::{self, Incoming, Source};
+use crate::bridge::route::Outcome;
 use crate::kubernetes::Store;
 use crate::services::evalai::{SweepRow, Swept};
 use leaderboard_api::{Evalai, Foreign, Leaderboard, Submission};

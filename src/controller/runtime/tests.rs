@@ -13,6 +13,7 @@ use crate::allowed::Allowed;
 use crate::controller::fixtures;
 use crate::controller::runtime::leader::Identity;
 use crate::controller::runtime::leader::tests::fake_server::FakeServer;
+use crate::controller::submissions::job_spec::OwnImage;
 use crate::kubernetes::Namespaces;
 use crate::observability::shutdown::Stop;
 
@@ -85,10 +86,10 @@ async fn leader() -> Process {
     let telemetry = Observability::new(signal);
     let lease = leader::Settings::new("ns", "operator", Identity::random("test"));
     let settings = Settings {
-        image: "operator:1".into(),
-        image_pull_policy: None,
-        region: None,
-        checksums: None,
+        own: OwnImage {
+            image: "operator:1".into(),
+            ..OwnImage::default()
+        },
         operator: lease.installation(),
         namespaces: Namespaces::All,
         has_cluster_rights: true,

@@ -239,7 +239,7 @@ impl Actor<'_> {
             log_delivery(new, one);
         }
         if !ended.is_empty() {
-            self.uses.traces.send(|| spans::of(self.view, new, &ended));
+            self.uses.traces.send(|| spans::of(&self.view.submission, new, &ended));
         }
     }
 
@@ -285,7 +285,7 @@ impl Actor<'_> {
             leaderboard,
             plan: &plan,
             number,
-            settings: self.uses.settings,
+            own: &self.uses.settings.own,
             failed_nodes: &status.failed_nodes,
             now: self.view.now,
         });

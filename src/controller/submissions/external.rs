@@ -13,7 +13,7 @@ use super::view::{EvalaiEnd, EvalaiInfo, EvalaiView, RecordView, Standing, View}
 use crate::allowed::Allowed;
 use crate::controller::objects::{key_of, log_span_of, uid};
 use crate::lock::lock;
-use crate::services::ObjectKey;
+use crate::object_key::ObjectKey;
 use crate::services::evalai::{
     self, DesiredUpdate, Ended, Hub, ImageAnswer, Outcome, Patience, Publisher, Run, Status, Subject, SubmissionState,
     Target,

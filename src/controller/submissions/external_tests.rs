@@ -12,7 +12,7 @@ use serde_json::{Value, json};
 use tokio::sync::mpsc;
 
 use super::*;
-use crate::ask::Lookup;
+use crate::ask::question::Lookup;
 use crate::controller::fixtures::{Cluster, Surroundings, leaderboard, surroundings, with_job};
 use crate::controller::submissions::view::{
     NodeView, ObservedFence, ObservedJob, ObservedLog, ObservedReport, ReportView, Turn,

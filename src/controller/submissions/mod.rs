@@ -16,6 +16,7 @@ pub mod payloads;
 pub mod phases;
 mod pod_layout;
 pub mod pod_overlay;
+pub mod questions;
 pub mod report_digest;
 mod result_texts;
 pub mod rows;

@@ -9,18 +9,14 @@ use futures::FutureExt;
 use jiff::Timestamp;
 use sha2::{Digest, Sha256};
 
-use crate::pod::report::{MAX_BYTES, REPORT_KEY, Report, StoredFile};
-use crate::services::archive::{Archive, ContentId};
+use super::report_digest::{MAX_TEXT, METADATA_KEY, STDOUT_KEY};
+use crate::pod::report::{ContentId, MAX_BYTES, REPORT_KEY, Report, StoredFile};
+use crate::services::archive::Archive;
 use crate::services::aws::Aws;
 use crate::services::evalai::{Outline, Payload, PayloadProblem, PayloadReader, StoredResult};
 
-/// Largest text that is passed on to EvalAI, in bytes.
-const MAX_TEXT: u64 = 4 << 20;
 /// Time that one read may take.
 const LIMIT: Duration = Duration::from_secs(10);
-/// Where logcopy puts the texts, below the run's prefix.
-const STDOUT_KEY: &str = "evalai/stdout.txt";
-const METADATA_KEY: &str = "evalai/metadata.json";
 
 /// The reader of the runs' buckets.
 pub fn reader(aws: Aws) -> PayloadReader {
@@ -34,16 +30,6 @@ pub fn reader(aws: Aws) -> PayloadReader {
         }
         .boxed()
     })
-}
-
-/// Why a text is left out of what EvalAI is sent of a report, for people.
-pub fn left_out(report: &Report) -> Option<String> {
-    let files = [STDOUT_KEY, METADATA_KEY].map(|key| Some((key, report.files.get(key)?)));
-    let (key, file) = files.into_iter().flatten().find(|(_, file)| file.size > MAX_TEXT)?;
-    let (size, limit) = (file.size, MAX_TEXT >> 20);
-    Some(format!(
-        "{key} was left out: it has {size} bytes, and EvalAI is sent texts of up to {limit} MiB. It is in the bucket."
-    ))
 }
 
 async fn read(aws: &Aws, outline: &Outline, stored: &StoredResult) -> Result<Payload, PayloadProblem> {

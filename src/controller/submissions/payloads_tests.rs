@@ -6,6 +6,7 @@ use axum::http::{StatusCode, Uri};
 use axum::response::{IntoResponse, Response};
 use serde_json::json;
 
+use super::super::report_digest::left_out;
 use super::*;
 use crate::controller::fixtures::{Cluster, surroundings};
 use crate::lock::lock;

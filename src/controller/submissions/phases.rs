@@ -7,7 +7,7 @@ use jiff::Timestamp;
 
 use super::view::View;
 use leaderboard_api::conditions::{ARCHIVED, FINISHED, PUBLISHED, RECORDED, RUNNING};
-use leaderboard_api::{Attempt, Ingested, SubmissionStatus, reasons};
+use leaderboard_api::{Attempt, Ingested, Submission, SubmissionStatus, reasons};
 
 /// What a submission goes through.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
@@ -86,7 +86,7 @@ pub fn ended(view: &View, new: &SubmissionStatus) -> Vec<Ended> {
     let is_same = |before: &&SubmissionStatus| before.attempt == Some(attempt);
     let step = Step {
         view,
-        old: restarted(view, new).or(before.filter(is_same)),
+        old: restarted(&view.submission, new).or(before.filter(is_same)),
         new,
     };
     step.to_job(&mut found);
@@ -96,8 +96,8 @@ pub fn ended(view: &View, new: &SubmissionStatus) -> Vec<Ended> {
 }
 
 /// The status of the attempt that a restart ends with `new`: all that ends then is of that attempt.
-pub fn restarted<'a>(view: &'a View, new: &SubmissionStatus) -> Option<&'a SubmissionStatus> {
-    let old = view.submission.status.as_ref().filter(|old| !old.has_ended())?;
+pub fn restarted<'a>(submission: &'a Submission, new: &SubmissionStatus) -> Option<&'a SubmissionStatus> {
+    let old = submission.status.as_ref().filter(|old| !old.has_ended())?;
     (old.has_run() && new.is_restart() && old.attempt < new.attempt).then_some(old)
 }
 
@@ -166,7 +166,7 @@ impl Step<'_> {
         let finished = self.new.end();
         if let Some(end) = finished.filter(|_| !self.old.is_some_and(SubmissionStatus::has_ended)) {
             found.add(Phase::Attempt, self.begun(), end.last_transition_time.0);
-        } else if restarted(self.view, self.new).is_some() {
+        } else if restarted(&self.view.submission, self.new).is_some() {
             found.add(Phase::Attempt, self.begun(), self.view.now);
         }
         let over = self.new.times.finished.as_ref().map(|time| time.0);

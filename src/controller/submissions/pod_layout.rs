@@ -1,11 +1,8 @@
 //! The inside of a Pod as the Job and the rules for an overlay agree on it: volumes, paths, variables. Pure.
 
 use super::job_spec::workload::ContentsVolume;
+use crate::pod::layout::{CARLA_ROOT, LEADERBOARD_ROOT, SCENARIO_RUNNER_ROOT};
 use crate::pod::run::{IDENTITY, LOGS, NAME_FILES, PODINFO, TOOLS};
-
-pub(super) const CARLA_ROOT: &str = "/workspace/CARLA";
-pub(super) const SCENARIO_RUNNER_ROOT: &str = "/workspace/scenario_runner";
-pub(super) const LEADERBOARD_ROOT: &str = "/workspace/leaderboard";
 
 /// Volumes with the private contents.
 pub(super) const CONTENTS_VOLUMES: [ContentsVolume; 3] = [
@@ -64,11 +61,6 @@ pub(super) const FIXED_ENV: [&str; 12] = [
     "SCENARIO_RUNNER_ROOT",
     "LEADERBOARD_ROOT",
 ];
-
-/// Puts what the original's script put there in front of the image's own PYTHONPATH.
-pub(super) fn python_path() -> String {
-    format!("{CARLA_ROOT}/PythonAPI/carla:{SCENARIO_RUNNER_ROOT}:{LEADERBOARD_ROOT}")
-}
 
 /// Paths at and below which an overlay may mount nothing.
 pub(super) fn protected_mounts() -> impl Iterator<Item = &'static str> {

@@ -1,15 +1,18 @@
 //! A report reduced to what decisions and the table need: under 1 KB while the run goes on, whatever the report embeds.
 
-use leaderboard_results::{Format, metrics};
 use serde_json::{Map, Value};
 
-use super::payloads::left_out;
-use crate::pod::report::{Logs, Report, ReportError, ReportPair};
+use crate::pod::carla;
+use crate::pod::report::{ContentId, Logs, Report, ReportError, ReportPair};
 use crate::pod::run::Stop;
-use crate::services::archive::ContentId;
 use leaderboard_api::text::one_line;
 use leaderboard_api::{Attempt, Progress, Score};
 
+/// Largest text that is passed on to EvalAI, in bytes.
+pub const MAX_TEXT: u64 = 4 << 20;
+/// Where logcopy puts the texts for EvalAI, below the run's prefix.
+pub const STDOUT_KEY: &str = "evalai/stdout.txt";
+pub const METADATA_KEY: &str = "evalai/metadata.json";
 /// Longest text of a report that is kept, in characters.
 const LONGEST: usize = 500;
 
@@ -107,8 +110,7 @@ impl ReportDigest {
 fn accuracies(results: &str) -> Option<Box<Map<String, Value>>> {
     let mut parsed: Value = serde_json::from_str(results).ok()?;
     let all = parsed.get_mut(0)?.get_mut("accuracies")?.as_object_mut()?;
-    let columns = [Format::V1, Format::V2].into_iter().flat_map(metrics);
-    let kept = columns.filter_map(|metric| all.remove_entry(metric.name));
+    let kept = carla::columns().filter_map(|name| all.remove_entry(name));
     Some(Box::new(kept.collect()))
 }
 
@@ -126,6 +128,16 @@ impl From<&Report> for ReportDigest {
     fn from(report: &Report) -> Self {
         Self::of(report, ContentId::of(&serde_json::to_vec(report).unwrap()))
     }
+}
+
+/// Why a text is left out of what EvalAI is sent of a report, for people.
+pub fn left_out(report: &Report) -> Option<String> {
+    let files = [STDOUT_KEY, METADATA_KEY].map(|key| Some((key, report.files.get(key)?)));
+    let (key, file) = files.into_iter().flatten().find(|(_, file)| file.size > MAX_TEXT)?;
+    let (size, limit) = (file.size, MAX_TEXT >> 20);
+    Some(format!(
+        "{key} was left out: it has {size} bytes, and EvalAI is sent texts of up to {limit} MiB. It is in the bucket."
+    ))
 }
 
 #[cfg(test)]

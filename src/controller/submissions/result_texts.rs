@@ -1,15 +1,15 @@
 //! The texts of a result: what EvalAI shows, and the row of the table. Pure: `payloads` reads what S3 holds of the first.
 
-use leaderboard_results::{metrics, number_text};
 use serde_json::Value;
 
 use super::failure_log::Tail;
 use super::report_digest::ReportDigest;
 use super::view::View;
-use crate::pod::run::results_format;
+use crate::pod::carla::results_format;
 use crate::services::evalai::{Outline, Patience, StoredResult};
 use crate::services::table::Row;
 use leaderboard_api::{FailureClass, LeaderboardVersion, LogTail, State, SubmissionStatus, effective};
+use leaderboard_results::{metrics, number_text};
 
 /// What the result in the view is sent with: nothing of a bucket where none is stored. `so_far`: with the metrics over the routes so
 /// far, else with the original's zeros.

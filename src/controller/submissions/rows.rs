@@ -3,55 +3,17 @@
 
 use std::collections::HashMap;
 use std::sync::{Arc, Mutex};
-use std::time::Duration;
 
-use crate::ask::{Ask, Asker, Failure, Service, Wake};
+use super::questions::{ForeignRun, Row};
+use crate::ask::question::Failure;
+use crate::ask::{Asker, Wake};
 use crate::lock::lock;
 use crate::observability::tasks::Tasks;
 use crate::services::aws::Aws;
 use crate::services::table::{ObservedRow, Table, TableError, TableId};
-use leaderboard_api::{self as api, Attempt, RunId};
 
-/// A run of another program, as its row shows it.
-#[derive(Clone, Debug, PartialEq, Eq)]
-pub struct ForeignRun {
-    pub status: String,
-    /// Since when, as it is stored.
-    pub since: Option<String>,
-}
-
-/// Where the row of a submission would be.
-#[derive(Clone, Debug, PartialEq)]
-pub struct Row {
-    /// An attempt asks anew: another program may have begun since.
-    pub attempt: Attempt,
-    pub table: api::Table,
-    /// Id of the team, the table's partition key.
-    pub team: String,
-    pub run_id: RunId,
-}
-
-/// How long after an answer the row is read again.
-pub const AGAIN: Duration = Duration::from_secs(30);
 /// What the old pipeline's row shows of a run that has not ended.
 const UNDER_WAY: [&str; 2] = ["SUBMITTED", "RUNNING"];
-
-impl Ask for Row {
-    /// None: no other program runs the submission.
-    type Answer = Option<ForeignRun>;
-    const AT_ONCE: usize = 16;
-    const AT_ONCE_OF_A_SERVICE: usize = 4;
-    const LONGEST: Duration = Duration::from_secs(10);
-
-    fn service(&self) -> Service {
-        Service::table(&self.table)
-    }
-
-    fn again(&self, result: &Result<Self::Answer, Failure>, _failures: u32) -> Option<Duration> {
-        let is_free = matches!(result, Ok(None));
-        (!is_free).then_some(AGAIN)
-    }
-}
 
 /// Starts the task that reads.
 pub fn start(aws: &Aws, tasks: &Tasks, wake: Wake) -> Asker<Row> {
@@ -168,26 +130,5 @@ mod tests {
             text: text(),
         };
         assert_eq!(is_refused(passing), Some(false));
-    }
-
-    #[test]
-    fn a_row_is_read_once_unless_it_shows_a_run_or_cannot_be_read() {
-        let question = Row {
-            attempt: Attempt::FIRST,
-            table: serde_json::from_value(serde_json::json!({"name": "rows"})).unwrap(),
-            team: "42".into(),
-            run_id: "77".parse().unwrap(),
-        };
-        let run = ForeignRun {
-            status: "RUNNING".into(),
-            since: None,
-        };
-        let unread = Failure {
-            is_refused: true,
-            why: "no".into(),
-        };
-        assert_eq!(question.again(&Ok(None), 0), None);
-        assert_eq!(question.again(&Ok(Some(run)), 0), Some(AGAIN));
-        assert_eq!(question.again(&Err(unread), 9), Some(AGAIN));
     }
 }

@@ -6,17 +6,15 @@
 use sha2::{Digest, Sha256};
 
 use super::phases::{Ended, Phase, restarted};
-use super::view::View;
 use crate::controller::objects::uid_of;
 use crate::observability::trace_id::TraceId;
 use crate::observability::traces::{Kind, Span, Value};
 use leaderboard_api::{Submission, SubmissionStatus, names, reasons};
 
 /// The spans of what has ended with `new`.
-pub fn of(view: &View, new: &SubmissionStatus, ended: &[Ended]) -> Vec<Span> {
-    let submission = &view.submission;
-    let new = restarted(view, new).unwrap_or(new);
-    let uid = uid_of(submission.as_ref());
+pub fn of(submission: &Submission, new: &SubmissionStatus, ended: &[Ended]) -> Vec<Span> {
+    let new = restarted(submission, new).unwrap_or(new);
+    let uid = uid_of(submission);
     let root = id(&uid, Phase::Intake, 0);
     let attempt = new.attempt.unwrap_or_default();
     let of_attempt = id(&uid, Phase::Attempt, attempt.0);
@@ -28,7 +26,7 @@ pub fn of(view: &View, new: &SubmissionStatus, ended: &[Ended]) -> Vec<Span> {
             _ => (leaf(&uid, one), Some(of_attempt)),
         };
         let mut attributes = common(submission, new);
-        attributes.extend(particular(view, new, one.phase));
+        attributes.extend(particular(submission, new, one.phase));
         Span {
             trace: TraceId::of(&uid),
             id: own,
@@ -74,10 +72,10 @@ fn common(submission: &Submission, new: &SubmissionStatus) -> Vec<(&'static str,
 }
 
 /// What is worth knowing of one phase.
-fn particular(view: &View, new: &SubmissionStatus, phase: Phase) -> Vec<(&'static str, Value)> {
-    let old = view.submission.status.as_ref();
+fn particular(submission: &Submission, new: &SubmissionStatus, phase: Phase) -> Vec<(&'static str, Value)> {
+    let old = submission.status.as_ref();
     match phase {
-        Phase::Intake => view.submission.spec.evalai.map_or_else(Vec::new, |evalai| {
+        Phase::Intake => submission.spec.evalai.map_or_else(Vec::new, |evalai| {
             vec![
                 ("evalai.challenge", Value::Number(evalai.challenge)),
                 ("evalai.phase", Value::Number(evalai.phase)),
@@ -87,7 +85,7 @@ fn particular(view: &View, new: &SubmissionStatus, phase: Phase) -> Vec<(&'stati
         Phase::Attempt => of_attempt(new),
         Phase::Schedule | Phase::Start | Phase::Run => {
             let job = old.filter(|old| old.attempt == new.attempt).unwrap_or(new).job_number();
-            let job = names::job(view.submission.metadata.name.as_deref().unwrap_or_default(), job);
+            let job = names::job(submission.metadata.name.as_deref().unwrap_or_default(), job);
             let node = [Some(new), old]
                 .into_iter()
                 .flatten()
@@ -120,4 +118,101 @@ fn of_attempt(new: &SubmissionStatus) -> Vec<(&'static str, Value)> {
 fn failed(new: &SubmissionStatus, phase: Phase) -> Option<&'static str> {
     let failure = new.failure.as_ref().filter(|_| phase == Phase::Attempt)?;
     Some(reasons::of(&failure.reason).map_or("Other", |reason| reason.name))
+}
+
+#[cfg(test)]
+mod tests {
+    use jiff::Timestamp;
+    use serde_json::{Value as Json, json};
+
+    use super::*;
+    use leaderboard_api::Attempt;
+
+    fn submission(attempt: i64, status: &Json) -> Submission {
+        serde_json::from_value(json!({
+            "apiVersion": "leaderboard.carla.org/v1alpha1", "kind": "Submission",
+            "metadata": {"name": "sub", "namespace": "ns", "uid": "uid-1"},
+            "spec": {
+                "leaderboardName": "carla", "image": "team/agent:1", "attempt": attempt,
+                "evalai": {"challenge": 1, "phase": 2, "submission": 3},
+            },
+            "status": status,
+        }))
+        .unwrap()
+    }
+
+    fn status(fields: Json) -> SubmissionStatus {
+        serde_json::from_value(fields).unwrap()
+    }
+
+    fn ended(phase: Phase) -> Ended {
+        Ended {
+            phase,
+            start: Timestamp::from_second(10).unwrap(),
+            end: Timestamp::from_second(120).unwrap(),
+        }
+    }
+
+    #[test]
+    fn what_a_restart_ends_is_of_the_attempt_before() {
+        let old = json!({"attempt": 1, "jobName": "sub-1"});
+        let new = status(json!({"attempt": 2, "conditions": [{
+            "type": "Finished", "status": "False", "reason": reasons::REPLACING, "message": "m",
+            "lastTransitionTime": "2026-01-01T00:00:00Z",
+        }]}));
+        let spans = of(&submission(2, &old), &new, &[ended(Phase::Run), ended(Phase::Attempt)]);
+        let attempt = ("leaderboard.attempt", Value::Number(1));
+        assert!(spans.iter().all(|span| span.attributes.contains(&attempt)), "{spans:?}");
+    }
+
+    #[test]
+    fn the_spans_of_a_failed_attempt_are_one_tree_that_names_the_reason() {
+        let failed = json!({
+            "attempt": 1, "state": "Failed",
+            "failure": {"class": "Participant", "reason": reasons::AGENT_CRASHED, "message": "m"},
+            "conditions": [{
+                "type": "Finished", "status": "True", "reason": reasons::AGENT_CRASHED, "message": "m",
+                "lastTransitionTime": "2026-01-01T00:00:00Z",
+            }],
+        });
+        let submission = submission(1, &json!({"attempt": 1}));
+        let spans = of(
+            &submission,
+            &status(failed),
+            &[ended(Phase::Run), ended(Phase::Attempt)],
+        );
+        let [run, attempt] = &spans[..] else {
+            panic!("{spans:?}")
+        };
+        assert_eq!((run.name, run.parent), ("run", Some(attempt.id)));
+        assert_eq!((run.error, attempt.error), (None, Some(reasons::AGENT_CRASHED)));
+        assert_eq!(run.trace, TraceId::of("uid-1"));
+        for expected in [
+            ("leaderboard.state", Value::Word("Failed")),
+            ("leaderboard.failure.class", Value::Word("Participant")),
+        ] {
+            assert!(attempt.attributes.contains(&expected), "{expected:?}");
+        }
+        let chosen = Value::Text("team/agent:1".into());
+        let mut texts = spans.iter().flat_map(|span| &span.attributes);
+        assert!(texts.all(|(_, value)| *value != chosen), "a text of the participant");
+    }
+
+    #[test]
+    fn ids_are_the_same_in_every_process_and_the_intake_is_the_root() {
+        let phases = [ended(Phase::Intake), ended(Phase::Accept)];
+        let new = status(json!({"attempt": Attempt::FIRST}));
+        let spans = of(&submission(1, &Json::Null), &new, &phases);
+        assert_eq!(spans, of(&submission(1, &Json::Null), &new, &phases));
+        let (intake, accept) = (&spans[0], &spans[1]);
+        assert_eq!(
+            (intake.name, intake.parent, intake.kind),
+            ("intake", None, Kind::Consumer)
+        );
+        assert_eq!(accept.name, "accept");
+        assert!(accept.parent.is_some_and(|parent| parent != intake.id));
+        let text = |text: &str| Value::Text(text.to_owned());
+        assert!(intake.attributes.contains(&("leaderboard.submission", text("sub"))));
+        assert!(intake.attributes.contains(&("leaderboard.attempt", Value::Number(1))));
+    }
 }

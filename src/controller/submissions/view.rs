@@ -4,16 +4,16 @@ use std::sync::Arc;
 use std::time::Duration;
 
 use jiff::Timestamp;
-use leaderboard_runner::verdict::Verdict;
 
 use super::report_digest::ReportDigest;
-use super::rows::Row;
-use crate::ask::Lookup;
+use crate::ask::question::Lookup;
 pub use crate::controller::slots::turns::Turn;
+use crate::controller::submissions::questions::Row;
 use crate::pod::run::Stop;
-use crate::pod::workspace::WorkspaceReason;
+use crate::pod::verdict::WorkspaceReason;
 use crate::services::evalai::Status;
 use leaderboard_api::{Attempt, JobNumber, Leaderboard, SharedText, Submission, names};
+use leaderboard_runner::verdict::Verdict;
 
 /// Everything a decision may depend on.
 #[derive(Clone, Debug)]

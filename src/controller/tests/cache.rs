@@ -64,7 +64,7 @@ fn job(number: usize) -> Value {
         leaderboard: &board(),
         plan,
         number: JobNumber::first(Attempt(1)),
-        settings: &settings(),
+        own: &settings().own,
         failed_nodes: &[],
         now: jiff::Timestamp::now(),
     }));

@@ -28,12 +28,12 @@ use crate::controller::settings::Settings;
 use crate::controller::slots::Slots;
 use crate::controller::stores::{Stores, owner_uid};
 use crate::controller::submissions::external::ExternalSystems;
+use crate::controller::submissions::job_spec::OwnImage;
 use crate::controller::submissions::memory::Memory;
 use crate::controller::submissions::observe::causes::Causes;
 use crate::controller::submissions::observe::workers::Workers;
 use crate::kubernetes::objects::{Job, Owner, Pod};
-use crate::kubernetes::{Namespaces, Writer};
-use crate::kubernetes::{Store, Synced};
+use crate::kubernetes::{Namespaces, Store, Synced, Writer};
 use crate::observability::shutdown::Stop;
 use crate::observability::tasks::Tasks;
 use crate::observability::traces::Traces;
@@ -150,10 +150,10 @@ fn noting<K: Resource<DynamicType = ()> + 'static>(names: &mpsc::UnboundedSender
 /// As the operator is started.
 pub fn settings() -> Settings {
     Settings {
-        image: "operator:1".into(),
-        image_pull_policy: None,
-        region: None,
-        checksums: None,
+        own: OwnImage {
+            image: "operator:1".into(),
+            ..OwnImage::default()
+        },
         operator: OPERATOR.into(),
         namespaces: Namespaces::All,
         has_cluster_rights: true,

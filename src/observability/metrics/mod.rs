@@ -14,16 +14,18 @@ use std::sync::{Arc, Mutex};
 use std::time::Duration;
 
 use jiff::Timestamp;
-use leaderboard_api::text::{LONGEST_NAME, one_line};
 use prometheus_client::encoding::text;
 use prometheus_client::metrics::counter::Counter;
 use prometheus_client::metrics::gauge::Gauge;
+
+use leaderboard_api::text::{LONGEST_NAME, one_line};
 pub use prometheus_client::metrics::histogram::Histogram;
 use prometheus_client::metrics::info::Info;
 use prometheus_client::registry::Registry;
 
 use super::REVISION;
 use crate::lock::lock;
+use crate::services::meter::Meter;
 use families::{Counters, Families, Gauges, Timings};
 use leader::{Leader, Samples};
 use process::Process;
@@ -244,6 +246,21 @@ impl Default for Metrics {
 }
 
 impl Metrics {
+    /// What counts the calls of clients here.
+    pub fn meter(self: &Arc<Self>) -> Meter {
+        let metrics = Arc::clone(self);
+        Meter::new(move |call| {
+            let (service, op, outcome, took) = (call.service, call.op, call.outcome, call.took.as_secs_f64());
+            if service == "evalai" {
+                metrics.evalai.requests.of([op, outcome]).inc();
+                metrics.evalai.duration.of([op]).observe(took);
+            } else {
+                metrics.shared.cloud_calls.of([service, op, outcome]).inc();
+                metrics.shared.cloud_call_duration.of([service, op]).observe(took);
+            }
+        })
+    }
+
     /// All metrics at their beginning; the names of the operator's own start with `leaderboard_`.
     pub fn new(program: Program) -> Self {
         let (mut registry, mut unexported) = (Registry::default(), Registry::default());

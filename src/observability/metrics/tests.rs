@@ -258,3 +258,19 @@ fn a_walk_replaces_all_that_the_one_before_has_shown() {
         "one that ends after the lead shows nothing"
     );
 }
+
+#[test]
+fn every_call_is_counted_once_also_one_that_was_abandoned() {
+    let metrics = Arc::new(Metrics::new(Program::Controller));
+    let meter = metrics.meter();
+    meter.begin("s3", "GetObject").end("ok");
+    drop(meter.clone().begin("evalai", "get_submission"));
+    Meter::default().begin("s3", "GetObject").end("ok");
+    let text = metrics.text().unwrap();
+    for line in [
+        "leaderboard_cloud_calls_total{service=\"s3\",op=\"GetObject\",outcome=\"ok\"} 1",
+        "leaderboard_evalai_requests_total{op=\"get_submission\",outcome=\"abandoned\"} 1",
+    ] {
+        assert!(text.lines().any(|found| found == line), "{line} is missing in\n{text}");
+    }
+}

@@ -16,7 +16,6 @@ use tokio::task::JoinHandle;
 use super::{Kind, Span, Traces, Value};
 use crate::observability::metrics::Metrics;
 use crate::observability::tasks::Tasks;
-use leaderboard_api::client_errors;
 use leaderboard_api::names::OPERATOR;
 
 /// Spans that wait: those of some 200 submissions that end at once.
@@ -94,7 +93,7 @@ pub fn start(endpoint: Option<&str>, metrics: &Arc<Metrics>, tasks: &Tasks) -> R
         // The headers hold credentials, which are for this address alone.
         .redirect(reqwest::redirect::Policy::none())
         .build()
-        .map_err(|error| TracesError::Client(client_errors::chain(&error)))?;
+        .map_err(|error| TracesError::Client(leaderboard_api::text::chain(&error)))?;
     let builder = SpanExporter::builder()
         .with_http()
         .with_http_client(client)

@@ -8,26 +8,26 @@ use std::sync::{Arc, Mutex};
 use std::time::{Duration, Instant};
 
 use hyper::body::Bytes;
-use leaderboard_runner::protocol::{self, Mark, Pair, StatusFile};
 use tokio::sync::watch;
 
 use super::describe::{describe, to_bytes};
 use super::{LANDING, LAST_FLUSH, LogcopyError, create};
 use crate::lock::lock;
 use crate::pod::blocking;
-use crate::pod::gather::{Gathered, Gatherer};
+use crate::pod::gather::{Gathered, Gatherer, Object};
 use crate::pod::judge::{Ending, Judge, Outside, Step, decide};
 use crate::pod::keys::agent_folder;
 use crate::pod::places::Setting;
 use crate::pod::report::{Logs, OWNER_KEY, Owner, REPORT_KEY, Report};
 use crate::pod::run::{STATUS_FOLDER, Stop};
 use crate::pod::tree::Tree;
+use crate::pod::upload::Haste;
 use crate::pod::upload::complaints::Why as Complaint;
 use crate::pod::upload::send::{Uploader, Window};
 use crate::pod::upload::wanted::{Files, Wanted};
-use crate::pod::upload::{Haste, Object};
 use crate::pod::watch::Watch;
 use crate::services::archive::{Archive, ArchiveError, Fetched};
+use leaderboard_runner::protocol::{self, Mark, Pair, StatusFile};
 
 /// Rounds of a container whose status files are stored: far more than retries a host forgives.
 const STATUS_ROUNDS: u32 = 64;

@@ -7,8 +7,9 @@ use std::future::Future;
 use std::sync::Arc;
 use std::time::{Duration, Instant};
 
-use super::{Decision, Object, Stored, fingerprint};
+use super::{Decision, Stored, fingerprint};
 use crate::pod::blocking;
+use crate::pod::gather::Object;
 use crate::pod::tree::{Stamp, Tree, TreeError};
 use crate::pod::upload::wanted::Wanted;
 use crate::services::archive::{Archive, ArchiveError, Cause, Kept, MIN_PART, PART, read_range};

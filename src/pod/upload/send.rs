@@ -14,9 +14,10 @@ use super::complaints::{Complaints, Why};
 use super::job::{Job, Outcome, Put};
 use super::quota::{Ledger, Quota, cost};
 use super::wanted::Wanted;
-use super::{Decision, Memory, Object, Stored, decide_upload};
+use super::{Decision, Memory, Stored, decide_upload};
 use crate::pod::blocking;
 use crate::pod::daily::{Spent, today};
+use crate::pod::gather::Object;
 use crate::pod::tree::{Stamp, Tree, TreeError};
 use crate::services::archive::{Archive, ArchiveError, Cause};
 

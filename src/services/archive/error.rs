@@ -1,7 +1,6 @@
 //! What goes wrong with S3, in words for the person who runs the bucket.
 
 use aws_sdk_s3::error::{ProvideErrorMetadata, SdkError};
-use leaderboard_api::client_errors;
 
 use super::parts::PartsError;
 
@@ -124,7 +123,7 @@ impl Cause {
     where
         E: std::error::Error + 'static,
     {
-        let text = client_errors::chain(error);
+        let text = leaderboard_api::text::chain(error);
         if text.contains("credentials") {
             Self::Denied(text)
         } else {

@@ -6,7 +6,6 @@ use reqwest::header::RETRY_AFTER;
 use reqwest::{RequestBuilder, Response};
 
 use super::answer::{Answer, Silence, classify};
-use leaderboard_api::client_errors;
 
 /// How long an answer is waited for.
 #[derive(Clone, Copy, Debug)]
@@ -46,7 +45,9 @@ pub(super) fn builder(timeouts: Timeouts) -> reqwest::ClientBuilder {
 }
 
 pub(super) fn made(builder: reqwest::ClientBuilder) -> Result<reqwest::Client, ClientError> {
-    builder.build().map_err(|e| ClientError(client_errors::chain(&e)))
+    builder
+        .build()
+        .map_err(|e| ClientError(leaderboard_api::text::chain(&e)))
 }
 
 /// What of an answer is worth something.
@@ -107,7 +108,7 @@ pub(super) fn silence(error: reqwest::Error) -> Silence {
     };
     Silence {
         sent: !error.is_connect() && !error.is_builder() && !is_canceled(&error),
-        why: format!("{what} ({})", client_errors::chain(&error)),
+        why: format!("{what} ({})", leaderboard_api::text::chain(&error)),
     }
 }
 

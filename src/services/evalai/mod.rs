@@ -23,6 +23,7 @@ pub mod status;
 mod task;
 pub mod types;
 
+pub use crate::pod::report::Patience;
 pub use http::{ClientError, Timeouts};
 pub use hub::{Hub, Options};
 pub use labels::{Labels, Misfit};
@@ -30,6 +31,6 @@ pub use queue::Timing;
 pub use row::Row;
 pub use status::{Outcome, Progress, Status};
 pub use types::{
-    Changed, DesiredUpdate, Ended, ImageAnswer, InboxTrouble, Key, Outline, Patience, Payload, PayloadProblem,
-    PayloadReader, Publisher, Run, StoredResult, Subject, SubmissionState, SweepRow, Swept, Target, Usage, WriteGuard,
+    Changed, DesiredUpdate, Ended, ImageAnswer, InboxTrouble, Key, Outline, Payload, PayloadProblem, PayloadReader,
+    Publisher, Run, StoredResult, Subject, SubmissionState, SweepRow, Swept, Target, Usage, WriteGuard,
 };

@@ -112,6 +112,14 @@ impl Progress {
             Self::Running => "running",
         }
     }
+
+    /// The status it leads to.
+    pub fn status(self) -> Status {
+        match self {
+            Self::Queued => Status::Queued,
+            Self::Running => Status::Running,
+        }
+    }
 }
 
 /// How a run has ended, as EvalAI shows it.

@@ -10,9 +10,10 @@ use jiff::Timestamp;
 
 use super::row::Row;
 use super::status::{Outcome, Progress, Status};
+pub use crate::object_key::ObjectKey as Key;
 use crate::observability::about::LogSpan;
-pub use crate::services::ObjectKey as Key;
-use crate::services::archive::ContentId;
+use crate::pod::report::ContentId;
+use crate::pod::report::Patience;
 use crate::services::token::Token;
 use leaderboard_api::{Attempt, Storage};
 
@@ -142,26 +143,6 @@ pub struct StoredResult {
     /// The metrics over the work so far are wanted, where it has them.
     pub so_far: bool,
     pub patience: Patience,
-}
-
-/// Until when what cannot be read is waited for. After that it is left out.
-#[derive(Clone, Copy, Debug, PartialEq, Eq)]
-pub struct Patience {
-    /// Texts that are of another round than the report: they hardly change.
-    pub unfit: Timestamp,
-    /// Texts that the bucket does not give out.
-    pub unread: Timestamp,
-    /// The report itself.
-    pub report: Timestamp,
-}
-
-impl Patience {
-    /// Nothing is left out.
-    pub const ENDLESS: Self = Self {
-        unfit: Timestamp::MAX,
-        unread: Timestamp::MAX,
-        report: Timestamp::MAX,
-    };
 }
 
 /// Texts of an evaluation.

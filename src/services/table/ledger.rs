@@ -9,8 +9,8 @@ use std::time::Duration;
 use tokio::time::Instant;
 
 use super::{Row, TableError, Written};
+use crate::object_key::ObjectKey;
 use crate::observability::about::LogSpan;
-use crate::services::ObjectKey;
 use leaderboard_api as api;
 
 /// How long a row that was refused for its own sake is not retried.

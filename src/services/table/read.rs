@@ -5,6 +5,7 @@ use std::collections::HashMap;
 use aws_sdk_dynamodb::types::AttributeValue;
 
 use super::{ATTEMPT, STATUS, Table, TableError, failed};
+use crate::services::metered::Metered;
 
 /// Column with the start of a run, `-` before it.
 const START: &str = "start_time";

@@ -16,9 +16,9 @@ use super::ledger::{Ledger, RowState, RowUpdate, TableId};
 use super::{Row, Table, TableError, Written};
 use crate::backoff::Backoff;
 use crate::lock::lock;
+use crate::object_key::ObjectKey;
 use crate::observability::about::LogSpan;
 use crate::observability::tasks::Tasks;
-use crate::services::ObjectKey;
 use crate::services::aws::Aws;
 use leaderboard_api as api;
 

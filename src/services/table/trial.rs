@@ -3,6 +3,7 @@
 use aws_sdk_dynamodb::operation::update_item::UpdateItemError;
 
 use super::{Row, Table, TableError, failed};
+use crate::services::metered::Metered;
 
 /// No row fulfils it, so nothing is written; DynamoDB looks at the right to write before it looks at the condition.
 const NEVER: &str = "attribute_exists(#attempt) AND attribute_not_exists(#attempt)";

@@ -2,13 +2,13 @@
 
 use std::collections::BTreeMap;
 
-use leaderboard_operator::pod::ownlog::{CONTENTS_LOG, WORKSPACE_LOG};
-use leaderboard_operator::pod::report::Logs;
-use leaderboard_operator::services::logs::Miss;
 use tokio::sync::watch;
 
 use super::*;
 use crate::support::throttle::Throttle;
+use leaderboard_operator::pod::keys::{CONTENTS_LOG, WORKSPACE_LOG};
+use leaderboard_operator::pod::report::Logs;
+use leaderboard_operator::services::logs::Miss;
 
 /// A Pod whose logs go to a group of its own, and the group's name.
 async fn pod_with_logs() -> (Pod, String) {

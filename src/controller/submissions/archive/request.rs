@@ -85,7 +85,7 @@ impl Work {
             attempt,
             ..
         } = &*self.target;
-        about::submission(format_args!("{namespace}/{name}"), leaderboard, *attempt, &self.uid)
+        about::submission(format_args!("{namespace}/{name}"), leaderboard, attempt.0, &self.uid)
     }
 }
 

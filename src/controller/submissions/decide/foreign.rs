@@ -1,14 +1,15 @@
 //! Another program may run a submission of EvalAI's too, as the old pipeline does. A row of its run, or results of something else below
 //! the prefix, hold the submission back: nothing is written anywhere until that run has ended, or a person hands the submission over.
 
+use super::clock;
 use super::plan::{Action, Question};
 use super::plan_builder::{PlanBuilder, Terms};
+use super::stop;
 use super::waits::Wait;
-use super::{clock, stop};
-use crate::ask::{Answered, Failure};
-use crate::controller::submissions::rows::{ForeignRun, Row};
+use crate::ask::question::{Answered, Failure};
+use crate::controller::submissions::questions::{ForeignRun, Row};
 use crate::controller::submissions::view::{ContainerView, JobView, PodView};
-use crate::pod::workspace::WorkspaceReason;
+use crate::pod::verdict::WorkspaceReason;
 use leaderboard_api::conditions::{self, Truth};
 use leaderboard_api::text::{LONGEST_NAME, one_line, sentence};
 use leaderboard_api::{names, reasons};

@@ -1,12 +1,10 @@
 //! In line for a slot: joins it, and shows the place. Who is next is decided by `slots`.
 
-use kube::ResourceExt;
-
 use super::plan::Action;
 use super::plan_builder::PlanBuilder;
 use crate::controller::slots::check_team;
 use crate::controller::slots::turns::{InLine, Turn};
-use leaderboard_api::{Eta, Waiting, reasons};
+use leaderboard_api::{Eta, ResourceExt, Waiting, reasons};
 
 /// What follows from its turn.
 pub(super) enum Step {

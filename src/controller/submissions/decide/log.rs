@@ -84,7 +84,7 @@ fn places(status: &SubmissionStatus, pod: Option<&PodView>) -> Vec<LogPlace> {
         reasons::START_DEADLINE => vec![pod.and_then(trouble::failing_before_agents).and_then(on_node)],
         reasons::RESULTS_NOT_STORED | reasons::JOB_FAILED => vec![
             on_node(names::CONTAINER_LOGCOPY),
-            Some(stored(names::CONTAINER_LOGCOPY, crate::pod::ownlog::OWN_LOG.into())),
+            Some(stored(names::CONTAINER_LOGCOPY, crate::pod::keys::OWN_LOG.into())),
         ],
         // It never ran.
         reasons::IMAGE_INVALID

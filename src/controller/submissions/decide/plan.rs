@@ -3,7 +3,7 @@
 use std::time::Duration;
 
 use crate::controller::slots::turns::InLine;
-use crate::controller::submissions::rows::Row;
+use crate::controller::submissions::questions::Row;
 use crate::controller::submissions::view::{LogPlace, ReportDemand};
 use crate::pod::run::Stop;
 use leaderboard_api::{JobNumber, SubmissionStatus, names};

@@ -4,7 +4,7 @@
 
 use super::words::{self, Cause};
 use crate::controller::submissions::view::{ContainerView, PodView};
-use crate::pod::workspace::WorkspaceReason;
+use crate::pod::verdict::WorkspaceReason;
 use leaderboard_api::text::sentence;
 use leaderboard_api::{names, reasons};
 use leaderboard_runner::protocol::{Member, Side};

@@ -9,12 +9,12 @@ use std::path::{Path, PathBuf};
 use std::process::{Command, Output};
 use std::time::Duration;
 
-use leaderboard_runner::{args, expand, graphics};
 use serde_json::{Value, json};
 
 use super::commands;
 use super::tests::{Case, container};
 use leaderboard_api::Attempt;
+use leaderboard_runner::{args, expand, graphics};
 
 /// A word as the kubelet hands it on (k8s.io/kubernetes/third_party/forked/golang/expansion).
 pub(super) fn kubernetes_expand(word: &str, lookup: &dyn Fn(&str) -> Option<String>) -> String {
@@ -84,7 +84,9 @@ fn behind_runner(words: &[String], env: &mut BTreeMap<String, String>) -> (args:
         return (*job, command);
     }
     // As on a node where the pair sees all GPUs.
-    let index = env.get(graphics::INDEX).map_or(0, |index| index.parse().unwrap());
+    let index = env
+        .get(leaderboard_runner::needs::INDEX)
+        .map_or(0, |index| index.parse().unwrap());
     let command = job
         .command
         .iter()
@@ -325,7 +327,7 @@ fn the_runner_gets_the_deadlines() {
             cancel: seconds(40),
             answer: Duration::from_secs(10),
             log: Some("/home/carla/CarlaUE4/Saved/console-3.log".into()),
-            gpu: Some(graphics::Needs::Vulkan),
+            gpu: Some(leaderboard_runner::needs::Needs::Vulkan),
             agent_gpu: false,
             unset: vec!["DISPLAY".into(), "XAUTHORITY".into()],
         }

@@ -3,9 +3,8 @@
 //! Kubernetes replaces `$(NAME)` in a container's words and variables when it starts; the runner does the same with an
 //! agent's words when it starts that, and knows the round. A shell comes last.
 
-use crate::controller::submissions::pod_layout::python_path;
+use crate::pod::layout::python_path;
 use leaderboard_api::LeaderboardVersion;
-use leaderboard_runner::graphics;
 
 const ADAPTER: &str = "-ini:[/Script/Engine.RendererSettings]:r.GraphicsAdapter=";
 
@@ -24,7 +23,7 @@ impl Adapter {
         match self {
             Self::Unnamed => None,
             Self::Numbered(number) => Some(format!("{ADAPTER}{number}")),
-            Self::Found => Some(literal(&format!("{ADAPTER}$({})", graphics::ADAPTER))),
+            Self::Found => Some(literal(&format!("{ADAPTER}$({})", leaderboard_runner::needs::ADAPTER))),
         }
     }
 }

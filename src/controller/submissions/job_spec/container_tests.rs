@@ -4,8 +4,7 @@ use serde_json::{Value, json};
 
 use super::run_document;
 use super::tests::{Case, OPERATOR_IMAGE, container, containers, role};
-use crate::pod::run::ENV_ROLE_ARN;
-use crate::pod::run::Run;
+use crate::pod::run::{ENV_ROLE_ARN, Run};
 use leaderboard_api::{Attempt, names};
 
 fn env<'a>(container: &'a Value, name: &str) -> Option<&'a Value> {
@@ -190,7 +189,7 @@ fn the_controllers_setting_of_checksums_is_that_of_its_pods() {
     const NAME: &str = "AWS_REQUEST_CHECKSUM_CALCULATION";
     let mut case = Case::new("V2", json!({}));
     for setting in [None, Some("when_required")] {
-        case.settings.checksums = setting.map(str::to_owned);
+        case.own.checksums = setting.map(str::to_owned);
         for container in containers(&case.json()) {
             assert_eq!(value(container, NAME), setting.filter(|_| is_own(container)));
         }
@@ -400,8 +399,8 @@ fn all_agents_of_a_pod_get_one_image_unless_the_host_has_nodes_ask_each_time() {
 #[test]
 fn our_own_image_has_the_pull_policy_and_region_of_the_operator() {
     let mut case = Case::new("V2", json!({}));
-    case.settings.image_pull_policy = Some("Always".into());
-    case.settings.region = Some("us-west-2".into());
+    case.own.pull_policy = Some("Always".into());
+    case.own.region = Some("us-west-2".into());
     let job = case.json();
     for container in containers(&job) {
         let is_agent = container["name"].as_str().unwrap().starts_with("agent-");

@@ -9,14 +9,14 @@ use std::collections::BTreeMap;
 
 use k8s_openapi::api::core::v1::{EnvVar, PodResourceClaim, ResourceClaim, ResourceRequirements};
 use k8s_openapi::apimachinery::pkg::api::resource::Quantity;
-use leaderboard_api::{GpuSource, LeaderboardSpec, names};
-use leaderboard_runner::graphics::{INDEX, Needs};
-use leaderboard_runner::protocol::{Member, Pair, Side};
 use serde_json::{Value, json};
 
 use super::failed_nodes::{HOSTNAME, REQUIRED};
 use super::{JobInput, variable};
 use crate::controller::gpu_claims::{source, template_name};
+use leaderboard_api::{GpuSource, LeaderboardSpec, names};
+use leaderboard_runner::needs::{INDEX, Needs};
+use leaderboard_runner::protocol::{Member, Pair, Side};
 
 const DEVICES: &str = "NVIDIA_VISIBLE_DEVICES";
 const CAPABILITIES: &str = "NVIDIA_DRIVER_CAPABILITIES";

@@ -9,9 +9,8 @@ use k8s_openapi::api::core::v1::{
 use super::security::{confined, context, resources};
 use super::{JobInput, commands, is_resumed, own_uid, run_document, variable, volumes};
 use crate::controller::submissions::pod_layout::CONTENTS_LOG_FOLDER;
-use crate::pod::ownlog::CONTENTS_LOG;
-use crate::pod::run::{ENV_POD_UID, ENV_ROLE_ARN, ENV_RUN, RUNNER, TOOLS};
-use crate::services::aws::ENV_CHECKSUMS;
+use crate::pod::keys::CONTENTS_LOG;
+use crate::pod::run::{ENV_CHECKSUMS, ENV_POD_UID, ENV_ROLE_ARN, ENV_RUN, RUNNER, TOOLS};
 use leaderboard_api::names;
 
 /// Copying prints little; what floods must not fill the disk. In bytes.
@@ -83,8 +82,8 @@ fn own(input: &JobInput<'_>, name: &str) -> Container {
     let uid = own_uid::of(input);
     Container {
         name: name.into(),
-        image: Some(input.settings.image.clone()),
-        image_pull_policy: input.settings.image_pull_policy.clone(),
+        image: Some(input.own.image.clone()),
+        image_pull_policy: input.own.pull_policy.clone(),
         command: Some(vec!["leaderboard-operator".into(), name.into()]),
         env: Some(own_env(input)),
         security_context: Some(SecurityContext {
@@ -116,9 +115,9 @@ fn own_env(input: &JobInput<'_>) -> Vec<EnvVar> {
         // The node's own role is no identity of ours: what answers us at the metadata address answers the agents too.
         variable("AWS_EC2_METADATA_DISABLED", "true"),
     ];
-    let region = input.settings.region.as_ref().or(input.plan.storage.region.as_ref());
+    let region = input.own.region.as_ref().or(input.plan.storage.region.as_ref());
     env.extend(region.map(|region| variable("AWS_REGION", region)));
-    let checksums = input.settings.checksums.as_deref();
+    let checksums = input.own.checksums.as_deref();
     env.extend(checksums.map(|when| variable(ENV_CHECKSUMS, when)));
     if let Some(identity) = &input.spec().pod_identity {
         env.extend(identity.role_arn.as_deref().map(|role| variable(ENV_ROLE_ARN, role)));

@@ -42,8 +42,7 @@ use serde_json::Value;
 use super::pod_layout::ANNOTATION_SKIP_CONTAINERS;
 use super::pod_overlay;
 use crate::controller::gpu_claims::source;
-use crate::controller::objects::owner_reference;
-use crate::controller::settings::Settings;
+use crate::controller::owner::owner_reference;
 use crate::pod::run::{Isolation, Run, SCHEMA};
 pub use gpu_count::gpus;
 use leaderboard_api::{
@@ -63,6 +62,17 @@ const SPARE_RESTARTS: i32 = 20;
 /// A policy that a Pod has found not to be enforced is taken for such so long; after that each Pod waits its full time again.
 const KNOWN_OPEN_FOR: Duration = Duration::from_hours(1);
 
+/// The operator's own image, with `workspace` and `logcopy` in it, and what of its environment their containers get.
+#[derive(Clone, Debug, Default)]
+pub struct OwnImage {
+    pub image: String,
+    pub pull_policy: Option<String>,
+    /// AWS region.
+    pub region: Option<String>,
+    /// When S3 is sent checksums.
+    pub checksums: Option<String>,
+}
+
 /// What a Job is built from.
 #[derive(Clone, Copy, Debug)]
 pub struct JobInput<'a> {
@@ -74,8 +84,7 @@ pub struct JobInput<'a> {
     pub plan: &'a RunPlan,
     /// Which Job it is.
     pub number: JobNumber,
-    /// The operator's own image, with `workspace` and `logcopy` in it, and its region.
-    pub settings: &'a Settings,
+    pub own: &'a OwnImage,
     /// Nodes that have failed earlier Jobs of the attempt.
     pub failed_nodes: &'a [FailedNode],
     /// When it is made.

@@ -1,8 +1,6 @@
 //! The two containers of each worker: strangers' images behind our runner. Pure.
 
 use k8s_openapi::api::core::v1::{Container, EnvVar, ResourceRequirements, SecurityContext};
-use leaderboard_api::effective;
-use leaderboard_runner::protocol::{Member, Pair, Side};
 use serde_json::Value;
 
 use super::security::context;
@@ -11,6 +9,8 @@ use super::{JobInput, carla, gpu, variable, volumes};
 use crate::controller::gpu_claims::source;
 use crate::controller::submissions::pod_layout::{FIXED_ENV, STATUS};
 use crate::pod::run::{RUNNER, TOOLS};
+use leaderboard_api::effective;
+use leaderboard_runner::protocol::{Member, Pair, Side};
 
 pub(super) fn workload(input: &JobInput<'_>, pair: Pair) -> Workload {
     carla::workload(&input.asked(), pair)

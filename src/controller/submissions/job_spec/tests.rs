@@ -6,8 +6,6 @@ use std::path::PathBuf;
 use serde_json::{Value, json};
 
 use super::*;
-use crate::allowed::Allowed;
-use crate::kubernetes::Namespaces;
 use leaderboard_api::{FailedNode, JobNumber, effective};
 
 pub(super) const OPERATOR_IMAGE: &str = "registry.example/leaderboard-operator:1";
@@ -18,7 +16,7 @@ pub(super) struct Case {
     pub(super) leaderboard: Leaderboard,
     pub(super) plan: RunPlan,
     pub(super) number: JobNumber,
-    pub(super) settings: Settings,
+    pub(super) own: OwnImage,
     pub(super) failed_nodes: Vec<FailedNode>,
 }
 
@@ -62,16 +60,9 @@ impl Case {
             leaderboard,
             plan,
             number: JobNumber::first(Attempt(1)),
-            settings: Settings {
+            own: OwnImage {
                 image: OPERATOR_IMAGE.into(),
-                image_pull_policy: None,
-                region: None,
-                checksums: None,
-                operator: "system/operator".into(),
-                namespaces: Namespaces::All,
-                has_cluster_rights: true,
-                allowed: Allowed::default(),
-                concurrency: 16,
+                ..OwnImage::default()
             },
             failed_nodes: Vec::new(),
         }
@@ -83,7 +74,7 @@ impl Case {
             leaderboard: &self.leaderboard,
             plan: &self.plan,
             number: self.number,
-            settings: &self.settings,
+            own: &self.own,
             failed_nodes: &self.failed_nodes,
             now: "2026-11-01T12:00:00Z".parse().unwrap(),
         }

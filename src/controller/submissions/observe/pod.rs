@@ -1,14 +1,13 @@
 //! A Pod reduced to what decisions depend on. Pure; reads the runner's verdicts as hostile text.
 
-use leaderboard_runner::protocol::Member;
-use leaderboard_runner::verdict::Verdict;
-
 use crate::controller::submissions::view::{ContainerView, EndView, PodView};
 use crate::kubernetes::objects::{Condition, ContainerStatus, Ended, Pod, PodStatus};
 use crate::pod::run::Stop;
-use crate::pod::workspace::{NotAVerdict, WorkspaceReason, WorkspaceVerdict};
+use crate::pod::verdict::{NotAVerdict, WorkspaceReason, WorkspaceVerdict};
 use leaderboard_api::names;
 use leaderboard_api::text::{LONGEST_MESSAGE, one_line};
+use leaderboard_runner::protocol::Member;
+use leaderboard_runner::verdict::Verdict;
 
 /// Reduces a Pod.
 pub fn view(pod: &Pod) -> PodView {

@@ -10,7 +10,6 @@ use super::poll::{Challenge, Poll};
 use super::sub::{Sub, Write};
 use super::{Busy, Lane, MAX_IN_FLIGHT, Next, Now, Queue, Ticket};
 use crate::services::evalai::request::{Purpose, Request, SubmissionRef};
-use crate::services::evalai::status::{Progress, Status};
 use crate::services::evalai::types::Key;
 
 /// Age at which a question goes before ends.
@@ -353,15 +352,5 @@ impl Queue {
             Step::Get | Step::Image => Busy::Read,
         });
         Some((request, checked.map(|at| at + self.timing.fresh)))
-    }
-}
-
-impl Progress {
-    /// The status it leads to.
-    pub(super) fn status(self) -> Status {
-        match self {
-            Self::Queued => Status::Queued,
-            Self::Running => Status::Running,
-        }
     }
 }

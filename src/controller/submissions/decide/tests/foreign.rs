@@ -4,9 +4,9 @@ use std::sync::Arc;
 use std::time::Duration;
 
 use super::builders::*;
-use crate::ask::{Answered, Failure, Lookup};
+use crate::ask::question::{Answered, Failure, Lookup};
 use crate::controller::submissions::decide::{Action, Plan, Question, SlotUse};
-use crate::controller::submissions::rows::{ForeignRun, Row};
+use crate::controller::submissions::questions::{ForeignRun, Row};
 use crate::controller::submissions::view::{EvalaiInfo, JobEnd, Standing};
 use crate::services::evalai::Status;
 use leaderboard_api::State::{Cancelled, Pending};

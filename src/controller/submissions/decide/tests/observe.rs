@@ -1,7 +1,7 @@
 //! Runs that are not published: EvalAI and the table are left as they are.
 
 use super::builders::*;
-use crate::ask::Lookup;
+use crate::ask::question::Lookup;
 use crate::controller::submissions::decide::{Action, EvalaiUpdate, Question};
 use crate::services::evalai::Status;
 use leaderboard_api::State::{Failed, Finished, Pending};

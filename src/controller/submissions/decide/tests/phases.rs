@@ -7,11 +7,8 @@ use serde_json::json;
 use super::builders::*;
 use crate::controller::submissions::decide::{Plan, decide};
 use crate::controller::submissions::phases::{self, Ended};
-use crate::controller::submissions::spans;
-use crate::observability::trace_id::TraceId;
-use crate::observability::traces::{Kind, Span, Value};
-use leaderboard_api::State::{Failed, Finished, Pending, Running};
-use leaderboard_api::{Attempt, names, reasons};
+use leaderboard_api::State::{Finished, Pending, Running};
+use leaderboard_api::{Attempt, names};
 
 /// What ends with the next reconcile: phase, and the seconds at which it began and ended.
 type Lengths = Vec<(&'static str, i64, i64)>;
@@ -139,66 +136,8 @@ fn a_restart_ends_the_run_and_the_attempt_that_it_follows() {
     assert_eq!(pass(&mut world).1, []);
     world.go_to(120);
     world.complete();
-    let plan = decide(&world.view);
-    let found = phases::ended(&world.view, &plan.status);
-    assert!(
-        spans::of(&world.view, &plan.status, &found)
-            .iter()
-            .all(|span| { span.attributes.contains(&("leaderboard.attempt", Value::Number(1))) })
-    );
     assert_eq!(pass(&mut world).1, [("run", 10, 120), ("attempt", 0, 120)]);
     world.job_gone();
     world.go_to(121);
     assert_eq!(pass(&mut world).1, [("accept", 120, 121), ("wait", 121, 121)]);
-}
-
-fn spans_of(world: &mut World) -> Vec<Span> {
-    let plan = decide(&world.view);
-    let found = phases::ended(&world.view, &plan.status);
-    let spans = spans::of(&world.view, &plan.status, &found);
-    world.pass();
-    spans
-}
-
-#[test]
-fn the_spans_of_a_failed_attempt_are_one_tree_that_names_the_reason() {
-    let mut world = World::local().running();
-    world.see(ended("agent-1", 3, "exited", 1, 100));
-    assert_eq!(spans_of(&mut world), [], "it is asked to stop");
-    world.complete();
-    let spans = spans_of(&mut world);
-    assert_eq!(world.status().state, Some(Failed));
-    let [run, attempt] = &spans[..] else {
-        panic!("{spans:?}")
-    };
-    assert_eq!((run.name, run.parent), ("run", Some(attempt.id)));
-    assert_eq!((run.error, attempt.error), (None, Some(reasons::AGENT_CRASHED)));
-    assert_eq!(run.trace, TraceId::of(UID));
-    for expected in [
-        ("leaderboard.state", Value::Word("Failed")),
-        ("leaderboard.failure.class", Value::Word("Participant")),
-    ] {
-        assert!(attempt.attributes.contains(&expected), "{expected:?}");
-    }
-    let texts = spans.iter().flat_map(|span| &span.attributes);
-    let texts: Vec<_> = texts
-        .filter(|(_, value)| *value == Value::Text("team/agent:1".into()))
-        .collect();
-    assert!(texts.is_empty(), "what a participant has chosen: {texts:?}");
-}
-
-#[test]
-fn ids_are_the_same_in_every_process_and_the_intake_is_the_root() {
-    let spans = spans_of(&mut sent());
-    assert_eq!(spans, spans_of(&mut sent()));
-    let (intake, accept) = (&spans[0], &spans[1]);
-    assert_eq!(
-        (intake.name, intake.parent, intake.kind),
-        ("intake", None, Kind::Consumer)
-    );
-    assert_eq!(accept.name, "accept");
-    assert!(accept.parent.is_some_and(|parent| parent != intake.id));
-    let text = |text: &str| Value::Text(text.to_owned());
-    assert!(intake.attributes.contains(&("leaderboard.submission", text("sub"))));
-    assert!(intake.attributes.contains(&("leaderboard.attempt", Value::Number(1))));
 }

@@ -1,0 +1,60 @@
+//! How the things stand that a Leaderboard names, as `decide` sees them.
+
+use leaderboard_api::conditions::Truth;
+
+/// How the template of a Leaderboard stands.
+#[derive(Clone, Debug, Default, PartialEq, Eq)]
+pub enum Claims {
+    /// Its workers claim nothing.
+    #[default]
+    NotRequired,
+    InPlace,
+    /// The API server does not serve claims.
+    NotServed,
+    /// It is not there, and why.
+    Missing(String),
+}
+
+/// What is shown of a Leaderboard whose places cannot all be reached.
+#[derive(Clone, Debug, PartialEq, Eq)]
+pub struct Unreachable {
+    /// Never True.
+    pub truth: Truth,
+    /// Of the gravest.
+    pub reason: &'static str,
+    /// Of all.
+    pub message: String,
+}
+
+/// How a Leaderboard stands with EvalAI.
+#[derive(Clone, Debug, PartialEq, Eq)]
+pub enum EvalaiStanding {
+    NotRequired,
+    NoToken(String),
+    TokenRefused(String),
+    /// Its queue in EvalAI is not read. Refused: waiting alone does not help.
+    QueueUnread {
+        is_refused: bool,
+        why: String,
+    },
+    /// Its phases or labels do not fit the challenge.
+    Misfit(String),
+    /// Not checked yet, or EvalAI does not answer.
+    Unchecked(Option<String>),
+    Fits {
+        /// Something to be shown although it works, such as a token that ends soon.
+        note: Option<String>,
+    },
+}
+
+/// How the policy of a Leaderboard stands.
+#[derive(Clone, Debug, PartialEq, Eq)]
+pub enum Policy {
+    InPlace,
+    /// The cluster has its own.
+    External,
+    /// The API server refuses it, and why.
+    Refused(String),
+    /// It could not be applied, or came out otherwise, and why.
+    NotApplied(String),
+}
