@@ -214,7 +214,7 @@ mod tests {
         ] {
             assert!(keyed.iter().any(|found| found == path), "{path}: {keyed:?}");
         }
-        for path in ["Submission.status.pairs", "Submission.status.conditions"] {
+        for path in ["Submission.status.workers", "Submission.status.conditions"] {
             assert!(keyed.iter().any(|found| found == path), "{path}: {keyed:?}");
         }
     }

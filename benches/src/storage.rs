@@ -10,8 +10,8 @@ use axum::Router;
 use axum::extract::{Request, State};
 use axum::http::{Method, StatusCode, header};
 use axum::response::{IntoResponse, Response};
-use leaderboard_api::{Attempt, PairState};
-use leaderboard_operator::pod::report::{REPORT_KEY, Report, ReportPair, SCHEMA, StoredFile};
+use leaderboard_api::{Attempt, Metric, WorkerState};
+use leaderboard_operator::pod::report::{REPORT_KEY, Report, ReportWorker, SCHEMA, StoredFile};
 use tokio::net::TcpListener;
 use tokio::task::JoinHandle;
 
@@ -144,8 +144,12 @@ impl Shelf {
 fn report(is_final: bool) -> Report {
     let share = ROUTES / PAIRS;
     let done = if is_final { share } else { share / 2 };
-    let state = if is_final { PairState::Done } else { PairState::Running };
-    let pair = |id| ReportPair {
+    let state = if is_final {
+        WorkerState::Done
+    } else {
+        WorkerState::Running
+    };
+    let worker = |id| ReportWorker {
         id,
         done,
         total: share,
@@ -175,10 +179,13 @@ fn report(is_final: bool) -> Report {
         round: ROUND,
         done: done * PAIRS,
         total: ROUTES,
-        pairs: (1..=PAIRS).map(pair).collect(),
-        score: Some(41.25),
-        route_completion: Some(75.5),
-        infraction_penalty: Some(0.55),
+        unit: "routes".into(),
+        workers: (1..=PAIRS).map(worker).collect(),
+        score: Some(Metric::new("Driving score", 41.25, 2)),
+        metrics: vec![
+            Metric::new("Route completion", 75.5, 2),
+            Metric::new("Infraction penalty", 0.55, 3),
+        ],
         is_final,
         eligible: true,
         entry_status: if is_final { "Finished" } else { "Started" }.into(),

@@ -96,7 +96,7 @@ def submissions(settings: Settings, kube: Kube) -> Shown:
     running, other = submit(TEAM_A, SENSORS, "crash-once"), submit(TEAM_B, MAP, "standard")
     wait(kube, other, state("Running"))
     waiting = [submit(team, SENSORS, "standard") for team in (TEAM_B, TEAM_A, TEAM_A)]
-    wait(kube, running, "jsonpath={.status.pairs[1].crashes}=1")
+    wait(kube, running, "jsonpath={.status.workers[1].crashes}=1")
     return Shown(finished, failed, running, waiting[0])
 
 

@@ -127,7 +127,7 @@ impl Parts for Submission {
         if let Some(status) = &mut submission.status {
             // A list that was read has room for twice as many.
             status.conditions.shrink_to_fit();
-            status.pairs.shrink_to_fit();
+            status.workers.shrink_to_fit();
             if let Some(plan) = &mut status.plan {
                 plan.shrink_to_fit();
             }

@@ -6,7 +6,7 @@ use jiff::Timestamp;
 use kube::ResourceExt;
 use leaderboard_api::text::{one_line, sentence};
 use leaderboard_api::{
-    Attempt, EndReason, Failure, PairState, PairStatus, State, Submission, SubmissionStatus, conditions, reasons,
+    Attempt, EndReason, Failure, State, Submission, SubmissionStatus, WorkerState, WorkerStatus, conditions, reasons,
 };
 use serde::Serialize;
 
@@ -54,19 +54,21 @@ pub(super) struct Runs {
     pub node: Option<String>,
     pub done: i32,
     pub total: i32,
+    /// Name of what is counted.
+    pub unit: String,
     pub score: Option<String>,
-    pub pairs: Vec<Pair>,
+    pub workers: Vec<Worker>,
     pub phases: Phases,
 }
 
-/// One of its pairs.
+/// One of its workers.
 #[derive(Serialize, Clone, Debug, PartialEq, Eq)]
-pub(super) struct Pair {
+pub(super) struct Worker {
     pub id: i32,
     pub done: i32,
     pub total: i32,
     pub crashes: i32,
-    pub state: PairState,
+    pub state: WorkerState,
     /// What ended its last round, after a crash.
     pub last: Option<EndReason>,
 }
@@ -83,6 +85,8 @@ pub(super) struct Ended {
     pub is_final: bool,
     pub done: i32,
     pub total: i32,
+    /// Name of what is counted.
+    pub unit: String,
     /// Where the end has not arrived yet.
     pub open: Vec<&'static str>,
     pub phases: Phases,
@@ -169,7 +173,7 @@ impl Waits {
 impl Runs {
     pub(super) fn of(submission: &Submission) -> Self {
         with_status(submission, |status| {
-            let (done, total) = progress(status);
+            let (done, total, unit) = progress(status);
             Self {
                 who: Who::of(submission),
                 reason: status.reason.as_deref().map(name),
@@ -177,28 +181,36 @@ impl Runs {
                 node: status.node_name.as_deref().map(name),
                 done,
                 total,
+                unit,
                 score: status.score.as_ref().map(|score| name(&score.text)),
-                pairs: status.pairs.iter().map(Pair::of).collect(),
+                workers: status.workers.iter().map(Worker::of).collect(),
                 phases: Phases::of(submission),
             }
         })
     }
 }
 
-fn progress(status: &SubmissionStatus) -> (i32, i32) {
+fn progress(status: &SubmissionStatus) -> (i32, i32, String) {
     let progress = status.progress.as_ref();
-    progress.map_or((0, 0), |progress| (progress.done, progress.total))
+    progress.map_or_else(
+        || (0, 0, String::new()),
+        |progress| (progress.done, progress.total, name(&progress.unit)),
+    )
 }
 
-impl Pair {
-    fn of(pair: &PairStatus) -> Self {
+impl Worker {
+    fn of(worker: &WorkerStatus) -> Self {
         Self {
-            id: pair.id,
-            done: pair.done,
-            total: pair.total,
-            crashes: pair.crashes,
-            state: pair.state,
-            last: pair.last.as_ref().filter(|_| pair.crashes > 0).map(|last| last.reason),
+            id: worker.id,
+            done: worker.done,
+            total: worker.total,
+            crashes: worker.crashes,
+            state: worker.state,
+            last: worker
+                .last
+                .as_ref()
+                .filter(|_| worker.crashes > 0)
+                .map(|last| last.reason),
         }
     }
 }
@@ -206,7 +218,7 @@ impl Pair {
 impl Ended {
     pub(super) fn of(submission: &Submission, state: State) -> Self {
         with_status(submission, |status| {
-            let (done, total) = progress(status);
+            let (done, total, unit) = progress(status);
             let score = status.score.as_ref();
             Self {
                 who: Who::of(submission),
@@ -216,6 +228,7 @@ impl Ended {
                 is_final: score.is_some_and(|score| score.is_final),
                 done,
                 total,
+                unit,
                 open: open(status),
                 phases: Phases::of(submission),
             }

@@ -12,11 +12,12 @@ use bytes::Bytes;
 use sha2::{Digest, Sha256};
 
 use super::keys::{EVALAI, MERGED, checkpoint_path};
-use super::report::{ReportPair, StoredFile};
+use super::measures;
+use super::report::{ReportWorker, StoredFile};
 use super::run::{Run, STATUS_FOLDER};
 use super::tree::{Stamp, Tree, TreeError};
 use crate::pod::carla::results_format;
-use leaderboard_api::{PairState, Verify};
+use leaderboard_api::{Metric, Verify, WorkerState};
 use leaderboard_results::{Checkpoint, Files, Merged, Plan, Refusal, Slice, Strictness, read_worker};
 use leaderboard_runner::protocol::{KEPT_CHECKPOINT, Pair, Progress};
 
@@ -99,12 +100,12 @@ impl PairSeen {
     }
 
     /// `Waiting`, `Running`, `Done` or `Crashed`; the last means between a crash and the next start.
-    pub fn state(&self) -> PairState {
+    pub fn state(&self) -> WorkerState {
         match self {
-            Self { agent, .. } if agent.done => PairState::Done,
-            Self { agent, simulator } if agent.started || simulator.started => PairState::Running,
-            _ if self.crashes() > 0 => PairState::Crashed,
-            _ => PairState::Waiting,
+            Self { agent, .. } if agent.done => WorkerState::Done,
+            Self { agent, simulator } if agent.started || simulator.started => WorkerState::Running,
+            _ if self.crashes() > 0 => WorkerState::Crashed,
+            _ => WorkerState::Waiting,
         }
     }
 
@@ -146,11 +147,9 @@ pub struct Summary {
     /// Units of work done.
     pub done: u32,
     /// Over the units done so far; over all of them once `is_complete`.
-    pub score: Option<f64>,
-    /// Mean route completion in percent, over the same routes.
-    pub route_completion: Option<f64>,
-    /// Mean infraction penalty, 0 to 1, over the same routes.
-    pub infraction_penalty: Option<f64>,
+    pub score: Option<Metric>,
+    /// Further numbers, over the same units.
+    pub metrics: Vec<Metric>,
     /// No unit of the plan is missing.
     pub is_complete: bool,
     /// Every evaluator has come to its regular end.
@@ -165,12 +164,10 @@ pub struct Summary {
 
 impl From<&Merged> for Summary {
     fn from(merged: &Merged) -> Self {
-        let within = |most: f64, value: Option<f64>| value.filter(|value| (0.0..=most).contains(value));
         Self {
             done: merged.done,
-            score: within(100.0, merged.score.or(merged.partial_score)),
-            route_completion: within(100.0, merged.route_completion()),
-            infraction_penalty: within(1.0, merged.infraction_penalty()),
+            score: measures::score(merged),
+            metrics: measures::others(merged),
             is_complete: merged.is_final,
             has_ended: merged.pairs.iter().all(|pair| pair.ended),
             eligible: merged.eligible,
@@ -201,7 +198,7 @@ pub struct Gathered {
     /// Each pair from its status files.
     pub seen: Vec<PairSeen>,
     /// Each pair for the report.
-    pub pairs: Vec<ReportPair>,
+    pub pairs: Vec<ReportWorker>,
     /// Why each pair's checkpoint is refused, if it is.
     pub refused: Vec<Option<String>>,
     /// Each pair whose checkpoint this node can't read at present.
@@ -436,14 +433,14 @@ impl Gatherer {
         }
     }
 
-    fn pairs(&self, seen: &[PairSeen]) -> Vec<ReportPair> {
+    fn pairs(&self, seen: &[PairSeen]) -> Vec<ReportWorker> {
         let slices = self.plan.pairs.iter().zip(&self.workers).zip(seen);
         (1..)
             .zip(slices)
             .map(|(id, ((slice, worker), seen))| {
                 let total = slice.routes().saturating_mul(self.plan.repetitions);
                 let done = worker.good.as_ref().map_or(0, Checkpoint::done);
-                ReportPair {
+                ReportWorker {
                     id,
                     done: done.min(total),
                     total,

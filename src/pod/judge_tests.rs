@@ -130,7 +130,7 @@ pub(super) mod seen_on_a_volume {
     use crate::pod::gather::{Gatherer, results_plan};
     use crate::pod::keys::{EVALAI, MERGED, checkpoint_path};
     use crate::pod::tree::Tree;
-    use leaderboard_api::{PairState, RouteSlice};
+    use leaderboard_api::{RouteSlice, WorkerState};
 
     pub(crate) struct Volume {
         pub(crate) folder: tempfile::TempDir,
@@ -182,11 +182,11 @@ pub(super) mod seen_on_a_volume {
         let (gathered, seen) = volume.round();
         assert_eq!(
             (gathered.pairs[0].done, gathered.pairs[0].state),
-            (1, PairState::Running)
+            (1, WorkerState::Running)
         );
         assert_eq!(
             (gathered.pairs[1].done, gathered.pairs[1].state),
-            (0, PairState::Waiting)
+            (0, WorkerState::Waiting)
         );
         assert!(seen.any_started && seen.complete.is_none());
         assert!(text(&gathered, "evalai/stdout.txt").contains("Completed 1 out of the 4 routes"));
@@ -195,7 +195,8 @@ pub(super) mod seen_on_a_volume {
         put_checkpoint(volume.folder.path(), 2, &checkpoint(2, 2, 2));
         let (gathered, seen) = volume.round();
         assert_eq!((seen.complete, seen.all_done), (Some(Duration::ZERO), false));
-        assert_eq!(gathered.merged.as_ref().unwrap().score, Some(100.0));
+        let score = gathered.merged.as_ref().unwrap().score.clone();
+        assert_eq!(score.unwrap().value, "100.00");
         assert_eq!(text(&gathered, "evalai/metadata.json"), text(&gathered, MERGED));
         assert!(gathered.digests().keys().all(|key| key.starts_with(EVALAI)));
         assert_eq!(gathered.digests().len(), 3);
@@ -430,7 +431,7 @@ pub(super) mod seen_on_a_volume {
             put_status(&folder, side, 1, mark);
         }
         let pair = volume.round().0.pairs[0].clone();
-        assert_eq!((pair.crashes, pair.state), (2, PairState::Crashed));
+        assert_eq!((pair.crashes, pair.state), (2, WorkerState::Crashed));
     }
 
     #[test]

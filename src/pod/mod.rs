@@ -16,6 +16,7 @@ pub mod judge;
 pub mod keys;
 pub mod layout;
 pub mod logcopy;
+pub mod measures;
 mod name_files;
 pub mod ownlog;
 pub mod places;

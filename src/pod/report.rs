@@ -3,7 +3,7 @@
 //!
 //! The report is written by `logcopy` and read by the controller as hostile text: bounded in size, checked in every number. Pure.
 
-use std::collections::BTreeMap;
+use std::collections::{BTreeMap, BTreeSet};
 
 use jiff::Timestamp;
 use serde::{Deserialize, Serialize};
@@ -11,7 +11,7 @@ use sha2::{Digest, Sha256};
 
 use super::schema::is_read;
 use leaderboard_api::text::one_line;
-use leaderboard_api::{Attempt, PairState};
+use leaderboard_api::{Attempt, MAX_METRICS, MAX_NAME, Metric, WorkerState};
 
 /// Key of the report below the run's prefix.
 pub const REPORT_KEY: &str = "logcopy/report.json";
@@ -71,21 +71,20 @@ pub struct Report {
     pub pod_uid: String,
     /// Counts the rounds of this Pod.
     pub round: u64,
-    /// Routes done, over all pairs and repetitions.
+    /// Units done, over all workers.
     pub done: u32,
-    /// Routes in all.
+    /// Units in all.
     pub total: u32,
-    /// Each pair, from 1.
-    pub pairs: Vec<ReportPair>,
-    /// Mean driving score: over the finished routes, or of the whole run when final.
+    /// Name of the units, in the plural.
+    pub unit: String,
+    /// Each worker, from 1.
+    pub workers: Vec<ReportWorker>,
+    /// The number that ranks the run: over what is done, or of the whole run when final.
     #[serde(default, skip_serializing_if = "Option::is_none")]
-    pub score: Option<f64>,
-    /// Mean route completion in percent, over the same routes.
-    #[serde(default, skip_serializing_if = "Option::is_none")]
-    pub route_completion: Option<f64>,
-    /// Mean infraction penalty, 0 to 1, over the same routes.
-    #[serde(default, skip_serializing_if = "Option::is_none")]
-    pub infraction_penalty: Option<f64>,
+    pub score: Option<Metric>,
+    /// Further numbers, over the same units.
+    #[serde(default, skip_serializing_if = "Vec::is_empty")]
+    pub metrics: Vec<Metric>,
     /// True when the merge is complete against the plan and nothing more will come.
     #[serde(rename = "final")]
     pub is_final: bool,
@@ -119,19 +118,19 @@ pub struct Report {
     pub files: BTreeMap<String, StoredFile>,
 }
 
-/// One pair as its status files and checkpoint show it.
+/// One worker as its status files and checkpoint show it.
 #[derive(Serialize, Deserialize, Clone, Debug, PartialEq, Eq)]
-pub struct ReportPair {
+pub struct ReportWorker {
     /// From 1.
     pub id: u32,
-    /// Routes done.
+    /// Units done.
     pub done: u32,
-    /// Routes of its slice, times repetitions.
+    /// Units in all.
     pub total: u32,
-    /// Crashes of the agent's or simulator's side, whichever is more.
+    /// Crashes of the agent's or the environment's side, whichever is more.
     pub crashes: u32,
     /// What it does.
-    pub state: PairState,
+    pub state: WorkerState,
     /// Its checkpoint has a record that names a crash of the simulation; not from an older operator's Pod.
     #[serde(default, skip_serializing_if = "std::ops::Not::not")]
     pub names_crash: bool,
@@ -187,6 +186,7 @@ impl Report {
     fn shown(self) -> Self {
         let line = |text: &String| one_line(text, LONGEST_TEXT);
         Self {
+            unit: one_line(&self.unit, MAX_NAME),
             entry_status: line(&self.entry_status),
             why: self.why.as_ref().map(line),
             logs: self.logs.as_ref().map(|logs| match logs {
@@ -204,22 +204,20 @@ impl Report {
             return Err(ReportError::Schema(self.schema));
         }
         if self.done > self.total {
-            return implausible("more routes done than there are");
+            return implausible("more units done than there are");
         }
         if self.is_final && self.stopped.is_none() && self.why.is_none() && self.done != self.total {
-            return implausible("final, but routes are missing");
+            return implausible("final, but units are missing");
         }
-        if self.score.is_some_and(|s| !(0.0..=100.0).contains(&s)) {
-            return implausible("a score outside 0 to 100");
+        if !self.score.iter().chain(&self.metrics).all(Metric::is_plausible) {
+            return implausible("a score or a metric that is no number with a name");
         }
-        if self.route_completion.is_some_and(|c| !(0.0..=100.0).contains(&c)) {
-            return implausible("a route completion outside 0 to 100");
+        let names: BTreeSet<&str> = self.metrics.iter().map(|metric| metric.name.as_str()).collect();
+        if self.metrics.len() > MAX_METRICS || names.len() != self.metrics.len() {
+            return implausible("too many metrics, or two of one name");
         }
-        if self.infraction_penalty.is_some_and(|p| !(0.0..=1.0).contains(&p)) {
-            return implausible("an infraction penalty outside 0 to 1");
-        }
-        if self.pairs.len() > 64 || self.pairs.iter().any(|p| p.done > p.total) {
-            return implausible("a pair that did more than its slice");
+        if self.workers.len() > 64 || self.workers.iter().any(|worker| worker.done > worker.total) {
+            return implausible("a worker that did more than its share");
         }
         Ok(())
     }

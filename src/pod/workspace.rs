@@ -282,7 +282,7 @@ mod tests {
         let report = first();
         let read = Report::parse(&serde_json::to_vec(&report).unwrap()).unwrap();
         assert!(read.belongs_to("uid-1", Attempt(1)) && !read.is_final);
-        assert_eq!((read.total, read.pairs.len(), read.pairs[1].total), (4, 2, 2));
+        assert_eq!((read.total, read.workers.len(), read.workers[1].total), (4, 2, 2));
     }
 
     #[test]

@@ -42,8 +42,8 @@ pub fn full_status() -> Value {
             "simulatorImage": "simulator:1",
             "resume": true,
         },
-        "progress": {"done": 12, "total": 20, "text": "12/20"},
-        "pairs": [{
+        "progress": {"done": 12, "total": 20, "unit": "routes", "text": "12/20"},
+        "workers": [{
             "id": 1,
             "done": 6,
             "total": 10,
@@ -51,9 +51,8 @@ pub fn full_status() -> Value {
             "state": "Running",
             "last": {"reason": "Idle", "exitCode": 1, "time": time},
         }],
-        "score": {
-            "driving": "41.20", "routeCompletion": "80.00", "infractionPenalty": "0.515", "final": false, "text": "~41.20",
-        },
+        "score": {"name": "Driving score", "value": "41.20", "final": false, "text": "~41.20"},
+        "metrics": [{"name": "Route completion", "value": "80.00"}, {"name": "Infraction penalty", "value": "0.515"}],
         "duration": "1h25m",
         "waiting": {"position": 1, "etaMinSeconds": 1200, "etaMaxSeconds": 2400, "text": "1st, 20-40 min"},
         "times": {

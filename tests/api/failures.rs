@@ -186,7 +186,7 @@ async fn a_silent_node_is_replaced_before_the_grace_and_costs_no_attempt() {
         (status.attempt, status.retry, status.failure),
         (Some(Attempt(1)), 1, None)
     );
-    assert!(status.pairs.iter().all(|pair| pair.crashes == 0));
+    assert!(status.workers.iter().all(|pair| pair.crashes == 0));
     let patches = world.evalai.requests().into_iter().filter(|r| r.method == "PATCH");
     let told = patches.filter(|r| r.body["submission_status"] == json!("running"));
     assert_eq!(told.count(), 1, "EvalAI keeps saying running");

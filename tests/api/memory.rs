@@ -67,7 +67,7 @@ fn report(submission_uid: String, text: &str) -> String {
     let report = Report {
         done: 1,
         total: 1,
-        pairs: Vec::new(),
+        workers: Vec::new(),
         files: [(METADATA.to_owned(), file)].into(),
         ..player::report(submission_uid, "pod".into(), ROUTES)
     };

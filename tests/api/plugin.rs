@@ -34,7 +34,7 @@ async fn why_shows_state_cause_and_next_step() {
             "crashed",
             failed("Participant", "AgentCrashed"),
             &[
-                "Failure:     AgentCrashed in pair 2: participant failure, counts as an attempt.",
+                "Failure:     AgentCrashed in worker 2: participant failure, counts as an attempt.",
                 "aws s3 cp s3://results/42/evalai/environment_log.txt -",
                 "Next:        Look at agent/agent2/leaderboard.log of the results; the participant fixes the agent",
             ],
@@ -43,7 +43,7 @@ async fn why_shows_state_cause_and_next_step() {
             "lost",
             failed("Infrastructure", "NodeLost"),
             &[
-                "Failure:     NodeLost in pair 2: infrastructure failure, does not count as an attempt.",
+                "Failure:     NodeLost in worker 2: infrastructure failure, does not count as an attempt.",
                 &format!("kubectl leaderboard resume lost -n {}", terminal.namespace),
             ],
         ),
@@ -51,7 +51,7 @@ async fn why_shows_state_cause_and_next_step() {
             "done",
             finished(),
             &[
-                "Routes:      20/20 done, driving score 43.13.",
+                "Progress:    20/20 routes done, Driving score 43.13.",
                 "Results:     s3://results/42",
                 "EvalAI:      Published: EvalAI has the result.",
                 "Next:        Nothing.",

@@ -47,7 +47,11 @@ async fn assert_second_attempt(scene: &Scene, name: &str) {
     let status = scene.api::<Submission>().get(name).await.unwrap().status.unwrap();
     assert_eq!((status.attempt, status.retry), (Some(Attempt(2)), 0));
     assert_eq!((status.failure, status.interruptions), (None, None));
-    assert!(status.pairs.iter().all(|pair| pair.crashes == 0), "{:?}", status.pairs);
+    assert!(
+        status.workers.iter().all(|pair| pair.crashes == 0),
+        "{:?}",
+        status.workers
+    );
     assert_eq!(scene.jobs().await, [format!("{name}-1"), format!("{name}-2")]);
 }
 

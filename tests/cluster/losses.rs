@@ -106,7 +106,11 @@ pub(super) async fn assert_interrupted_once(scene: &Scene, name: &str) {
         (Some(Attempt(1)), 1, None)
     );
     assert_eq!(status.interruptions.unwrap().number, 1);
-    assert!(status.pairs.iter().all(|pair| pair.crashes == 0), "{:?}", status.pairs);
+    assert!(
+        status.workers.iter().all(|pair| pair.crashes == 0),
+        "{:?}",
+        status.workers
+    );
     assert_eq!(scene.jobs().await, [format!("{name}-1"), format!("{name}-1-r1")]);
 }
 

@@ -204,9 +204,9 @@ fn end(submission: &Submission) -> String {
 fn last_crash(submission: &Submission) -> Option<Timestamp> {
     let status = submission.status.as_ref().filter(|status| status.failure.is_some())?;
     status
-        .pairs
+        .workers
         .iter()
-        .filter_map(|pair| Some(pair.last.as_ref()?.time.as_ref()?.0))
+        .filter_map(|worker| Some(worker.last.as_ref()?.time.as_ref()?.0))
         .max()
 }
 

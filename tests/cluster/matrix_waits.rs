@@ -389,7 +389,7 @@ async fn on_the_lost_node(case: &mut Case, scene: &Scene, nodes: &Api<Node>, lab
         .unwrap()
         .status
         .unwrap();
-    let crashes: i32 = status.pairs.iter().map(|pair| pair.crashes).sum();
+    let crashes: i32 = status.workers.iter().map(|pair| pair.crashes).sum();
     let (attempt, retry) = (status.attempt.unwrap_or_default(), status.retry);
     case.also(&format!("attempt {attempt}, try {retry}, crashes {crashes}"));
 }

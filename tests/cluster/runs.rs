@@ -149,9 +149,9 @@ async fn a_crash_of_an_agent_costs_one_restart_and_no_points() {
         let crashes: Vec<_> = submission
             .status
             .unwrap()
-            .pairs
+            .workers
             .iter()
-            .map(|pair| pair.crashes)
+            .map(|worker| worker.crashes)
             .collect();
         assert_eq!(crashes, [0, 1, 0, 0]);
         assert_results(&scene.cloud.text("crashing", "evalai/results.json").await);

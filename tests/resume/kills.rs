@@ -228,7 +228,7 @@ impl Run<'_> {
                 return Err(format!("pair {pair}: an orderly end left {lag} routes unstored"));
             }
             if let (Moment::Stored(_), Some(report)) = (kill.moment, report(&self.submission.archive).await) {
-                let reported = u64::from(report.pairs[usize::from(pair) - 1].done);
+                let reported = u64::from(report.workers[usize::from(pair) - 1].done);
                 // A crash in its last route counts as a record and is repeated.
                 if stored + 1 < reported {
                     return Err(format!("pair {pair}: {reported} routes reported, {stored} stored"));

@@ -100,7 +100,7 @@ async fn run_to_the_third_route(kubelet: &mut Kubelet<'_>, submission: &Submissi
         while !agents().all(|agent| kubelet.path(&submission.hang_marker(agent, 3)).exists())
             || report(&submission.archive)
                 .await
-                .is_none_or(|report| report.pairs.iter().any(|pair| pair.done < 2))
+                .is_none_or(|report| report.workers.iter().any(|pair| pair.done < 2))
         {
             let ended = tokio::time::timeout(Duration::from_millis(20), kubelet.ended()).await;
             if let Ok((name, status)) = ended {
@@ -150,7 +150,7 @@ async fn a_disk_that_runs_full_ends_the_run_in_order() {
         "{last:?}"
     );
     // A copy that found no room is a route older than its file; half of a file is stored nowhere.
-    for pair in &last.pairs {
+    for pair in &last.workers {
         let key = format!("agent/agent{}/agent_results.json", pair.id);
         let stored = submission.archive.get(&key, 1 << 26).await.unwrap().unwrap();
         assert_eq!(next_route(&stored.bytes), Some(pair.done.into()), "{key}");
@@ -202,7 +202,7 @@ async fn a_read_only_log_folder_costs_its_pair_and_nothing_else() {
         "{last:?}"
     );
     assert_eq!(
-        last.pairs.iter().map(|pair| pair.done).collect::<Vec<_>>(),
+        last.workers.iter().map(|pair| pair.done).collect::<Vec<_>>(),
         [0, 5, 5, 5]
     );
     let agent = members().nth(1).unwrap();

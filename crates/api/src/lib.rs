@@ -22,7 +22,6 @@ pub mod leaderboard_network;
 pub mod leaderboard_parts;
 pub mod leaderboard_services;
 pub mod names;
-mod pair_status;
 mod progress;
 pub mod ranges;
 pub mod reasons;
@@ -39,6 +38,7 @@ mod submission_use;
 mod team;
 pub mod text;
 mod waiting;
+mod worker_status;
 
 /// Name, namespace and UID of an object.
 pub use kube::ResourceExt;
@@ -57,8 +57,7 @@ pub use leaderboard::{
     EvalaiBacklog, EvalaiUse, JOB_SECONDS, Leaderboard, LeaderboardSpec, LeaderboardStatus, TableUse, TrackStatus,
 };
 pub use leaderboard_parts::*;
-pub use pair_status::{EndReason, LastEnd, PairState, PairStatus};
-pub use progress::{Progress, Score};
+pub use progress::{MAX_METRICS, MAX_NAME, Metric, Progress, Score};
 pub use retention::Retention;
 pub use route_slice::{NotASlice, RouteSlice};
 pub use run_id::{NotARunId, RunId};
@@ -68,6 +67,7 @@ pub use submission_status::*;
 pub use submission_use::{Interruptions, MAX_INTERRUPTED_NODES, MAX_USING_TEAMS, TeamUse, Use};
 pub use team::{Team, TeamStatus};
 pub use waiting::{Eta, Waiting};
+pub use worker_status::{EndReason, LastEnd, WorkerState, WorkerStatus};
 
 /// API group of both kinds.
 pub const GROUP: &str = "leaderboard.carla.org";

@@ -1,65 +1,98 @@
-//! How far a run is: routes that are done, and the mean scores over them.
+//! How far a run is, and what it has scored. What is counted, and which numbers there are, is the kind of evaluation's own.
 //!
 //! Part of a Submission's status. Pure.
 
 use schemars::JsonSchema;
 use serde::{Deserialize, Serialize};
 
-/// Routes that are done, over all pairs and repetitions.
+/// Most metrics of a run, beside its score.
+pub const MAX_METRICS: usize = 32;
+/// Characters of a metric's name and of a unit's, and of a number.
+pub const MAX_NAME: usize = 64;
+/// Characters of a number.
+const MAX_NUMBER: usize = 32;
+
+/// Progress of the whole run.
 #[derive(Serialize, Deserialize, JsonSchema, Clone, Debug, PartialEq, Eq)]
 pub struct Progress {
-    /// Routes that are done.
+    /// Done counts the units that are done, over all workers.
     pub done: i32,
-    /// Routes of the run, times repetitions.
+    /// Total counts all units of the run.
     pub total: i32,
-    /// `12/20`.
+    /// Unit names what is counted, in the plural, such as `routes`.
+    #[schemars(length(max = MAX_NAME))]
+    pub unit: String,
+    /// Text shows the progress to people, such as `12/20`.
     #[schemars(length(max = 32))]
     pub text: String,
 }
 
 impl Progress {
     /// Progress with its text.
-    pub fn new(done: i32, total: i32) -> Self {
+    pub fn new(done: i32, total: i32, unit: &str) -> Self {
         Self {
             done,
             total,
+            unit: unit.to_owned(),
             text: format!("{done}/{total}"),
         }
     }
 }
 
-/// Mean scores over the routes that are done, as decimal numbers.
+/// One number that a run has come to.
+#[derive(Serialize, Deserialize, JsonSchema, Clone, Debug, Default, PartialEq, Eq)]
+pub struct Metric {
+    /// Name is the metric's name, such as `Route completion`.
+    #[schemars(length(max = MAX_NAME))]
+    pub name: String,
+    /// Value is a decimal number, such as `80.00`, in the unit of the metric.
+    #[schemars(length(max = MAX_NUMBER))]
+    pub value: String,
+}
+
+impl Metric {
+    /// A number with so many digits behind the point.
+    pub fn new(name: &str, value: f64, digits: usize) -> Self {
+        Self {
+            name: name.to_owned(),
+            value: format!("{value:.digits$}"),
+        }
+    }
+
+    /// Whether its name has letters and its value is a decimal number, and both are as short as the definition asks.
+    pub fn is_plausible(&self) -> bool {
+        let is_number = |text: &str| text.parse().is_ok_and(f64::is_finite);
+        let is_short = self.name.chars().count() <= MAX_NAME && self.value.len() <= MAX_NUMBER;
+        is_short && !self.name.trim().is_empty() && is_number(&self.value)
+    }
+}
+
+/// The number that ranks a run.
 #[derive(Serialize, Deserialize, JsonSchema, Clone, Debug, PartialEq, Eq)]
 #[serde(rename_all = "camelCase")]
 pub struct Score {
-    /// Driving score, 0 to 100.
-    #[schemars(length(max = 32))]
-    pub driving: String,
-    /// Route completion in percent.
-    #[serde(default, skip_serializing_if = "Option::is_none")]
-    #[schemars(length(max = 32))]
-    pub route_completion: Option<String>,
-    /// Infraction penalty, 0 to 1: the factor that is left.
-    #[serde(default, skip_serializing_if = "Option::is_none")]
-    #[schemars(length(max = 32))]
-    pub infraction_penalty: Option<String>,
-    /// Whether all routes are done. Until then the scores are those of the routes so far.
-    #[serde(rename = "final")]
-    pub is_final: bool,
-    /// The driving score for people: `~41.20` over the routes so far, `43.13` when final.
+    /// Name is the score's name, such as `Driving score`.
+    #[schemars(length(max = MAX_NAME))]
+    pub name: String,
+    /// Value is a decimal number, such as `43.13`, in the unit of the score.
+    #[schemars(length(max = MAX_NUMBER))]
+    pub value: String,
+    /// Text shows the score to people: `~41.20` as long as more can follow, `43.13` when it is final.
     #[schemars(length(max = 33))]
     pub text: String,
+    /// Final is true once the whole run is done. Until then the score is that of what is done so far.
+    #[serde(rename = "final")]
+    pub is_final: bool,
 }
 
 impl Score {
-    /// From the driving score, and the other two where they are known.
-    pub fn new(driving: f64, route_completion: Option<f64>, infraction_penalty: Option<f64>, is_final: bool) -> Self {
-        let driving = format!("{driving:.2}");
+    /// The score of a run that has come so far, or to its end.
+    pub fn new(metric: Metric, is_final: bool) -> Self {
+        let mark = if is_final { "" } else { "~" };
         Self {
-            text: text_of(&driving, is_final),
-            route_completion: route_completion.map(|percent| format!("{percent:.2}")),
-            infraction_penalty: infraction_penalty.map(|factor| format!("{factor:.3}")),
-            driving,
+            text: format!("{mark}{}", metric.value),
+            name: metric.name,
+            value: metric.value,
             is_final,
         }
     }
@@ -67,17 +100,9 @@ impl Score {
     /// The same as the score of a run that goes on.
     #[must_use]
     pub fn so_far(self) -> Self {
-        Self {
-            text: text_of(&self.driving, false),
-            is_final: false,
-            ..self
-        }
+        let (name, value) = (self.name, self.value);
+        Self::new(Metric { name, value }, false)
     }
-}
-
-fn text_of(driving: &str, is_final: bool) -> String {
-    let mark = if is_final { "" } else { "~" };
-    format!("{mark}{driving}")
 }
 
 #[cfg(test)]
@@ -86,11 +111,31 @@ mod tests {
 
     #[test]
     fn a_score_shows_whether_it_is_final() {
-        let score = Score::new(43.129, Some(80.0), Some(0.5151), true);
-        assert_eq!((score.text.as_str(), score.driving.as_str()), ("43.13", "43.13"));
-        assert_eq!(score.route_completion.as_deref(), Some("80.00"));
-        assert_eq!(score.infraction_penalty.as_deref(), Some("0.515"));
+        let score = Score::new(Metric::new("Driving score", 43.129, 2), true);
+        assert_eq!((score.text.as_str(), score.value.as_str()), ("43.13", "43.13"));
         let again = score.so_far();
         assert_eq!((again.text.as_str(), again.is_final), ("~43.13", false));
+        assert_eq!((again.name.as_str(), again.value.as_str()), ("Driving score", "43.13"));
+    }
+
+    #[test]
+    fn a_metric_is_a_name_and_a_finite_number() {
+        let metric = |name: &str, value: &str| Metric {
+            name: name.to_owned(),
+            value: value.to_owned(),
+        };
+        for (name, value, expected) in [
+            ("Driving score", "43.13", true),
+            ("Driving score", "-1", true),
+            ("Driving score", "NaN", false),
+            ("Driving score", "1e999", false),
+            ("Driving score", "<b>", false),
+            (" ", "1", false),
+            ("Driving score", &"1".repeat(33), false),
+            (&"é".repeat(MAX_NAME), "1", true),
+            (&"é".repeat(MAX_NAME + 1), "1", false),
+        ] {
+            assert_eq!(metric(name, value).is_plausible(), expected, "{name} {value}");
+        }
     }
 }

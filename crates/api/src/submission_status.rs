@@ -11,14 +11,14 @@ use super::attempt::Attempt;
 use super::conditions::Condition;
 use super::failed_node::{FailedNode, MAX_FAILED_NODES};
 use super::leaderboard_parts::{LeaderboardVersion, Storage};
-use super::pair_status::PairStatus;
-use super::progress::{Progress, Score};
+use super::progress::{MAX_METRICS, Metric, Progress, Score};
 use super::route_slice::RouteSlice;
 use super::run_id::RunId;
 use super::shared_text::SharedText;
 use super::submission_use::{Interruptions, Use};
 use super::team::TeamStatus;
 use super::waiting::Waiting;
+use super::worker_status::WorkerStatus;
 
 /// Characters of a message in a status.
 pub const MAX_MESSAGE: usize = 4096;
@@ -107,17 +107,22 @@ pub struct SubmissionStatus {
     /// The participant's image as the first agent ran it. Every later Job runs the same, wherever its tag moves.
     #[serde(default, skip_serializing_if = "Option::is_none")]
     pub image: Option<PinnedImage>,
-    /// Routes that are done.
+    /// Progress shows how much of the run is done.
     #[serde(default, skip_serializing_if = "Option::is_none")]
     pub progress: Option<Progress>,
-    /// Each simulator-agent pair.
+    /// Workers lists the parts that share out the run and go on at once, such as a simulator with its agent.
     #[serde(default, skip_serializing_if = "Vec::is_empty")]
     #[x_kube(merge_strategy = ListMerge::Map(vec!["id".into()]))]
     #[schemars(length(max = 64))]
-    pub pairs: Vec<PairStatus>,
-    /// Mean scores over the routes that are done.
+    pub workers: Vec<WorkerStatus>,
+    /// Score is the number that ranks the run.
     #[serde(default, skip_serializing_if = "Option::is_none")]
     pub score: Option<Score>,
+    /// Metrics lists further numbers of the run, over what is done so far.
+    #[serde(default, skip_serializing_if = "Vec::is_empty")]
+    #[x_kube(merge_strategy = ListMerge::Map(vec!["name".into()]))]
+    #[schemars(length(max = MAX_METRICS))]
+    pub metrics: Vec<Metric>,
     /// Place in line.
     #[serde(default, skip_serializing_if = "Option::is_none")]
     pub waiting: Option<Box<Waiting>>,
@@ -149,10 +154,10 @@ pub struct SubmissionStatus {
     /// What went wrong.
     #[serde(default, skip_serializing_if = "Option::is_none")]
     pub failure: Option<Box<Failure>>,
-    /// Routes that were stored when the present Job was due; absent until an infrastructure failure that an agent can cause has ended a
-    /// Job of this attempt. After another such failure a further Job follows only if more are stored.
+    /// DoneBefore counts the units that were stored when the present Job was due. It is absent until an infrastructure failure that an
+    /// agent can cause has ended a Job of this attempt. After another such failure a further Job follows only if more are stored.
     #[serde(default, skip_serializing_if = "Option::is_none")]
-    pub routes_before: Option<i32>,
+    pub done_before: Option<i32>,
     /// What its Jobs have used. A resume keeps it.
     #[serde(rename = "use", default, skip_serializing_if = "Option::is_none")]
     pub usage: Option<Use>,
@@ -344,9 +349,9 @@ pub struct Failure {
     #[serde(default, skip_serializing_if = "Option::is_none")]
     #[schemars(length(max = MAX_MESSAGE))]
     pub participant_message: Option<String>,
-    /// The pair that it happened in, from 1; absent if it concerns the whole run.
+    /// Worker is the `id` of the worker in which it happened. It is absent if the failure concerns the whole run.
     #[serde(default, skip_serializing_if = "Option::is_none")]
-    pub pair: Option<i32>,
+    pub worker: Option<i32>,
 }
 
 #[allow(clippy::trivially_copy_pass_by_ref, reason = "the signature is serde's")]

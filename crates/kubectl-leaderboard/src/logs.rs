@@ -26,9 +26,9 @@ pub struct Logs {
     /// Follow the log until the submission has ended: into Pods that come later, and through crashes of agents.
     #[arg(short, long)]
     follow: bool,
-    /// Only this pair, from 1.
+    /// Only this worker, from 1.
     #[arg(long, value_name = "NUMBER")]
-    pair: Option<usize>,
+    worker: Option<usize>,
     /// Whose log.
     #[arg(long, value_enum, default_value_t, value_name = "CONTAINERS")]
     of: Whose,
@@ -51,14 +51,14 @@ pub(super) enum Whose {
 
 impl Whose {
     /// The containers with their labels.
-    fn containers(self, pairs: usize, only: Option<usize>) -> Vec<(String, String)> {
-        let of_pairs = |name: fn(usize) -> String| {
-            let pairs = (1..=pairs).filter(|pair| only.is_none_or(|only| only == *pair));
-            pairs.map(|pair| (pair.to_string(), name(pair))).collect()
+    fn containers(self, workers: usize, only: Option<usize>) -> Vec<(String, String)> {
+        let of_workers = |name: fn(usize) -> String| {
+            let workers = (1..=workers).filter(|worker| only.is_none_or(|only| only == *worker));
+            workers.map(|worker| (worker.to_string(), name(worker))).collect()
         };
         match self {
-            Self::Agent => of_pairs(names::agent_container),
-            Self::Simulator => of_pairs(names::simulator_container),
+            Self::Agent => of_workers(names::agent_container),
+            Self::Simulator => of_workers(names::simulator_container),
             Self::Start => {
                 let all = names::INIT_CONTAINERS.into_iter();
                 let that_end = all.filter(|name| *name != names::CONTAINER_LOGCOPY);
@@ -74,12 +74,12 @@ impl Whose {
     }
 
     /// The keys of these logs below the run's prefix, with their labels.
-    pub(super) fn keys(self, pairs: usize, only: Option<usize>) -> Vec<(String, String)> {
-        let pairs = (1..=pairs).filter(|pair| only.is_none_or(|only| only == *pair));
-        let of_pairs = |key: fn(usize) -> String| pairs.map(|pair| (pair.to_string(), key(pair))).collect();
+    pub(super) fn keys(self, workers: usize, only: Option<usize>) -> Vec<(String, String)> {
+        let workers = (1..=workers).filter(|worker| only.is_none_or(|only| only == *worker));
+        let of_workers = |key: fn(usize) -> String| workers.map(|worker| (worker.to_string(), key(worker))).collect();
         match self {
-            Self::Agent => of_pairs(|pair| format!("agent/agent{pair}/leaderboard.log")),
-            Self::Simulator => of_pairs(|pair| format!("simulator/console-{pair}.log")),
+            Self::Agent => of_workers(|worker| format!("agent/agent{worker}/leaderboard.log")),
+            Self::Simulator => of_workers(|worker| format!("simulator/console-{worker}.log")),
             Self::Start => Vec::new(),
             Self::Logcopy => vec![("logcopy".to_owned(), "logcopy/logcopy.log".to_owned())],
         }
@@ -97,16 +97,16 @@ struct Source {
 /// Prints the logs.
 pub async fn logs(cluster: &Cluster, wanted: &Logs) -> Result<ExitCode, Error> {
     let submission = cluster.submission(&wanted.name).await?;
-    let pairs = pairs(&submission);
-    if let Some(pair) = wanted.pair.filter(|pair| *pair == 0 || *pair > pairs.max(1)) {
-        return Err(Error::Unfit(no_pair(&wanted.name, pair, pairs)));
+    let workers = workers(&submission);
+    if let Some(worker) = wanted.worker.filter(|worker| *worker == 0 || *worker > workers.max(1)) {
+        return Err(Error::Unfit(no_worker(&wanted.name, worker, workers)));
     }
     if wanted.follow && !facts::has_ended(&submission) {
         return follow::follow(cluster, wanted, submission).await;
     }
     let code = match cluster.pod(&wanted.name).await? {
-        Some(pod) => stream(cluster, &pod, &sources(wanted, pairs)).await?,
-        None => from_bucket(&submission, wanted, pairs).await?,
+        Some(pod) => stream(cluster, &pod, &sources(wanted, workers)).await?,
+        None => from_bucket(&submission, wanted, workers).await?,
     };
     if wanted.follow {
         note(&end(&submission));
@@ -114,10 +114,10 @@ pub async fn logs(cluster: &Cluster, wanted: &Logs) -> Result<ExitCode, Error> {
     Ok(code)
 }
 
-fn no_pair(name: &str, pair: usize, pairs: usize) -> String {
-    match pairs {
-        0 | 1 => format!("{name} has no pair {pair}. It has one: leave out --pair"),
-        pairs => format!("{name} has no pair {pair}. It has {pairs}, counted from 1"),
+fn no_worker(name: &str, worker: usize, workers: usize) -> String {
+    match workers {
+        0 | 1 => format!("{name} has no worker {worker}. It has one: leave out --worker"),
+        workers => format!("{name} has no worker {worker}. It has {workers}, counted from 1"),
     }
 }
 
@@ -151,10 +151,10 @@ pub(super) fn end(submission: &Submission) -> String {
     )
 }
 
-fn sources(wanted: &Logs, pairs: usize) -> Vec<Source> {
-    let containers = wanted.of.containers(pairs, wanted.pair).into_iter().enumerate();
+fn sources(wanted: &Logs, workers: usize) -> Vec<Source> {
+    let containers = wanted.of.containers(workers, wanted.worker).into_iter().enumerate();
     let source = |(stream, (label, container)): (usize, (String, String))| Source {
-        // A pair has its colour also where it is shown alone.
+        // A worker has its colour also where it is shown alone.
         stream: label.parse().unwrap_or(stream),
         label,
         container,
@@ -162,7 +162,7 @@ fn sources(wanted: &Logs, pairs: usize) -> Vec<Source> {
     containers.map(source).collect()
 }
 
-fn pairs(submission: &Submission) -> usize {
+fn workers(submission: &Submission) -> usize {
     let plan = submission.status.as_ref().and_then(|status| status.plan.as_ref());
     plan.map_or(0, |plan| plan.workers())
 }
@@ -196,8 +196,8 @@ async fn stream(cluster: &Cluster, pod: &Pod, sources: &[Source]) -> Result<Exit
 }
 
 /// Prints the logs that are stored, or the commands that do so where there is no program for it.
-async fn from_bucket(submission: &Submission, wanted: &Logs, pairs: usize) -> Result<ExitCode, Error> {
-    let keys = wanted.of.keys(pairs, wanted.pair);
+async fn from_bucket(submission: &Submission, wanted: &Logs, workers: usize) -> Result<ExitCode, Error> {
+    let keys = wanted.of.keys(workers, wanted.worker);
     let commands = in_bucket(submission, wanted.of, &keys, frame()).map_err(Error::Unfit)?;
     let status = submission.status.as_ref();
     let results = status
@@ -353,7 +353,7 @@ mod tests {
                           "slices": [{"first": 0, "last": 0}], "routes": 1, "repetitions": 1, "storage": storage, "image": "a",
                           "contentsImage": "c", "simulatorImage": "s"});
         let stored = submission(&json!({"resultsURL": "s3://b/mine", "plan": plan, "conditions": ended()}));
-        assert_eq!(pairs(&stored), 1);
+        assert_eq!(workers(&stored), 1);
         let in_bucket = |submission, of: Whose| in_bucket(submission, of, &of.keys(1, None), frame());
         let lines = in_bucket(&stored, Whose::Agent).unwrap();
         assert_eq!(
@@ -397,14 +397,17 @@ mod tests {
     }
 
     #[test]
-    fn a_pair_that_does_not_exist_is_named_with_how_many_there_are() {
-        for (pairs, next) in [
-            (0, "leave out --pair"),
-            (1, "leave out --pair"),
+    fn a_worker_that_does_not_exist_is_named_with_how_many_there_are() {
+        for (workers, next) in [
+            (0, "leave out --worker"),
+            (1, "leave out --worker"),
             (4, "It has 4, counted from 1"),
         ] {
-            let why = no_pair("mine", 7, pairs);
-            assert!(why.starts_with("mine has no pair 7. ") && why.ends_with(next), "{why}");
+            let why = no_worker("mine", 7, workers);
+            assert!(
+                why.starts_with("mine has no worker 7. ") && why.ends_with(next),
+                "{why}"
+            );
         }
     }
 }

@@ -412,10 +412,10 @@ mod tests {
                 "a  \u{1b}[31mFailed\u{1b}[0m   3 min  was Running before",
             ),
             (
-                "Pair 1:  ██░░ 1/2",
-                "Pair 1:  \u{1b}[36m██\u{1b}[0m\u{1b}[2m░░\u{1b}[0m 1/2",
+                "Worker 1:  ██░░ 1/2",
+                "Worker 1:  \u{1b}[36m██\u{1b}[0m\u{1b}[2m░░\u{1b}[0m 1/2",
             ),
-            ("Pair 2:  ██ 2/2", "Pair 2:  \u{1b}[32m██\u{1b}[0m 2/2"),
+            ("Worker 2:  ██ 2/2", "Worker 2:  \u{1b}[32m██\u{1b}[0m 2/2"),
             ("Next: Nothing.", "Next: Nothing."),
         ] {
             assert_eq!(painted(line), expected);

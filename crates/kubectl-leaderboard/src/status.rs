@@ -3,7 +3,7 @@
 use jiff::Timestamp;
 use kube::ResourceExt;
 use leaderboard_api::text::sentence;
-use leaderboard_api::{PairState, PairStatus, State, Submission, SubmissionStatus, Times, conditions};
+use leaderboard_api::{State, Submission, SubmissionStatus, Times, WorkerState, WorkerStatus, conditions};
 use serde_json::{Value, json};
 
 use super::board::{self, Observed};
@@ -11,7 +11,7 @@ use super::facts;
 use super::table::{bar, table};
 use super::text::{Frame, Page, join, span};
 
-/// Columns of the bar of a run, and of one pair's.
+/// Columns of the bar of a run, and of one worker's.
 const BAR: usize = 20;
 
 /// One screen of a submission.
@@ -32,11 +32,11 @@ pub fn screen(submission: &Submission, leaderboard: Observed<'_>, frame: Frame) 
     page.row("In line", &in_line(status));
     if let Some(progress) = &status.progress {
         let bar = bar(progress.done, progress.total, BAR);
-        page.row("Routes", &format!("{bar} {}", progress.text));
+        page.row("Progress", &format!("{bar} {} {}", progress.text, progress.unit));
     }
-    for each in &status.pairs {
+    for each in &status.workers {
         let has_ended = facts::has_ended(submission);
-        page.row(&format!("Pair {}", each.id), &pair(each, has_ended, now));
+        page.row(&format!("Worker {}", each.id), &worker(each, has_ended, now));
     }
     page.row("Scores", &scores(status));
     page.row("Times", &times(submission, &status.times, now));
@@ -57,20 +57,16 @@ fn in_line(status: &SubmissionStatus) -> String {
     format!("position {}{}.", waiting.position, eta.unwrap_or_default())
 }
 
-/// The scores, of the routes so far until the run has finished.
+/// The score and the metrics, so far until the run has finished.
 fn scores(status: &SubmissionStatus) -> String {
     let Some(score) = &status.score else {
         return String::new();
     };
-    let completion = score.route_completion.as_ref();
-    let penalty = score.infraction_penalty.as_ref();
-    let parts = [
-        Some(format!("driving {}", score.text)),
-        completion.map(|percent| format!("route completion {percent} %")),
-        penalty.map(|factor| format!("infraction penalty {factor}")),
-    ];
-    let parts: Vec<String> = parts.into_iter().flatten().collect();
-    let so_far = if score.is_final { "" } else { ", of the routes so far" };
+    let score_text = format!("{} {}", score.name, score.text);
+    let others = status.metrics.iter();
+    let others = others.map(|metric| format!("{} {}", metric.name, metric.value));
+    let parts: Vec<String> = std::iter::once(score_text).chain(others).collect();
+    let so_far = if score.is_final { "" } else { ", so far" };
     format!("{}{so_far}.", parts.join(", "))
 }
 
@@ -92,32 +88,32 @@ fn links(page: &mut Page, submission: &Submission, status: &SubmissionStatus, le
     page.whole("Next", &facts::command("why", submission));
 }
 
-fn pair(pair: &PairStatus, has_ended: bool, now: Timestamp) -> String {
-    let state = match pair.state {
-        PairState::Waiting => "waiting",
-        PairState::Running => "running",
-        PairState::Done => "done",
-        PairState::Crashed if has_ended => "given up",
-        PairState::Crashed => "crashed, starts again",
-        PairState::Unknown => "",
+fn worker(worker: &WorkerStatus, has_ended: bool, now: Timestamp) -> String {
+    let state = match worker.state {
+        WorkerState::Waiting => "waiting",
+        WorkerState::Running => "running",
+        WorkerState::Done => "done",
+        WorkerState::Crashed if has_ended => "given up",
+        WorkerState::Crashed => "crashed, starts again",
+        WorkerState::Unknown => "",
     };
-    let crashes = match pair.crashes {
+    let crashes = match worker.crashes {
         0 => String::new(),
         1 => ", 1 crash".to_owned(),
         count => format!(", {count} crashes"),
     };
-    let last = pair.last.as_ref().filter(|_| pair.crashes > 0).map(|last| {
+    let last = worker.last.as_ref().filter(|_| worker.crashes > 0).map(|last| {
         let ago = last
             .time
             .as_ref()
             .map(|time| format!(" {} ago", span(now.duration_since(time.0).as_secs())));
         format!("; last end {}{}", last.reason, ago.unwrap_or_default())
     });
-    let bar = bar(pair.done, pair.total, BAR);
+    let bar = bar(worker.done, worker.total, BAR);
     format!(
         "{bar} {}/{} {state}{crashes}{}",
-        pair.done,
-        pair.total,
+        worker.done,
+        worker.total,
         last.unwrap_or_default()
     )
 }
@@ -159,7 +155,7 @@ pub fn lines(submissions: &[Submission], is_qualified: bool, is_wide: bool, fram
     let now = frame.now;
     let mut all: Vec<&Submission> = submissions.iter().collect();
     all.sort_by_key(|one| order(one, now));
-    let mut head = vec!["NAME", "STATE", "REASON", "ROUTES", "SCORE", "QUEUE", "SINCE"];
+    let mut head = vec!["NAME", "STATE", "REASON", "PROGRESS", "SCORE", "QUEUE", "SINCE"];
     if is_qualified {
         head.insert(0, "NAMESPACE");
     }
@@ -209,7 +205,7 @@ fn row(submission: &Submission, is_qualified: bool, is_wide: bool, now: Timestam
         row.insert(0, submission.namespace().unwrap_or_default());
     }
     if is_wide {
-        let crashes: i32 = status.pairs.iter().map(|pair| pair.crashes).sum();
+        let crashes: i32 = status.workers.iter().map(|worker| worker.crashes).sum();
         row.extend([
             submission.spec.leaderboard_name.clone(),
             text(status.track.as_deref().or(submission.spec.track.as_deref())),

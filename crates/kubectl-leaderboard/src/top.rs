@@ -53,7 +53,7 @@ fn uses(submissions: &[Submission]) -> Vec<(Key, Use)> {
             .map(|waiting| waiting.position);
         each.first_in_line = [each.first_in_line, place].into_iter().flatten().min();
         each.crashes += status.map_or(0, |status| {
-            status.pairs.iter().map(|pair| i64::from(pair.crashes)).sum()
+            status.workers.iter().map(|worker| i64::from(worker.crashes)).sum()
         });
     }
     let mut all: Vec<(Key, Use)> = uses.into_iter().collect();

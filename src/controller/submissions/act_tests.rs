@@ -100,7 +100,7 @@ async fn each_transition_is_one_line_with_all_that_identifies_it() {
         ..old.clone()
     };
     write(scheduled.clone()).await;
-    let progress = json!({"done": 1, "total": 4, "text": "1/4"});
+    let progress = json!({"done": 1, "total": 4, "unit": "routes", "text": "1/4"});
     write(SubmissionStatus {
         progress: serde_json::from_value(progress).unwrap(),
         ..scheduled.clone()

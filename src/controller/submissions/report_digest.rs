@@ -1,12 +1,12 @@
-//! A report reduced to what decisions and the table need: under 1 KB while the run goes on, whatever the report embeds.
+//! A report reduced to what decisions and the table need: under 1.5 KB while the run goes on, whatever the report embeds.
 
 use serde_json::{Map, Value};
 
 use crate::pod::carla;
-use crate::pod::report::{ContentId, Logs, Report, ReportError, ReportPair};
+use crate::pod::report::{ContentId, Logs, Report, ReportError, ReportWorker};
 use crate::pod::run::Stop;
 use leaderboard_api::text::one_line;
-use leaderboard_api::{Attempt, Progress, Score};
+use leaderboard_api::{Attempt, Metric, Progress, Score};
 
 /// Largest text that is passed on to EvalAI, in bytes.
 pub const MAX_TEXT: u64 = 4 << 20;
@@ -25,10 +25,11 @@ pub struct ReportDigest {
     pub pod_uid: String,
     pub done: u32,
     pub total: u32,
-    pub pairs: Vec<ReportPair>,
-    pub score: Option<f64>,
-    pub route_completion: Option<f64>,
-    pub infraction_penalty: Option<f64>,
+    pub unit: String,
+    pub workers: Vec<ReportWorker>,
+    pub score: Option<Metric>,
+    /// The numbers that the status shows beside the score.
+    pub metrics: Vec<Metric>,
     pub is_final: bool,
     pub eligible: bool,
     pub entry_status: String,
@@ -42,7 +43,7 @@ pub struct ReportDigest {
     /// The agents' folders fill the volume of the logs.
     pub agents_fill_disk: bool,
     /// The metrics of a final report, for the table.
-    pub metrics: Option<Box<Map<String, Value>>>,
+    pub accuracies: Option<Box<Map<String, Value>>>,
     /// Why EvalAI is not sent one of its texts.
     pub left_out: Option<Box<str>>,
 }
@@ -55,7 +56,7 @@ impl ReportDigest {
         Ok(is_of.then(|| Self::of(&report, ContentId::of(bytes))))
     }
 
-    /// Whether all routes are done, and nothing more comes.
+    /// Whether the whole run is done, and nothing more comes.
     pub fn is_complete(&self) -> bool {
         self.is_final && self.done == self.total && self.total > 0
     }
@@ -69,13 +70,12 @@ impl ReportDigest {
     }
 
     pub fn progress(&self) -> Progress {
-        Progress::new(clamp(self.done), clamp(self.total))
+        Progress::new(clamp(self.done), clamp(self.total), &self.unit)
     }
 
-    /// The score so far, or of all routes.
+    /// The score so far, or of the whole run.
     pub fn score(&self, is_final: bool) -> Option<Score> {
-        let (completion, penalty) = (self.route_completion, self.infraction_penalty);
-        Some(Score::new(self.score?, completion, penalty, is_final))
+        Some(Score::new(self.score.clone()?, is_final))
     }
 
     pub fn of(report: &Report, id: ContentId) -> Self {
@@ -85,10 +85,10 @@ impl ReportDigest {
             pod_uid: cut(&report.pod_uid),
             done: report.done,
             total: report.total,
-            pairs: report.pairs.clone(),
-            score: report.score,
-            route_completion: report.route_completion,
-            infraction_penalty: report.infraction_penalty,
+            unit: report.unit.clone(),
+            workers: report.workers.clone(),
+            score: report.score.clone(),
+            metrics: report.metrics.clone(),
             is_final: report.is_final,
             eligible: report.eligible,
             entry_status: cut(&report.entry_status),
@@ -100,7 +100,7 @@ impl ReportDigest {
                 Logs::Refused(why) => Logs::Refused(cut(why)),
             }),
             agents_fill_disk: report.agents_fill_disk,
-            metrics: report.is_final.then(|| accuracies(&report.results)).flatten(),
+            accuracies: report.is_final.then(|| accuracies(&report.results)).flatten(),
             left_out: left_out(report).map(Into::into),
         }
     }
@@ -146,13 +146,15 @@ mod tests {
 
     use super::*;
 
-    /// A report of a real size: 40 kB of results, two pairs.
+    /// A report of a real size: 40 kB of results, two workers.
     fn report(is_final: bool) -> Vec<u8> {
-        let pair = |id: u32| json!({"id": id, "done": 10, "total": 10, "crashes": 1, "state": "Running"});
+        let worker = |id: u32| json!({"id": id, "done": 10, "total": 10, "crashes": 1, "state": "Running"});
         let accuracies = json!({"Driving score": 43.125, "other": "x".repeat(40_000)});
         json!({
             "schema": 1, "submissionUid": "u", "attempt": 1, "podUid": "0a86cbb5-8f3c-4a55-b5a1-9a4ff7a5c9a2", "round": 9,
-            "done": 20, "total": 20, "pairs": [pair(1), pair(2)], "score": 43.125, "final": is_final, "eligible": is_final,
+            "done": 20, "total": 20, "unit": "routes", "workers": [worker(1), worker(2)],
+            "score": {"name": "Driving score", "value": "43.13"},
+            "metrics": [{"name": "Route completion", "value": "80.00"}, {"name": "Infraction penalty", "value": "0.515"}], "final": is_final, "eligible": is_final,
             "entryStatus": "Finished", "why": "w".repeat(9_000), "warnings": vec!["v".repeat(9_000); 9],
             "results": json!([{"accuracies": accuracies}]).to_string(), "partialResults": "p".repeat(40_000),
             "files": {"evalai/stdout.txt": {"size": 9, "sha256": "0".repeat(64)}},
@@ -168,24 +170,30 @@ mod tests {
             digest.why.as_ref(),
             digest.warning.as_ref(),
         ];
-        let pairs = digest.pairs.len() * size_of::<ReportPair>();
-        size_of::<ReportDigest>() + pairs + texts.into_iter().flatten().map(String::capacity).sum::<usize>()
+        let workers = digest.workers.len() * size_of::<ReportWorker>();
+        let metric = |metric: &Metric| size_of::<Metric>() + metric.name.capacity() + metric.value.capacity();
+        let metrics: usize = digest.score.iter().chain(&digest.metrics).map(metric).sum();
+        size_of::<ReportDigest>() + workers + metrics + texts.into_iter().flatten().map(String::capacity).sum::<usize>()
     }
 
     #[test]
-    fn a_live_report_of_a_real_size_is_kept_in_less_than_a_kilobyte() {
+    fn a_live_report_of_a_real_size_is_kept_in_less_than_one_and_a_half_kilobytes() {
         let bytes = report(false);
         assert!(bytes.len() > 80_000);
         let digest = ReportDigest::read(&bytes, "u").unwrap().unwrap();
-        assert!(size(&digest) < 1024, "{} bytes", size(&digest));
-        assert_eq!((digest.metrics, digest.why), (None, None));
-        assert_eq!((digest.done, digest.pairs.len(), digest.score), (20, 2, Some(43.125)));
+        assert!(size(&digest) < 1536, "{} bytes", size(&digest));
+        assert_eq!((digest.accuracies, digest.why), (None, None));
+        let score = digest.score.map(|score| score.value);
+        assert_eq!(
+            (digest.done, digest.workers.len(), score.as_deref()),
+            (20, 2, Some("43.13"))
+        );
     }
 
     #[test]
     fn a_final_report_keeps_the_metrics_of_the_table_alone() {
         let digest = ReportDigest::read(&report(true), "u").unwrap().unwrap();
-        let metrics = digest.metrics.unwrap();
+        let metrics = digest.accuracies.unwrap();
         assert_eq!(serde_json::to_string(&metrics).unwrap(), r#"{"Driving score":43.125}"#);
         assert_eq!(digest.why.unwrap().chars().count(), LONGEST);
     }

@@ -128,7 +128,7 @@ fn table_status(state: State) -> &'static str {
 
 /// The metric columns, as text with the digits of results.json; those without a value are to be removed.
 fn columns(report: Option<&ReportDigest>, version: LeaderboardVersion) -> Vec<(String, Option<String>)> {
-    let accuracies = report.and_then(|report| report.metrics.as_ref());
+    let accuracies = report.and_then(|report| report.accuracies.as_ref());
     let text = |value: &Value| match value.as_f64().filter(|_| value.is_f64()) {
         Some(number) => number_text(number),
         None => value.to_string(),
@@ -150,7 +150,7 @@ mod tests {
 
     fn report(results: &str) -> ReportDigest {
         let report: crate::pod::report::Report = serde_json::from_value(json!({
-            "schema": 1, "submissionUid": "u", "attempt": 1, "podUid": "p", "round": 9, "done": 1, "total": 4, "pairs": [],
+            "schema": 1, "submissionUid": "u", "attempt": 1, "podUid": "p", "round": 9, "done": 1, "total": 4, "unit": "routes", "workers": [],
             "final": true, "eligible": true, "entryStatus": "Finished", "results": results,
         }))
         .unwrap();

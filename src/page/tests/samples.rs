@@ -47,27 +47,27 @@ pub(super) fn waiting(name: &str, team: &str, position: Option<i32>, reason: &st
     submission(name, "carla-20", team, &status)
 }
 
-/// One that runs since so many hours, with what its pairs have done of 20 routes and how often each crashed.
-pub(super) fn running(name: &str, team: &str, attempt: i64, hours: i64, pairs: &[(i32, i32)]) -> Arc<Submission> {
-    let done: i32 = pairs.iter().map(|(done, _)| done).sum();
-    let total = 20 * i32::try_from(pairs.len()).unwrap();
-    let pairs: Vec<Value> = (1..)
-        .zip(pairs)
-        .map(|(id, (done, crashes))| pair(id, *done, *crashes))
+/// One that runs since so many hours, with what its workers have done of 20 routes and how often each crashed.
+pub(super) fn running(name: &str, team: &str, attempt: i64, hours: i64, workers: &[(i32, i32)]) -> Arc<Submission> {
+    let done: i32 = workers.iter().map(|(done, _)| done).sum();
+    let total = 20 * i32::try_from(workers.len()).unwrap();
+    let all: Vec<Value> = (1..)
+        .zip(workers)
+        .map(|(id, (done, crashes))| worker(id, *done, *crashes))
         .collect();
     let started = hours * HOUR;
     let status = json!({
         "attempt": attempt, "reason": "Running", "track": "sensors", "jobName": format!("{name}-{attempt}"),
-        "nodeName": format!("gpu-{hours}"), "pairs": pairs,
-        "progress": {"done": done, "total": total, "text": format!("{done}/{total}")},
-        "score": {"driving": "41.20", "final": false, "text": format!("~4{hours}.20")},
+        "nodeName": format!("gpu-{hours}"), "workers": all,
+        "progress": {"done": done, "total": total, "unit": "routes", "text": format!("{done}/{total}")},
+        "score": {"name": "Driving score", "value": "41.20", "final": false, "text": format!("~4{hours}.20")},
         "times": {"submitted": ago(started + hours * 20 * MINUTE), "scheduled": ago(started + 7 * MINUTE), "started": ago(started)},
         "conditions": [condition("Running", "True", "Running", started)],
     });
     submission(name, "carla-20", team, &status)
 }
 
-fn pair(id: i32, done: i32, crashes: i32) -> Value {
+fn worker(id: i32, done: i32, crashes: i32) -> Value {
     let state = match (done, crashes) {
         (20, _) => "Done",
         (_, 2..) => "Crashed",
@@ -82,8 +82,8 @@ pub(super) fn finished(name: &str, team: &str, score: &str, minutes: i64, hours:
     let end = minutes * MINUTE;
     let status = json!({
         "attempt": 1, "reason": "Finished", "track": "sensors",
-        "progress": {"done": 80, "total": 80, "text": "80/80"},
-        "score": {"driving": score, "final": true, "text": score},
+        "progress": {"done": 80, "total": 80, "unit": "routes", "text": "80/80"},
+        "score": {"name": "Driving score", "value": score, "final": true, "text": score},
         "times": {
             "submitted": ago(end + 2 * hours * HOUR), "scheduled": ago(end + hours * HOUR + 6 * MINUTE),
             "started": ago(end + hours * HOUR), "finished": ago(end), "published": ago(end - 20),
@@ -104,7 +104,7 @@ pub(super) fn failed(
     let end = minutes * MINUTE;
     let status = json!({
         "attempt": 1, "reason": reason, "track": "sensors",
-        "progress": {"done": 22, "total": 80, "text": "22/80"},
+        "progress": {"done": 22, "total": 80, "unit": "routes", "text": "22/80"},
         "failure": {"class": class, "reason": reason, "message": message},
         "times": {
             "submitted": ago(end + 2 * HOUR), "scheduled": ago(end + HOUR), "started": ago(end + HOUR - 5 * MINUTE),

@@ -9,7 +9,7 @@ const PHASES = [
   ["publishing", "published in", "finished"],
 ];
 
-const PAIR = {
+const WORKER = {
   Waiting: "waiting",
   Running: "running",
   Done: "done",
@@ -156,15 +156,15 @@ export function leaderboards(view, context) {
   return element("div", {}, shown.length ? [legend(), cards] : empty, rest);
 }
 
-function pair(each) {
+function worker(each) {
   const crashes = each.crashes === 1 ? "1 crash" : `${each.crashes} crashes`;
   const last = each.last ? ` (${each.last})` : "";
-  const state = each.crashes ? `${PAIR[each.state]}, ${crashes}${last}` : PAIR[each.state];
+  const state = each.crashes ? `${WORKER[each.state]}, ${crashes}${last}` : WORKER[each.state];
   return element(
     "li",
     { "data-key": each.id, "data-state": each.state },
-    element("span", { class: "label" }, `Pair ${each.id}`),
-    bar(each.done, each.total, `Routes of pair ${each.id}`),
+    element("span", { class: "label" }, `Worker ${each.id}`),
+    bar(each.done, each.total, `Progress of worker ${each.id}`),
     element("span", {}, `${each.done}/${each.total}`),
     element("span", { class: "muted state" }, state),
   );
@@ -176,7 +176,7 @@ export function running(view, context) {
     const score = row.score ? element("span", { class: "score" }, row.score) : null;
     const notes = [row.attempt > 1 ? `attempt ${row.attempt}` : null, row.node ? `on ${row.node}` : null];
     if (row.reason && row.reason !== "Running" && row.reason !== "Resumed") notes.push(row.reason);
-    const pairs = element("ul", { class: "pairs", "aria-label": `Pairs of ${row.name}` }, row.pairs.map(pair));
+    const workers = element("ul", { class: "workers", "aria-label": `Workers of ${row.name}` }, row.workers.map(worker));
     return element(
       "li",
       { class: "row run", "data-key": keyOf(row) },
@@ -184,11 +184,11 @@ export function running(view, context) {
       element(
         "div",
         { class: "side" },
-        element("div", { class: "whole" }, bar(row.done, row.total, `Routes of ${row.name}`), `${row.done}/${row.total} routes`, score),
+        element("div", { class: "whole" }, bar(row.done, row.total, `Progress of ${row.name}`), `${row.done}/${row.total} ${row.unit}`, score),
         element("span", { class: "muted notes" }, notes.filter(Boolean).join(" · ")),
       ),
       picture(lengths(row.phases, context.now), scale),
-      row.pairs.length ? pairs : null,
+      row.workers.length ? workers : null,
     );
   });
 }
@@ -222,7 +222,7 @@ export function ended(view, context) {
       who(row, context),
       element("div", { class: "outcome" }, element("span", { class: `badge ${BADGE[row.state]}` }, row.state), element("span", { class: "score" }, row.score ?? "–")),
       picture(lengths(row.phases, context.now), scale),
-      element("span", { class: "muted notes" }, [reason, row.total ? `${row.done}/${row.total} routes` : null].filter(Boolean).join(" · "), open, end ? " · " : null, end),
+      element("span", { class: "muted notes" }, [reason, row.total ? `${row.done}/${row.total} ${row.unit}` : null].filter(Boolean).join(" · "), open, end ? " · " : null, end),
     );
   });
 }

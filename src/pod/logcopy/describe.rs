@@ -4,6 +4,7 @@ use std::collections::BTreeMap;
 
 use crate::pod::gather::Gathered;
 use crate::pod::judge::Ending;
+use crate::pod::measures::UNIT;
 use crate::pod::report::{LONGEST_TEXT, MAX_BYTES, Report, SCHEMA};
 use crate::pod::run::Run;
 use leaderboard_api::text::one_line;
@@ -37,10 +38,10 @@ pub fn describe(run: &Run, pod_uid: &str, gathered: &Gathered, ending: Option<&E
         round: 0,
         done: merged.map_or(0, |merged| merged.done).min(total),
         total,
-        pairs: gathered.pairs.clone(),
-        score: merged.and_then(|merged| merged.score),
-        route_completion: merged.and_then(|merged| merged.route_completion),
-        infraction_penalty: merged.and_then(|merged| merged.infraction_penalty),
+        unit: UNIT.to_owned(),
+        workers: gathered.pairs.clone(),
+        score: merged.and_then(|merged| merged.score.clone()),
+        metrics: merged.map(|merged| merged.metrics.clone()).unwrap_or_default(),
         is_final: ending.is_some(),
         eligible: counts && merged.is_some_and(|merged| merged.eligible),
         entry_status: merged.map_or("Started", |merged| merged.ended_as.as_str()).to_owned(),

@@ -32,7 +32,7 @@ async fn with_path(terminal: &Terminal, path: &Path, arguments: &[&str]) -> Prin
 async fn without_the_program_its_commands_are_printed() {
     let terminal = stored().await;
     let nowhere = tempfile::tempdir().unwrap();
-    let text = with_path(&terminal, nowhere.path(), &["logs", "mine", "--pair", "2"])
+    let text = with_path(&terminal, nowhere.path(), &["logs", "mine", "--worker", "2"])
         .await
         .well();
     assert_has(
@@ -40,7 +40,7 @@ async fn without_the_program_its_commands_are_printed() {
         &["aws s3 cp s3://results/42/agent/agent2/leaderboard.log - --region eu-west-1"],
     );
     assert!(!text.contains("agent1"), "{text}");
-    let text = terminal.run(&["logs", "mine", "--pair", "3"]).await.refused();
+    let text = terminal.run(&["logs", "mine", "--worker", "3"]).await.refused();
     assert_has(&text, &["mine has no pair 3. It has 2, counted from 1"]);
 }
 
@@ -70,7 +70,7 @@ async fn the_program_reads_each_log_and_one_that_cannot_be_read_does_not_hold_up
     let text = with_path(
         &terminal,
         folder.path(),
-        &["logs", "mine", "-f", "--pair", "1", "--color", "always"],
+        &["logs", "mine", "-f", "--worker", "1", "--color", "always"],
     )
     .await;
     assert!(
@@ -94,14 +94,14 @@ async fn a_server_that_is_not_awss_gets_a_persons_credentials_only_by_a_flag_tha
     echoing(folder.path());
     let call = "s3 cp --only-show-errors --endpoint-url=https://minio.example";
     for arguments in [
-        &["logs", "mine", "--pair", "1"][..],
-        &["logs", "mine", "--pair", "1", "--endpoint=https://other.example"],
+        &["logs", "mine", "--worker", "1"][..],
+        &["logs", "mine", "--worker", "1", "--endpoint=https://other.example"],
     ] {
         let printed = with_path(&terminal, folder.path(), arguments).await;
         assert!(!printed.out.contains(call), "{printed:?}");
         assert_has(&printed.refused(), &[ENDPOINT, "add --endpoint=https://minio.example"]);
     }
-    let trusted = ["logs", "mine", "--pair", "1", "--endpoint=https://minio.example"];
+    let trusted = ["logs", "mine", "--worker", "1", "--endpoint=https://minio.example"];
     let printed = with_path(&terminal, folder.path(), &trusted).await;
     assert_eq!(printed.code, Some(0), "{printed:?}");
     assert_has(&printed.out, &[call]);

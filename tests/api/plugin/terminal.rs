@@ -226,7 +226,7 @@ pub fn end(state: &str, reason: &str) -> Value {
 
 pub fn failed(class: &str, reason: &str) -> Value {
     let mut status = end("Failed", reason);
-    let failure = json!({"class": class, "reason": reason, "message": "It has ended.", "pair": 2});
+    let failure = json!({"class": class, "reason": reason, "message": "It has ended.", "worker": 2});
     merge(&mut status, &json!({ "failure": failure }));
     status
 }
@@ -235,7 +235,7 @@ pub fn finished() -> Value {
     let mut status = end("Finished", "Finished");
     merge(
         &mut status,
-        &json!({"score": {"driving": "43.13", "final": true, "text": "43.13"}, "progress": {"done": 20, "total": 20, "text": "20/20"}}),
+        &json!({"score": {"name": "Driving score", "value": "43.13", "final": true, "text": "43.13"}, "progress": {"done": 20, "total": 20, "unit": "routes", "text": "20/20"}}),
     );
     status
 }

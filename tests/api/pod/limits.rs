@@ -126,7 +126,7 @@ async fn status_files_without_end_are_not_all_stored() {
     }
     let logcopy = pod.logcopy();
     let report = pod.reported(|report| report.round >= 1).await;
-    assert_eq!(report.pairs[0].crashes, 150, "they count all the same");
+    assert_eq!(report.workers[0].crashes, 150, "they count all the same");
     logcopy.end().await;
     let keys = pod.keys().await;
     let stored = keys

@@ -1,6 +1,6 @@
 //! The sidecar, from the first round to SIGTERM.
 
-use leaderboard_api::PairState;
+use leaderboard_api::WorkerState;
 
 use super::*;
 
@@ -21,8 +21,12 @@ async fn a_whole_run_ends_with_the_final_report_and_the_original_layout() {
     pod.checkpoint(1, 1);
     let report = pod.reported(|report| report.done == 1).await;
     assert_eq!(
-        (report.score, report.is_final, report.pairs[0].state),
-        (Some(100.0), false, PairState::Running)
+        (
+            report.score.as_ref().map(|score| score.value.as_str()),
+            report.is_final,
+            report.workers[0].state
+        ),
+        (Some("100.00"), false, WorkerState::Running)
     );
     let stored = pod.stored("evalai/results.json").await.unwrap();
     assert_eq!(stored, report.results.as_bytes(), "what is stored stays the original's");
@@ -44,7 +48,7 @@ async fn a_whole_run_ends_with_the_final_report_and_the_original_layout() {
         (report.done, report.total, report.entry_status.as_str()),
         (4, 4, "Finished")
     );
-    assert!(report.pairs.iter().all(|pair| pair.state == PairState::Done));
+    assert!(report.workers.iter().all(|pair| pair.state == WorkerState::Done));
     assert_eq!(
         pod.stored("evalai/results.json").await.unwrap(),
         report.results.as_bytes()

@@ -8,8 +8,8 @@ use evalai_stand_in::Config;
 use futures::FutureExt;
 use futures::future::BoxFuture;
 use kube::ResourceExt;
-use leaderboard_api::{Attempt, PairState, names};
-use leaderboard_operator::pod::report::{REPORT_KEY, Report, ReportPair, SCHEMA};
+use leaderboard_api::{Attempt, Metric, WorkerState, names};
+use leaderboard_operator::pod::report::{REPORT_KEY, Report, ReportWorker, SCHEMA};
 use leaderboard_operator::services::archive::Archive;
 use serde_json::json;
 use tokio::time::{Instant, interval_at};
@@ -108,17 +108,17 @@ pub fn report(submission_uid: String, pod_uid: String, done: u32) -> Report {
         round: done.into(),
         done,
         total: ROUTES,
-        pairs: vec![ReportPair {
+        unit: "routes".into(),
+        workers: vec![ReportWorker {
             id: 1,
             done,
             total: ROUTES,
             crashes: 0,
-            state: PairState::Running,
+            state: WorkerState::Running,
             names_crash: false,
         }],
-        score: Some(score),
-        route_completion: None,
-        infraction_penalty: None,
+        score: Some(Metric::new("Driving score", score, 2)),
+        metrics: Vec::new(),
         is_final: is_last,
         eligible: is_last,
         entry_status: if is_last { "Finished" } else { "Started" }.into(),

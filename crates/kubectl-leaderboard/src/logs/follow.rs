@@ -11,7 +11,7 @@ use kube::ResourceExt;
 use kube::runtime::watcher;
 use leaderboard_api::Submission;
 
-use super::{Logs, Source, begins_again, begins_later, end, pairs, sources};
+use super::{Logs, Source, begins_again, begins_later, end, sources, workers};
 use crate::cluster::Cluster;
 use crate::commands::note_interruption;
 use crate::error::Error;
@@ -96,7 +96,10 @@ impl Following<'_> {
     /// Begins the logs of containers that have one and were not begun.
     fn begin(&mut self, pod: &Pod) {
         let mut new = Vec::new();
-        for source in sources(self.wanted, pairs(&self.submission).max(self.wanted.pair.unwrap_or(0))) {
+        for source in sources(
+            self.wanted,
+            workers(&self.submission).max(self.wanted.worker.unwrap_or(0)),
+        ) {
             let Some(restarts) = life(pod, &source.container) else {
                 continue;
             };

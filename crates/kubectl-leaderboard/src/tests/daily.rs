@@ -30,11 +30,10 @@ submission-42 is Running since 2026-11-01 11:00:00 UTC (60 min ago).
 
 Track:       sensors of Leaderboard carla-20, by Team Seven; EvalAI submission 42, phase 7
 Reason:      Running: 12/20 routes done.
-Routes:      ████████████░░░░░░░░ 12/20
-Pair 1:      ██████████████████░░ 9/10 running
-Pair 2:      ██████░░░░░░░░░░░░░░ 3/10 running, 1 crash; last end SimulatorCrashed 20 min ago
-Scores:      driving ~41.20, route completion 80.00 %, infraction penalty 0.515, of the routes so
-             far.
+Progress:    ████████████░░░░░░░░ 12/20 routes
+Worker 1:    ██████████████████░░ 9/10 running
+Worker 2:    ██████░░░░░░░░░░░░░░ 3/10 running, 1 crash; last end SimulatorCrashed 20 min ago
+Scores:      Driving score ~41.20, Route completion 80.00, Infraction penalty 0.515, so far.
 Times:       submitted 2026-11-01 10:00:00 UTC (2 h ago), accepted after 2 s, on a node after 55
              min, started after 4 min.
 Job:         submission-42-1 on node gpu-3
@@ -102,14 +101,14 @@ fn every_submission_has_a_line_those_that_run_first() {
     assert_eq!(
         shown(&lines),
         "\
-NAME           STATE     REASON          ROUTES  SCORE   QUEUE           SINCE
-submission-40  Running   Running         12/20   ~41.20                  60 min
-submission-43  Pending   WaitingForSlot                  1st             60 min
-submission-45  Pending   WaitingForSlot                  3rd, 20-35 min  60 min
-submission-46  (new)                                                     2 h
-submission-38  Finished  Finished        20/20   43.13                   3 min
-submission-39  Failed    NodeLost                                        3 min
-submission-42  Failed    AgentCrashed    12/20   ~41.20                  3 min"
+NAME           STATE     REASON          PROGRESS  SCORE   QUEUE           SINCE
+submission-40  Running   Running         12/20     ~41.20                  60 min
+submission-43  Pending   WaitingForSlot                    1st             60 min
+submission-45  Pending   WaitingForSlot                    3rd, 20-35 min  60 min
+submission-46  (new)                                                       2 h
+submission-38  Finished  Finished        20/20     43.13                   3 min
+submission-39  Failed    NodeLost                                          3 min
+submission-42  Failed    AgentCrashed    12/20     ~41.20                  3 min"
     );
     let wide = status::lines(&some(), true, true, frame());
     assert!(

@@ -86,7 +86,7 @@ fn waiting() -> Value {
 fn running() -> Value {
     json!({
         "state": "Running", "attempt": 1, "reason": "Running", "message": "12/20 routes done.", "track": "sensors",
-        "progress": {"done": 12, "total": 20, "text": "12/20"}, "score": {"driving": "41.20", "final": false, "text": "~41.20"}, "jobName": "submission-42-1",
+        "progress": {"done": 12, "total": 20, "unit": "routes", "text": "12/20"}, "score": {"name": "Driving score", "value": "41.20", "final": false, "text": "~41.20"}, "jobName": "submission-42-1",
         "nodeName": "gpu-3", "resultsURL": "s3://results/v2/42", "times": {"started": "2026-11-01T11:00:00Z"},
         "conditions": [condition("Finished", "False", "Preparing", ""), condition("Running", "True", "Running", ""),
                        condition("Stalled", "False", "NotStalled", "")],
@@ -99,10 +99,10 @@ fn crashed() -> Value {
                    agent and submits again.";
     json!({
         "state": "Failed", "attempt": 1, "reason": "AgentCrashed", "message": message, "track": "sensors",
-        "progress": {"done": 12, "total": 20, "text": "12/20"}, "score": {"driving": "41.20", "final": false, "text": "~41.20"}, "jobName": "submission-42-1",
+        "progress": {"done": 12, "total": 20, "unit": "routes", "text": "12/20"}, "score": {"name": "Driving score", "value": "41.20", "final": false, "text": "~41.20"}, "jobName": "submission-42-1",
         "resultsURL": "s3://results/v2/42", "times": {"finished": "2026-11-01T11:57:00Z"},
-        "failure": {"class": "Participant", "reason": "AgentCrashed", "message": message, "pair": 2},
-        "pairs": [
+        "failure": {"class": "Participant", "reason": "AgentCrashed", "message": message, "worker": 2},
+        "workers": [
             {"id": 1, "done": 10, "total": 10, "crashes": 0, "state": "Done"},
             {"id": 2, "done": 2, "total": 10, "crashes": 4, "state": "Crashed",
              "last": {"reason": "Exited", "exitCode": 1, "time": "2026-11-01T11:55:00Z"}},
@@ -130,8 +130,8 @@ fn node_lost() -> Value {
 /// All is done.
 fn finished() -> Value {
     json!({
-        "state": "Finished", "attempt": 1, "reason": "Finished", "track": "sensors", "score": {"driving": "43.13", "final": true, "text": "43.13"},
-        "message": "20 of 20 routes, driving score 43.13.", "progress": {"done": 20, "total": 20, "text": "20/20"},
+        "state": "Finished", "attempt": 1, "reason": "Finished", "track": "sensors", "score": {"name": "Driving score", "value": "43.13", "final": true, "text": "43.13"},
+        "message": "20 of 20 routes, Driving score 43.13.", "progress": {"done": 20, "total": 20, "unit": "routes", "text": "20/20"},
         "resultsURL": "s3://results/v2/42", "times": {"finished": "2026-11-01T11:57:00Z"},
         "conditions": [
             condition("Finished", "True", "Finished", ""), condition("Archived", "True", "Stored", ""),
@@ -185,15 +185,16 @@ fn ran_with(status: Value, simulator: &str) -> Value {
     with(status, &json!({"plan": plan_with(simulator), "nodeName": "gpu-3"}))
 }
 
-/// Two pairs, one of which has crashed, with all three scores.
+/// Two workers, one of which has crashed, with all three scores.
 fn driving() -> Value {
     let more = json!({
-        "pairs": [
+        "workers": [
             {"id": 1, "done": 9, "total": 10, "crashes": 0, "state": "Running"},
             {"id": 2, "done": 3, "total": 10, "crashes": 1, "state": "Running",
              "last": {"reason": "SimulatorCrashed", "time": "2026-11-01T11:40:00Z"}},
         ],
-        "score": {"driving": "41.20", "routeCompletion": "80.00", "infractionPenalty": "0.515", "final": false, "text": "~41.20"},
+        "score": {"name": "Driving score", "value": "41.20", "final": false, "text": "~41.20"},
+        "metrics": [{"name": "Route completion", "value": "80.00"}, {"name": "Infraction penalty", "value": "0.515"}],
         "times": {"submitted": "2026-11-01T10:00:00Z", "accepted": "2026-11-01T10:00:02Z",
                   "scheduled": "2026-11-01T10:56:00Z", "started": "2026-11-01T11:00:00Z"},
     });

@@ -56,10 +56,10 @@ Track:       sensors of Leaderboard carla-20; EvalAI submission 42, phase 7
 Reason:      AgentCrashed: An agent crashed more often than retries.perPair allows.
 Message:     Agent 2 crashed 4 times. Look at agent/agent2/leaderboard.log of the results; the
              participant fixes the agent and submits again.
-Failure:     AgentCrashed in pair 2: participant failure, counts as an attempt.
+Failure:     AgentCrashed in worker 2: participant failure, counts as an attempt.
 Attempt:     1.
-Routes:      12/20 done, driving score ~41.20 so far.
-Pair 2:      2 of 10 routes done; last end: Exited (exit code 1), 5 min ago.
+Progress:    12/20 routes done, Driving score ~41.20 so far.
+Worker 2:    2 of 10 done; last end: Exited (exit code 1), 5 min ago.
 Results:     s3://results/v2/42
 S3:          Stored: The final results are in S3.
 EvalAI:      Waiting: EvalAI does not have the result yet. The last request failed: 503. Since
@@ -75,28 +75,25 @@ Next:        Look at agent/agent2/leaderboard.log of the results; the participan
     );
 }
 
-/// The containers of a failed pair may end again until its Job is gone, and that end may have no known cause.
+/// The containers of a failed worker may end again until its Job is gone, and that end may have no known cause.
 #[test]
-fn the_crashes_of_the_failed_pair_are_counted_once() {
+fn the_crashes_of_the_failed_worker_are_counted_once() {
     let message = "Agent 2 crashed once. Fix the agent.";
-    let pairs = json!([
+    let workers = json!([
         {"id": 1, "done": 1, "total": 10, "crashes": 3, "state": "Crashed"},
         {"id": 2, "done": 2, "total": 10, "crashes": 2, "state": "Crashed", "last": {"reason": "unseen"}},
     ]);
-    let failure = json!({"class": "Participant", "pair": 2, "reason": "CannotStart", "message": message});
+    let failure = json!({"class": "Participant", "worker": 2, "reason": "CannotStart", "message": message});
     let text = explained(&with(
         crashed(),
-        &json!({"message": message, "failure": failure, "pairs": pairs}),
+        &json!({"message": message, "failure": failure, "workers": workers}),
     ));
     assert!(
         text.contains("Message:     Agent 2 crashed once. Fix the agent."),
         "{text}"
     );
-    assert!(
-        text.contains("Pair 1:      1 of 10 routes done, crashed 3 times."),
-        "{text}"
-    );
-    assert!(text.contains("Pair 2:      2 of 10 routes done."), "{text}");
+    assert!(text.contains("Worker 1:    1 of 10 done, crashed 3 times."), "{text}");
+    assert!(text.contains("Worker 2:    2 of 10 done."), "{text}");
 }
 
 #[test]
@@ -140,7 +137,7 @@ fn a_finished_one_has_its_score_and_results() {
     let text = explained(&finished());
     for expected in [
         "submission-42 is Finished since 2026-11-01 11:57:00 UTC (3 min ago).",
-        "Routes:      20/20 done, driving score 43.13.",
+        "Progress:    20/20 routes done, Driving score 43.13.",
         "Results:     s3://results/v2/42",
         "S3:          Stored: The final results are in S3.",
         "DynamoDB:    Recorded: DynamoDB has the result.",

@@ -9,7 +9,7 @@ use jiff::Timestamp;
 use kube::ResourceExt;
 use serde_json::{Value, json};
 
-use self::next::{next_steps, of_pair, verb};
+use self::next::{next_steps, of_worker, verb};
 use super::board::{self, Observed};
 use super::bucket;
 use super::facts::{class, command, has_ended, headline, is_attempt_requested, track};
@@ -17,7 +17,7 @@ use super::text::{Frame, Page, join, span, when};
 use leaderboard_api::conditions::{self, Condition};
 use leaderboard_api::names::FAILURE_LOG_KEY;
 use leaderboard_api::text::sentence;
-use leaderboard_api::{EndReason, FailureClass, LastEnd, PairStatus, Submission, SubmissionStatus, reasons};
+use leaderboard_api::{EndReason, FailureClass, LastEnd, Submission, SubmissionStatus, WorkerStatus, reasons};
 
 /// What is known, and the lines about it so far.
 struct Explanation<'a> {
@@ -103,13 +103,14 @@ impl Explanation<'_> {
 
     fn failure(&mut self) {
         let Some(failure) = &self.status.failure else { return };
-        let pair = failure.pair.map(|pair| format!(" in pair {pair}")).unwrap_or_default();
+        let worker = failure.worker.map(|worker| format!(" in worker {worker}"));
+        let worker = worker.unwrap_or_default();
         let counts = match failure.class {
             FailureClass::Participant => "counts as an attempt",
             FailureClass::Infrastructure => "does not count as an attempt",
         };
         let class = class(failure.class);
-        let text = format!("{}{pair}: {class}, {counts}.", failure.reason);
+        let text = format!("{}{worker}: {class}, {counts}.", failure.reason);
         self.page.row("Failure", &text);
         // While the run is being stopped, the message above is that of the stop.
         if self.status.message.as_deref() != Some(failure.message.as_str()) {
@@ -168,17 +169,17 @@ impl Explanation<'_> {
 
     fn run(&mut self) {
         let status = self.status;
-        let progress = status.progress.as_ref().map(|p| format!("{} done", p.text));
+        let progress = status.progress.as_ref().map(|p| format!("{} {} done", p.text, p.unit));
         let score = status.score.as_ref().map(|score| {
             let so_far = if score.is_final { "" } else { " so far" };
-            format!("driving score {}{so_far}", score.text)
+            format!("{} {}{so_far}", score.name, score.text)
         });
         let parts: Vec<String> = [progress, score].into_iter().flatten().collect();
-        self.page.row("Routes", &sentence(&parts.join(", ")));
-        let failed = status.failure.as_ref().and_then(|failure| failure.pair);
-        for pair in status.pairs.iter().filter(|pair| pair.crashes > 0) {
-            let text = crashes(pair, failed == Some(pair.id), self.now);
-            self.page.row(&format!("Pair {}", pair.id), &text);
+        self.page.row("Progress", &sentence(&parts.join(", ")));
+        let failed = status.failure.as_ref().and_then(|failure| failure.worker);
+        for worker in status.workers.iter().filter(|worker| worker.crashes > 0) {
+            let text = crashes(worker, failed == Some(worker.id), self.now);
+            self.page.row(&format!("Worker {}", worker.id), &text);
         }
         if !has_ended(self.submission) {
             let job = status.job_name.as_deref().unwrap_or_default();
@@ -216,7 +217,7 @@ impl Explanation<'_> {
                 .page
                 .row("Log", "no log explains it; the message has all that is known.");
         };
-        let log = of_pair(log, failure.pair);
+        let log = of_worker(log, failure.worker);
         let text = format!("the last 10,000 characters of {log}. Hosts only: it may reveal private routes.");
         self.page.row("Log", &text);
         let storage = self.status.plan.as_ref().map(|plan| &plan.storage);
@@ -241,16 +242,16 @@ pub(super) fn meaning(reason: &str) -> String {
     reasons::of(reason).map_or_else(String::new, |reason| reasons::plain(reason.meaning))
 }
 
-/// How a pair crashed. The message of a failure has the count at which the pair failed; its containers may end once more before
+/// How a worker crashed. The message of a failure has the count at which the worker failed; its containers may end once more before
 /// the Job is gone, so that the count is left out where both are shown.
-fn crashes(pair: &PairStatus, is_failed: bool, now: Timestamp) -> String {
-    let times = match pair.crashes {
+fn crashes(worker: &WorkerStatus, is_failed: bool, now: Timestamp) -> String {
+    let times = match worker.crashes {
         _ if is_failed => String::new(),
         1 => ", crashed once".to_owned(),
         count => format!(", crashed {count} times"),
     };
     let is_known = |last: &&LastEnd| ![EndReason::Unseen, EndReason::Unknown].contains(&last.reason);
-    let known = pair.last.as_deref().filter(is_known);
+    let known = worker.last.as_deref().filter(is_known);
     let last = known.map(|last| {
         let code = last.exit_code.map(|code| format!(" (exit code {code})"));
         let ago = last.time.as_ref().map(|time| {
@@ -261,7 +262,7 @@ fn crashes(pair: &PairStatus, is_failed: bool, now: Timestamp) -> String {
         format!("; last end: {}{code}{ago}", last.reason)
     });
     let last = last.unwrap_or_default();
-    format!("{} of {} routes done{times}{last}.", pair.done, pair.total)
+    format!("{} of {} done{times}{last}.", worker.done, worker.total)
 }
 
 fn system_text(condition: &Condition, system: &str, now: Timestamp) -> String {

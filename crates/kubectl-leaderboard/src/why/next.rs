@@ -5,10 +5,10 @@ use leaderboard_api::{Failure, FailureClass, Submission, SubmissionStatus, condi
 use crate::board::{self, Observed};
 use crate::facts::has_ended;
 
-/// A text of the table of reasons about the pair that failed.
-pub(super) fn of_pair(text: &str, pair: Option<i32>) -> String {
+/// A text of the table of reasons about the worker that failed.
+pub(super) fn of_worker(text: &str, worker: Option<i32>) -> String {
     let text = reasons::plain(text);
-    pair.map_or(text.clone(), |pair| text.replace("<n>", &pair.to_string()))
+    worker.map_or(text.clone(), |worker| text.replace("<n>", &worker.to_string()))
 }
 
 /// What to do next; the step of the reason comes first.
@@ -24,10 +24,10 @@ pub(super) fn next_steps(submission: &Submission, status: &SubmissionStatus, lea
         board::problems(&submission.spec.leaderboard_name, leaderboard)
     };
     reasons.extend(problems.iter().filter_map(|problem| problem.reason.as_deref()));
-    let pair = status.failure.as_ref().and_then(|failure| failure.pair);
+    let worker = status.failure.as_ref().and_then(|failure| failure.worker);
     let mut steps: Vec<String> = Vec::new();
     let next = |reason| next_step(status.failure.as_deref(), reason);
-    for next in reasons.into_iter().filter_map(next).map(|next| of_pair(next, pair)) {
+    for next in reasons.into_iter().filter_map(next).map(|next| of_worker(next, worker)) {
         if !steps.contains(&next) {
             steps.push(next);
         }

@@ -386,7 +386,7 @@ fn only_those_whose_turn_has_changed_are_woken() {
         "000",
         "x",
         0,
-        json!({"jobName": "j", "progress": {"done": 1, "total": 4, "text": "1/4"}}),
+        json!({"jobName": "j", "progress": {"done": 1, "total": 4, "unit": "routes", "text": "1/4"}}),
     ));
     assert_eq!(world.woken(), [""; 0], "nobody moves by it");
     world.shows(&submission("000", "x", 0, ended(1)));

@@ -15,7 +15,7 @@ use super::plan_builder::PlanBuilder;
 use super::waits::Wait;
 use crate::controller::submissions::report_digest::{ReportDigest, clamp};
 use crate::controller::submissions::view::{ContainerView, PodView};
-use leaderboard_api::{EndReason, Failure, LastEnd, PairState, PairStatus, SubmissionStatus, reasons};
+use leaderboard_api::{EndReason, Failure, LastEnd, SubmissionStatus, WorkerState, WorkerStatus, reasons};
 
 /// Counts the crashes of each worker and remembers the last one: its Pod may be gone when the cause is looked for.
 pub(super) fn note(status: &mut SubmissionStatus, pod: &PodView, now: Timestamp) {
@@ -26,15 +26,15 @@ pub(super) fn note(status: &mut SubmissionStatus, pod: &PodView, now: Timestamp)
         let crash = last_crash(pod, id, now);
         if counted > 0 || crash.is_some() {
             let host = pair_with(id).and_then(|pair| container(pod, pair.host()));
-            let pair = pair_entry(status, id);
-            pair.simulator_failed |= crash.is_some_and(|crash| blame::is_hosts_own(host, &crash));
-            take(pair, counted, crash);
+            let worker = worker_entry(status, id);
+            worker.environment_failed |= crash.is_some_and(|crash| blame::is_hosts_own(host, &crash));
+            take(worker, counted, crash);
         }
     }
 }
 
 /// Takes in what was seen of a pair: how often its containers ended, by whatever, and the last crash.
-fn take(pair: &mut PairStatus, counted: i32, crash: Option<Crash>) {
+fn take(worker: &mut WorkerStatus, counted: i32, crash: Option<Crash>) {
     if let Some(crash) = crash {
         let last = LastEnd {
             reason: crash.cause,
@@ -42,13 +42,13 @@ fn take(pair: &mut PairStatus, counted: i32, crash: Option<Crash>) {
             time: crash.at.map(Time),
         };
         // The same end is seen in each reconcile. One side's may have been counted as a crash before the other's was seen.
-        if crash.cause == EndReason::EndedFromOutside && pair.last.as_deref() != Some(&last) {
-            pair.ended_from_outside = pair.ended_from_outside.saturating_add(1);
-            pair.crashes = pair.crashes.saturating_sub(1).max(0);
+        if crash.cause == EndReason::EndedFromOutside && worker.last.as_deref() != Some(&last) {
+            worker.ended_from_outside = worker.ended_from_outside.saturating_add(1);
+            worker.crashes = worker.crashes.saturating_sub(1).max(0);
         }
-        pair.last = Some(Box::new(last));
+        worker.last = Some(Box::new(last));
     }
-    pair.crashes = pair.crashes.max(counted.saturating_sub(pair.ended_from_outside));
+    worker.crashes = worker.crashes.max(counted.saturating_sub(worker.ended_from_outside));
 }
 
 /// Ends of a container that were crashes. One that has ended counts at once, not only when it is started again. The kubelet also counts
@@ -90,39 +90,40 @@ fn pair_of(container: &str) -> Option<i32> {
     Some(Member::parse(container)?.pair.get().into())
 }
 
-fn pair_entry(status: &mut SubmissionStatus, id: i32) -> &mut PairStatus {
-    if let Some(at) = status.pairs.iter().position(|p| p.id == id) {
-        return &mut status.pairs[at];
+fn worker_entry(status: &mut SubmissionStatus, id: i32) -> &mut WorkerStatus {
+    if let Some(at) = status.workers.iter().position(|p| p.id == id) {
+        return &mut status.workers[at];
     }
-    let fresh = PairStatus {
+    let fresh = WorkerStatus {
         id,
         done: 0,
         total: status.plan.as_ref().map_or(0, |plan| plan.total_of(id)),
         crashes: 0,
-        state: PairState::Waiting,
+        state: WorkerState::Waiting,
         last: None,
         ended_from_outside: 0,
-        simulator_failed: false,
+        environment_failed: false,
     };
-    let at = status.pairs.partition_point(|p| p.id < id);
-    status.pairs.insert(at, fresh);
-    &mut status.pairs[at]
+    let at = status.workers.partition_point(|p| p.id < id);
+    status.workers.insert(at, fresh);
+    &mut status.workers[at]
 }
 
 /// The failure of a pair that has crashed as often as it may, or cannot start at all. It waits until the cause is settled.
 pub(super) fn too_many(draft: &mut PlanBuilder<'_>) -> Option<Failure> {
     let limit = draft.retries().per_pair.saturating_add(1);
-    let is_too_many =
-        |pair: &&PairStatus| pair.crashes >= limit || (pair.crashes > 0 && cause(pair).is_some_and(is_hopeless));
+    let is_too_many = |worker: &&WorkerStatus| {
+        worker.crashes >= limit || (worker.crashes > 0 && cause(worker).is_some_and(is_hopeless))
+    };
     let node = draft.status.node_name.as_deref();
     let mut awaited = None;
-    for pair in draft.status.pairs.iter().filter(is_too_many) {
-        let Some(cause) = cause(pair) else { continue };
+    for worker in draft.status.workers.iter().filter(is_too_many) {
+        let Some(cause) = cause(worker) else { continue };
         let pod = draft.view.pod.as_ref();
-        let crash = pod.and_then(|pod| last_crash(pod, pair.id, draft.now()));
+        let crash = pod.and_then(|pod| last_crash(pod, worker.id, draft.now()));
         // Who goes on to fail while the other side's word is waited for puts its end off no further.
-        match crash.filter(|crash| !crash.is_settled && pair.crashes <= limit) {
-            None => return Some(of_pair(pair, cause, node)),
+        match crash.filter(|crash| !crash.is_settled && worker.crashes <= limit) {
+            None => return Some(of_worker(worker, cause, node)),
             Some(crash) => awaited = awaited.or(crash.at),
         }
     }
@@ -134,21 +135,21 @@ pub(super) fn too_many(draft: &mut PlanBuilder<'_>) -> Option<Failure> {
 
 /// The failure of the pair that has crashed most.
 pub(super) fn worst(status: &SubmissionStatus) -> Option<Failure> {
-    let crashed = status.pairs.iter().filter(|p| p.crashes > 0 && p.last.is_some());
-    let pair = crashed.max_by_key(|p| p.crashes)?;
-    Some(of_pair(pair, cause(pair)?, status.node_name.as_deref()))
+    let crashed = status.workers.iter().filter(|p| p.crashes > 0 && p.last.is_some());
+    let worker = crashed.max_by_key(|p| p.crashes)?;
+    Some(of_worker(worker, cause(worker)?, status.node_name.as_deref()))
 }
 
 /// Whether what looked like crashes were runs to the end whose checkpoint is refused: an agent that ends by itself without
 /// results that can be read is tried again as one that crashed.
 pub(super) fn is_refusal(status: &SubmissionStatus, found: &Failure, report: &ReportDigest) -> bool {
-    let by_itself = |pair: &PairStatus| matches!(cause(pair), Some(EndReason::Exited | EndReason::Incomplete));
+    let by_itself = |worker: &WorkerStatus| matches!(cause(worker), Some(EndReason::Exited | EndReason::Incomplete));
     let is_of_results = [reasons::AGENT_CRASHED, reasons::INVALID_RESULTS].contains(&found.reason.as_str());
-    is_of_results && status.pairs.iter().any(by_itself) && report.is_verdict() && report.why.is_some()
+    is_of_results && status.workers.iter().any(by_itself) && report.is_verdict() && report.why.is_some()
 }
 
-fn cause(pair: &PairStatus) -> Option<EndReason> {
-    pair.last.as_ref().map(|last| last.reason)
+fn cause(worker: &WorkerStatus) -> Option<EndReason> {
+    worker.last.as_ref().map(|last| last.reason)
 }
 
 /// Whether another round in the same Pod would end in the same way.
@@ -159,9 +160,9 @@ fn is_hopeless(cause: EndReason) -> bool {
     )
 }
 
-fn of_pair(pair: &PairStatus, cause: EndReason, node: Option<&str>) -> Failure {
-    let id = pair.id;
-    let times = match pair.crashes {
+fn of_worker(worker: &WorkerStatus, cause: EndReason, node: Option<&str>) -> Failure {
+    let id = worker.id;
+    let times = match worker.crashes {
         1 => "once".to_owned(),
         crashes => format!("{crashes} times"),
     };
@@ -175,7 +176,7 @@ fn of_pair(pair: &PairStatus, cause: EndReason, node: Option<&str>) -> Failure {
         participant(reason, &what, &next)
     };
     Failure {
-        pair: Some(id),
+        worker: Some(id),
         ..failure
     }
 }

@@ -134,7 +134,7 @@ fn cause(draft: &PlanBuilder<'_>, report: Option<&ReportDigest>, job_end: Option
         return failure::invalid_results(why);
     }
     if let Some(report) = verdict {
-        return failure::not_eligible(report, &draft.status.pairs);
+        return failure::not_eligible(report, &draft.status.workers);
     }
     match job_end {
         Some(end) => of_job(draft, end),
@@ -208,10 +208,10 @@ fn retry(draft: &mut PlanBuilder<'_>, found: &Failure) {
     draft.status.next_retry_time = Some(Time(at));
     clock::restart(draft);
     draft.status.times.stopping = None;
-    for pair in &mut draft.status.pairs {
-        pair.crashes = 0;
-        pair.ended_from_outside = 0;
-        pair.last = None;
+    for worker in &mut draft.status.workers {
+        worker.crashes = 0;
+        worker.ended_from_outside = 0;
+        worker.last = None;
     }
     let what = &found.message;
     let message = format!("{what} {next}");
@@ -237,8 +237,9 @@ fn finished(draft: &mut PlanBuilder<'_>, report: &ReportDigest) {
     // Without its Job nobody has taken it in yet.
     reported::take(draft, report);
     draft.status.failure = None;
-    let score = draft.status.score.as_ref().map_or("", |score| score.text.as_str());
-    let message = format!("{} of {} routes, driving score {score}.", report.done, report.total);
+    let score = draft.status.score.as_ref();
+    let score = score.map_or_else(String::new, |score| format!(", {} {}", score.name, score.text));
+    let message = format!("{} of {} {}{score}.", report.done, report.total, report.unit);
     close(draft, reasons::FINISHED, &message);
 }
 

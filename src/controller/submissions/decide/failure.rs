@@ -8,7 +8,7 @@ use crate::controller::submissions::report_digest::{ReportDigest, clamp};
 use crate::controller::submissions::view::ObservedNode;
 use crate::pod::run::Stop;
 use leaderboard_api::text::sentence;
-use leaderboard_api::{Failure, FailureClass, PairStatus, reasons};
+use leaderboard_api::{Failure, FailureClass, WorkerStatus, reasons};
 
 /// A failure that is the participant's: `what` happened, in one sentence, and what each reader does about it.
 pub(super) fn participant(reason: &str, what: &str, next: &Steps) -> Failure {
@@ -20,7 +20,7 @@ pub(super) fn participant(reason: &str, what: &str, next: &Steps) -> Failure {
         participant_message: Some(for_participants).filter(|text| *text != message),
         message,
         next_step: Some(next.hosts.clone()),
-        pair: None,
+        worker: None,
     }
 }
 
@@ -37,7 +37,7 @@ pub(super) fn infrastructure(reason: &str, what: &str) -> Failure {
         message: what.to_owned(),
         next_step: None,
         participant_message: Some(infrastructure_for_participants(reason)),
-        pair: None,
+        worker: None,
     }
 }
 
@@ -97,7 +97,7 @@ pub(super) fn results_not_stored() -> Failure {
 pub(super) fn invalid_results(why: &str) -> Failure {
     let what = format!("The results cannot be used: {}", sentence(why));
     Failure {
-        pair: pair_named(why),
+        worker: pair_named(why),
         ..charged(reasons::INVALID_RESULTS, &what)
     }
 }
@@ -109,9 +109,9 @@ fn pair_named(why: &str) -> Option<i32> {
 }
 
 /// Results that are complete but do not count.
-pub(super) fn not_eligible(report: &ReportDigest, pairs: &[PairStatus]) -> Failure {
+pub(super) fn not_eligible(report: &ReportDigest, workers: &[WorkerStatus]) -> Failure {
     if report.entry_status == "Crashed" {
-        return named_crash(report, pairs);
+        return named_crash(report, workers);
     }
     let what = format!("The run ended as {}, so its results do not count.", report.entry_status);
     charged(reasons::NOT_ELIGIBLE, &what)
@@ -119,21 +119,25 @@ pub(super) fn not_eligible(report: &ReportDigest, pairs: &[PairStatus]) -> Failu
 
 /// Results that name a crash of the simulation. The agent writes them, and knows its score by then, so a crash that no host's container had is
 /// its own. Evaluators repeat the route of a crash; one that does not keeps its record over the Jobs of an attempt.
-fn named_crash(report: &ReportDigest, pairs: &[PairStatus]) -> Failure {
-    let named = report.pairs.iter().filter(|pair| pair.names_crash);
-    let mut named = named.map(|pair| clamp(pair.id));
+fn named_crash(report: &ReportDigest, workers: &[WorkerStatus]) -> Failure {
+    let named = report.workers.iter().filter(|worker| worker.names_crash);
+    let mut named = named.map(|worker| clamp(worker.id));
     let first = named.clone().next();
-    let has_failed = |id: i32| pairs.iter().any(|pair| pair.id == id && pair.simulator_failed);
+    let has_failed = |id: i32| {
+        workers
+            .iter()
+            .any(|worker| worker.id == id && worker.environment_failed)
+    };
     if let Some(id) = named.find(|id| !has_failed(*id)) {
         let what = format!("The results of pair {id} name a crash of the simulation that its simulator did not have.");
         return Failure {
-            pair: Some(id),
+            worker: Some(id),
             ..charged(reasons::INVALID_RESULTS, &what)
         };
     }
     // One of an older operator's Pod names no pair.
     Failure {
-        pair: first,
+        worker: first,
         ..infrastructure(
             reasons::SIMULATION_CRASHED,
             "The simulation crashed during a route, so the results do not count.",

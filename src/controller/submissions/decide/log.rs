@@ -73,7 +73,7 @@ fn places(status: &SubmissionStatus, pod: Option<&PodView>) -> Vec<LogPlace> {
     let Some(failure) = &status.failure else {
         return Vec::new();
     };
-    let id = failure.pair.unwrap_or_else(|| unfinished(status));
+    let id = failure.worker.unwrap_or_else(|| unfinished(status));
     let Some(pair) = u16::try_from(id).ok().and_then(Pair::new) else {
         return Vec::new();
     };
@@ -102,8 +102,10 @@ fn places(status: &SubmissionStatus, pod: Option<&PodView>) -> Vec<LogPlace> {
 
 /// The first worker that has not done all its work: a failure of the whole run is most likely explained by its log.
 fn unfinished(status: &SubmissionStatus) -> i32 {
-    let mut pairs = status.pairs.iter();
-    pairs.find(|pair| pair.done < pair.total).map_or(1, |pair| pair.id)
+    let mut workers = status.workers.iter();
+    workers
+        .find(|worker| worker.done < worker.total)
+        .map_or(1, |worker| worker.id)
 }
 
 fn stored(container: &str, key: String) -> LogPlace {

@@ -240,6 +240,7 @@ impl<'a> PlanBuilder<'a> {
             image: old.image,
             progress: old.progress,
             score: old.score.map(Score::so_far),
+            metrics: old.metrics,
             results_url: old.results_url,
             usage: old.usage,
             times: leaderboard_api::Times {

@@ -26,8 +26,8 @@ const NO_ROUTE: &str =
 
 /// Whether an agent can have provoked a failure.
 pub(super) fn is_one(found: &Failure) -> bool {
-    // A pull of the hosts' own images belongs to no pair.
-    let is_of_hosts = found.reason == reasons::IMAGE_PULL && found.pair.is_none();
+    // A pull of the hosts' own images belongs to no worker.
+    let is_of_hosts = found.reason == reasons::IMAGE_PULL && found.worker.is_none();
     found.class == FailureClass::Infrastructure && !is_of_hosts && REASONS.contains(&found.reason.as_str())
 }
 
@@ -39,13 +39,13 @@ pub(super) fn may_go_on(found: &Failure, before: Option<i32>, stored: i32) -> bo
 
 /// The same for the present Job.
 pub(super) fn leaves_a_job(draft: &PlanBuilder<'_>, found: &Failure) -> bool {
-    may_go_on(found, draft.status.routes_before, stored(draft))
+    may_go_on(found, draft.status.done_before, stored(draft))
 }
 
 /// Notes what the next Job begins with.
 pub(super) fn note(draft: &mut PlanBuilder<'_>, found: &Failure) {
-    if is_one(found) || draft.status.routes_before.is_some() {
-        draft.status.routes_before = Some(stored(draft));
+    if is_one(found) || draft.status.done_before.is_some() {
+        draft.status.done_before = Some(stored(draft));
     }
 }
 

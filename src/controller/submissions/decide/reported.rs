@@ -5,29 +5,32 @@ use crate::controller::submissions::report_digest::{ReportDigest, clamp};
 use crate::pod::report::Logs;
 use leaderboard_api::conditions::{self, Truth};
 use leaderboard_api::text::sentence;
-use leaderboard_api::{PairStatus, reasons};
+use leaderboard_api::{WorkerStatus, reasons};
 
 /// Takes in how far the run is.
 pub(super) fn take(draft: &mut PlanBuilder<'_>, report: &ReportDigest) {
     draft.status.progress = Some(report.progress());
     let is_complete = report.is_final && report.done == report.total;
-    draft.status.score = report.score(is_complete).or(draft.status.score.take());
-    let old = std::mem::take(&mut draft.status.pairs);
-    draft.status.pairs = report
-        .pairs
+    if let Some(score) = report.score(is_complete) {
+        draft.status.score = Some(score);
+        draft.status.metrics.clone_from(&report.metrics);
+    }
+    let old = std::mem::take(&mut draft.status.workers);
+    draft.status.workers = report
+        .workers
         .iter()
-        .map(|pair| {
-            let known = old.iter().find(|p| p.id == clamp(pair.id));
-            PairStatus {
-                id: clamp(pair.id),
-                done: clamp(pair.done),
-                total: clamp(pair.total),
+        .map(|worker| {
+            let known = old.iter().find(|k| k.id == clamp(worker.id));
+            WorkerStatus {
+                id: clamp(worker.id),
+                done: clamp(worker.done),
+                total: clamp(worker.total),
                 // The kubelet counts them: a report can know of a crash before its end shows whose fault it was.
                 crashes: known.map_or(0, |k| k.crashes),
-                state: pair.state,
+                state: worker.state,
                 last: known.and_then(|k| k.last.clone()),
                 ended_from_outside: known.map_or(0, |k| k.ended_from_outside),
-                simulator_failed: known.is_some_and(|k| k.simulator_failed),
+                environment_failed: known.is_some_and(|k| k.environment_failed),
             }
         })
         .collect();

@@ -6,7 +6,7 @@ use std::time::Duration;
 
 use super::waits::Wait;
 use leaderboard_api::conditions::STALLED;
-use leaderboard_api::{PairState, SharedText, SubmissionStatus};
+use leaderboard_api::{SharedText, SubmissionStatus, WorkerState};
 
 /// Places in line that are written without waiting for their turn.
 pub(super) const FIRST_PLACES: i32 = 20;
@@ -58,17 +58,20 @@ fn steady(status: &SubmissionStatus) -> SubmissionStatus {
         node_name: None,
         progress: None,
         score: None,
+        metrics: Vec::new(),
         message: None,
         waiting: None,
         image: None,
         ..status.clone()
     };
-    for pair in &mut steady.pairs {
-        pair.done = 0;
-        pair.state = PairState::default();
+    for worker in &mut steady.workers {
+        worker.done = 0;
+        worker.state = WorkerState::default();
     }
-    // A pair that has not crashed carries nothing that would be missed.
-    steady.pairs.retain(|pair| pair.crashes > 0 || pair.last.is_some());
+    // A worker that has not crashed carries nothing that would be missed.
+    steady
+        .workers
+        .retain(|worker| worker.crashes > 0 || worker.last.is_some());
     steady.times.scheduled = None;
     for condition in &mut steady.conditions {
         // Why nothing is stalled is no news.
@@ -88,12 +91,12 @@ mod tests {
 
     use super::*;
     use leaderboard_api::conditions::{self, Truth};
-    use leaderboard_api::{PairStatus, Progress, State, reasons};
+    use leaderboard_api::{Progress, State, WorkerStatus, reasons};
 
     fn running(done: i32) -> SubmissionStatus {
         SubmissionStatus {
             state: Some(State::Running),
-            progress: Some(Progress::new(done, 20)),
+            progress: Some(Progress::new(done, 20, "routes")),
             message: Some(format!("{done}/20 routes done.").into()),
             ..SubmissionStatus::default()
         }
@@ -150,18 +153,18 @@ mod tests {
 
     #[test]
     fn a_crash_is_written_at_once() {
-        let crashed = PairStatus {
+        let crashed = WorkerStatus {
             id: 1,
             done: 0,
             total: 5,
             crashes: 1,
-            state: PairState::Crashed,
+            state: WorkerState::Crashed,
             last: None,
             ended_from_outside: 0,
-            simulator_failed: false,
+            environment_failed: false,
         };
         let status = SubmissionStatus {
-            pairs: vec![crashed],
+            workers: vec![crashed],
             ..running(1)
         };
         assert_eq!(change(&running(1), &status), Change::Real);

@@ -140,7 +140,9 @@ fn show_running(draft: &mut PlanBuilder<'_>) {
         reasons::RUNNING
     };
     let progress = draft.status.progress.as_ref();
-    let message = progress.map(|p| format!("{} routes done.", p.text)).unwrap_or_default();
+    let message = progress
+        .map(|p| format!("{} {} done.", p.text, p.unit))
+        .unwrap_or_default();
     draft.moves();
     draft.condition(conditions::RUNNING, Truth::True, reason, "");
     draft.show(reason, message);
@@ -349,7 +351,7 @@ fn failure_of(found: &Trouble, pod: &PodView, seconds: i64) -> Failure {
         },
     };
     Failure {
-        pair: found.pair,
+        worker: found.worker,
         ..failure
     }
 }

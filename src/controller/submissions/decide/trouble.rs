@@ -19,8 +19,8 @@ pub(super) struct Trouble {
     /// A sentence. It stays the same while Kubernetes goes back and forth between trying and waiting.
     pub(super) message: String,
     pub(super) cause: Cause,
-    /// The pair of an agent that does not start.
-    pub(super) pair: Option<i32>,
+    /// The worker whose agent does not start.
+    pub(super) worker: Option<i32>,
     /// No amount of waiting helps.
     pub(super) is_hopeless: bool,
     /// It keeps the run from starting, so that the deadline of the start counts; else it is a restart of a container
@@ -137,9 +137,9 @@ fn of_end(container: &ContainerView, is_init: bool) -> Option<Trouble> {
 }
 
 fn trouble(container: &ContainerView, reason: &'static str, message: &str, cause: Cause) -> Trouble {
-    let pair = agent(container);
+    let worker = agent(container);
     // The hosts' own images are theirs to fix.
-    let cause = if pair.is_none() && cause.is_images() {
+    let cause = if worker.is_none() && cause.is_images() {
         Cause::Host
     } else {
         cause
@@ -148,7 +148,7 @@ fn trouble(container: &ContainerView, reason: &'static str, message: &str, cause
         reason,
         message: sentence(message),
         cause,
-        pair,
+        worker,
         is_hopeless: false,
         is_start: true,
     }

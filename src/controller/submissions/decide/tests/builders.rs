@@ -14,12 +14,12 @@ use crate::controller::submissions::view::{
     ContainerView, EndView, EvalaiEnd, EvalaiInfo, EvalaiView, JobEnd, JobView, NodeView, ObservedFence, ObservedJob,
     ObservedLog, ObservedReport, PodView, RecordView, ReportView, Stage, Standing, Turn, View,
 };
-use crate::pod::report::{Report, ReportPair};
+use crate::pod::report::{Report, ReportWorker};
 use crate::pod::run::Stop;
 use crate::services::evalai::Status;
 use leaderboard_api::conditions;
 use leaderboard_api::{
-    Attempt, Leaderboard, LeaderboardSpec, PairState, State, Submission, SubmissionStatus, names, reasons,
+    Attempt, Leaderboard, LeaderboardSpec, Metric, State, Submission, SubmissionStatus, WorkerState, names, reasons,
 };
 use leaderboard_runner::verdict::{Verdict, What};
 
@@ -387,12 +387,12 @@ fn verdict(what: &str, round: u32) -> Option<Verdict> {
 
 /// A report of the present Pod with this many of the four routes done.
 pub fn report(done: u32) -> Report {
-    let pair = |id: u32| ReportPair {
+    let worker = |id: u32| ReportWorker {
         id,
         done: done.saturating_sub(2 * (id - 1)).min(2),
         total: 2,
         crashes: 0,
-        state: PairState::Running,
+        state: WorkerState::Running,
         names_crash: false,
     };
     Report {
@@ -403,10 +403,14 @@ pub fn report(done: u32) -> Report {
         round: 1,
         done,
         total: 4,
-        pairs: vec![pair(1), pair(2)],
-        score: (done > 0).then_some(41.2),
-        route_completion: (done > 0).then_some(90.0),
-        infraction_penalty: (done > 0).then_some(0.5),
+        unit: "routes".into(),
+        workers: vec![worker(1), worker(2)],
+        score: (done > 0).then(|| Metric::new("Driving score", 41.2, 2)),
+        metrics: if done > 0 {
+            vec![Metric::new("Route completion", 90.0, 2)]
+        } else {
+            Vec::new()
+        },
         is_final: false,
         eligible: false,
         entry_status: "Started".into(),
@@ -427,7 +431,7 @@ pub fn final_report() -> Report {
         is_final: true,
         eligible: true,
         entry_status: "Finished".into(),
-        score: Some(43.129),
+        score: Some(Metric::new("Driving score", 43.129, 2)),
         ..report(4)
     }
 }

@@ -21,7 +21,7 @@ fn used_up(agent: &str, simulator: &str) -> Failure {
     let plan = world.pass_to(Running, reasons::STOPPING);
     assert_eq!(annotated(&plan), Some(Stop::Retries), "{agent} {simulator}");
     assert_eq!(
-        plan.status.pairs[0].crashes, 4,
+        plan.status.workers[0].crashes, 4,
         "{agent} {simulator}: the end that is not restarted yet counts"
     );
     *plan.status.failure.unwrap()
@@ -68,7 +68,7 @@ fn fewer_crashes_than_allowed_are_forgiven() {
     let mut world = World::local().running();
     world.see(ended("agent-1", 2, "exited", 1, 100));
     let plan = world.pass_to(Running, reasons::RUNNING);
-    assert_eq!(plan.status.pairs[0].crashes, 3);
+    assert_eq!(plan.status.workers[0].crashes, 3);
     world.report(final_report());
     world.complete();
     world.report(final_report());
@@ -130,7 +130,11 @@ fn an_agent_that_blames_its_simulator_is_charged() {
         world.see_alone(ended("agent-1", 3, word, 1, 100));
         world.go_to(101);
         let plan = world.pass_to(Running, reasons::RUNNING);
-        assert_eq!((plan.status.pairs[0].crashes, plan.status.failure), (4, None), "{word}");
+        assert_eq!(
+            (plan.status.workers[0].crashes, plan.status.failure),
+            (4, None),
+            "{word}"
+        );
         assert!(plan.requeue.unwrap().as_secs() <= 120, "{word}");
         let mut alone = world.clone();
         alone.go_to(220);
@@ -152,7 +156,7 @@ fn a_port_that_an_agent_has_taken_is_the_participants() {
     let mut world = World::local().running();
     world.see_alone(ended("simulator-2", 3, "portTaken", 1, 100));
     let failure = world.pass_to(Running, reasons::STOPPING).status.failure.unwrap();
-    assert_eq!((failure.class, failure.pair), (Participant, Some(2)));
+    assert_eq!((failure.class, failure.worker), (Participant, Some(2)));
     assert_eq!(
         failure.message,
         "Another container of the Pod listened on the port of simulator 2, which failed 4 times. Let the agents listen on no \
@@ -179,7 +183,7 @@ fn an_end_of_an_earlier_round_is_not_the_verdict_that_is_waited_for() {
     world.see_alone(ended("simulator-1", 3, "peerCrashed", 1, 400));
     world.go_to(401);
     let plan = world.pass_to(Running, reasons::RUNNING);
-    assert_eq!((plan.status.pairs[0].crashes, plan.status.failure), (4, None));
+    assert_eq!((plan.status.workers[0].crashes, plan.status.failure), (4, None));
     world.see_alone(ended("agent-1", 3, "idle", 1, 401));
     let failure = world.pass_to(Running, reasons::STOPPING).status.failure.unwrap();
     assert_eq!(failure.reason, reasons::IDLE);
@@ -200,7 +204,7 @@ fn an_agent_that_followed_its_simulator_waits_for_the_simulators_own_verdict() {
     world.see_alone(restarted("simulator-1", 3, "peerCrashed", 1, 40));
     world.see_alone(ended("agent-1", 3, "peerCrashed", 1, 100));
     let plan = world.pass_to(Running, reasons::RUNNING);
-    assert_eq!((plan.status.pairs[0].crashes, plan.status.failure), (4, None));
+    assert_eq!((plan.status.workers[0].crashes, plan.status.failure), (4, None));
     world.see_alone(ended("simulator-1", 3, "exited", 1, 100));
     let failure = world.pass_to(Running, reasons::STOPPING).status.failure.unwrap();
     assert_eq!(failure.reason, reasons::SIMULATION_CRASHED);
@@ -210,7 +214,7 @@ fn an_agent_that_followed_its_simulator_waits_for_the_simulators_own_verdict() {
 fn a_count_without_a_cause_waits_for_it() {
     let mut world = World::local().running();
     let mut told = report(1);
-    told.pairs[0].crashes = 4;
+    told.workers[0].crashes = 4;
     world.report(told);
     assert_eq!(world.pass_to(Running, reasons::RUNNING).status.failure, None);
     world.see(ended("agent-1", 3, "exited", 1, 100));
@@ -222,7 +226,7 @@ fn a_crash_that_only_the_simulator_has_reported_waits_for_the_agents_own_report(
     let mut world = World::local().running();
     world.see_alone(ended("simulator-1", 3, "peerCrashed", 1, 100));
     let plan = world.pass_to(Running, reasons::RUNNING);
-    assert_eq!((plan.status.pairs[0].crashes, plan.status.failure), (4, None));
+    assert_eq!((plan.status.workers[0].crashes, plan.status.failure), (4, None));
     let mut late = world.clone();
     world.see_alone(ended("agent-1", 3, "idle", 1, 100));
     let plan = world.pass_to(Running, reasons::STOPPING);
@@ -281,8 +285,8 @@ fn ends_on_command_are_no_crashes() {
     for what in ["stopped", "cancelled"] {
         world.see(ended("agent-1", 0, what, 143, 100));
         let plan = world.pass_to(Running, reasons::RUNNING);
-        assert_eq!(plan.status.pairs.len(), 2);
-        assert!(plan.status.pairs.iter().all(|p| p.crashes == 0 && p.last.is_none()));
+        assert_eq!(plan.status.workers.len(), 2);
+        assert!(plan.status.workers.iter().all(|p| p.crashes == 0 && p.last.is_none()));
     }
 }
 
@@ -308,7 +312,7 @@ fn a_simulator_without_a_gpu_ends_its_job_at_once_and_its_node_is_remembered() {
         );
         let begin = "Pair 1 lacks a GPU on node node-a, although the Leaderboard gives it one: ";
         assert!(failure.message.starts_with(begin), "{}", failure.message);
-        assert_eq!(failure.pair, Some(1));
+        assert_eq!(failure.worker, Some(1));
         world.complete();
         let plan = world.pass_to(Pending, reasons::REPLACING);
         let node_name = "node-a".into();

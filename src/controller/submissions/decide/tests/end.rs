@@ -26,7 +26,7 @@ fn complete_results_that_count_finish() {
     );
     assert_eq!(
         plan.status.message.as_deref(),
-        Some("4 of 4 routes, driving score 43.13.")
+        Some("4 of 4 routes, Driving score 43.13.")
     );
     assert_eq!(
         plan.status.times.finished.clone().unwrap().0,
@@ -170,14 +170,14 @@ fn names_a_crash() -> Report {
         entry_status: "Crashed".into(),
         ..final_report()
     };
-    told.pairs[1].names_crash = true;
+    told.workers[1].names_crash = true;
     told
 }
 
 #[test]
 fn results_that_name_a_crash_that_no_simulator_had_are_the_participants() {
     let failure = completes_with(Some(names_a_crash()), reasons::INVALID_RESULTS);
-    assert_eq!((failure.class, failure.pair), (Participant, Some(2)));
+    assert_eq!((failure.class, failure.worker), (Participant, Some(2)));
     assert_eq!(
         failure.message,
         "The results of pair 2 name a crash of the simulation that its simulator did not have. Check what the agent writes into its \
@@ -225,7 +225,7 @@ fn results_that_name_a_crash_that_the_simulator_had_are_nobodys_fault() {
             .status
             .failure
             .unwrap();
-        assert_eq!((failure.class, failure.pair), (Infrastructure, Some(2)), "{what}");
+        assert_eq!((failure.class, failure.worker), (Infrastructure, Some(2)), "{what}");
     }
 }
 

@@ -70,7 +70,7 @@ fn a_node_that_is_about_to_go_is_left_with_all_that_was_reached() {
             .ends_with("this costs neither an attempt nor a retry.")
     );
     assert_eq!((plan.status.attempt, plan.status.retry), (Some(Attempt(1)), 1));
-    assert_eq!((plan.status.failure, plan.status.routes_before), (None, None));
+    assert_eq!((plan.status.failure, plan.status.done_before), (None, None));
     let known = plan.status.interruptions.unwrap();
     assert_eq!((known.number, known.nodes), (1, vec!["node-a".to_owned()]));
     world.job_gone();

@@ -48,7 +48,7 @@ fn an_agents_failure_is_explained_by_its_own_log_from_s3() {
         let mut world = World::local().running();
         world.see(ended("agent-2", 3, word, 1, 100));
         let plan = world.pass_to(Running, reasons::STOPPING);
-        assert_eq!(plan.status.failure.as_ref().unwrap().pair, Some(2));
+        assert_eq!(plan.status.failure.as_ref().unwrap().worker, Some(2));
         assert_eq!(places(&plan), Vec::<String>::new(), "logcopy stores it yet");
         let mut with_pod = world.clone();
         assert_eq!(
@@ -85,7 +85,7 @@ fn a_failure_of_the_whole_run_is_explained_by_a_pair_that_was_not_done() {
     world.complete();
     world.report(refused.clone());
     let plan = world.pass_to(Failed, reasons::INVALID_RESULTS);
-    assert_eq!(plan.status.failure.as_ref().unwrap().pair, Some(2));
+    assert_eq!(plan.status.failure.as_ref().unwrap().worker, Some(2));
     assert_eq!(places(&plan)[0], "s3 agent/agent2/leaderboard.log", "the refused one");
     for why in [
         "pairs 1 and 2 have different sensors",
@@ -96,7 +96,7 @@ fn a_failure_of_the_whole_run_is_explained_by_a_pair_that_was_not_done() {
         let mut world = World::local().running();
         world.complete();
         world.report(Report { why, ..refused.clone() });
-        assert_eq!(world.pass().status.failure.unwrap().pair, None);
+        assert_eq!(world.pass().status.failure.unwrap().worker, None);
     }
 
     let ineligible = Report {

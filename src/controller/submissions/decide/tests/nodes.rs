@@ -128,9 +128,9 @@ fn a_lost_node_costs_neither_an_attempt_nor_a_pairs_retry() {
         (Some(Attempt(1)), None)
     );
     assert!(
-        plan.status.pairs.iter().all(|pair| pair.crashes == 0),
+        plan.status.workers.iter().all(|pair| pair.crashes == 0),
         "{:?}",
-        plan.status.pairs
+        plan.status.workers
     );
     assert!(plan.status.message.as_ref().unwrap().contains("Node node-a was lost"));
 }

@@ -21,13 +21,13 @@ fn a_sandbox_that_is_made_anew_uses_up_no_retry() {
     let mut world = World::local().running();
     for time in 1..=5 {
         see_sandbox_made_anew(&mut world, time, 100 * i64::from(time));
-        assert_eq!(world.pass().status.pairs[0].crashes, 0, "{time}");
+        assert_eq!(world.pass().status.workers[0].crashes, 0, "{time}");
     }
     // The runners' rounds count them, too.
     let mut told = report(1);
-    told.pairs[0].crashes = 5;
+    told.workers[0].crashes = 5;
     world.report(told);
-    assert_eq!(world.pass_to(Running, reasons::RUNNING).status.pairs[0].crashes, 0);
+    assert_eq!(world.pass_to(Running, reasons::RUNNING).status.workers[0].crashes, 0);
     for (crashes, restarts) in [(1, 5), (2, 6), (3, 7)] {
         world.see(ended(
             "agent-1",
@@ -37,7 +37,7 @@ fn a_sandbox_that_is_made_anew_uses_up_no_retry() {
             1000 + 100 * i64::from(restarts),
         ));
         let plan = world.pass_to(Running, reasons::RUNNING);
-        assert_eq!(plan.status.pairs[0].crashes, crashes);
+        assert_eq!(plan.status.workers[0].crashes, crashes);
         world.see_alone(running("simulator-1"));
     }
     world.see(ended("agent-1", 8, "exited", 1, 1800));
@@ -59,9 +59,9 @@ fn of_a_sandbox_that_is_made_anew_one_side_may_be_seen_first() {
     world.see_alone(ended("simulator-1", 0, "silentDeath", 137, 100));
     world.go_to(101);
     let plan = world.pass_to(Running, reasons::RUNNING);
-    assert_eq!(plan.status.pairs[0].crashes, 1, "so far the simulator has crashed");
+    assert_eq!(plan.status.workers[0].crashes, 1, "so far the simulator has crashed");
     see_sandbox_made_anew(&mut world, 1, 100);
-    assert_eq!(world.pass().status.pairs[0].crashes, 0);
+    assert_eq!(world.pass().status.workers[0].crashes, 0);
 }
 
 #[test]
@@ -79,7 +79,7 @@ fn a_simulator_that_is_kept_away_for_want_of_processes_ends_the_run_at_the_agent
         simulator.waiting = Some(("CrashLoopBackOff".into(), String::new()));
         world.see_alone(simulator);
         let plan = world.pass();
-        let found = (plan.status.pairs[0].crashes, plan.status.failure);
+        let found = (plan.status.workers[0].crashes, plan.status.failure);
         assert_eq!(found, (1, None), "it is waited for");
     }
     let mut agent = ended("agent-2", 1, "notReady", 1, 900);
@@ -87,7 +87,7 @@ fn a_simulator_that_is_kept_away_for_want_of_processes_ends_the_run_at_the_agent
     world.see_alone(agent);
     world.go_to(1021);
     let failure = world.pass_to(Running, reasons::STOPPING).status.failure.unwrap();
-    assert_eq!((failure.class, failure.pair), (Participant, Some(2)));
+    assert_eq!((failure.class, failure.worker), (Participant, Some(2)));
 }
 
 #[test]
@@ -124,11 +124,11 @@ fn a_crash_that_only_the_report_knows_ends_no_run_by_the_cause_of_the_one_before
     let mut world = World::local().running();
     world.see_alone(ended("simulator-1", 0, "exited", 1, 100));
     let mut told = report(1);
-    told.pairs[0].crashes = 4;
+    told.workers[0].crashes = 4;
     world.report(told);
     world.go_to(101);
     let plan = world.pass_to(Running, reasons::RUNNING);
-    assert_eq!(plan.status.pairs[0].crashes, 1);
+    assert_eq!(plan.status.workers[0].crashes, 1);
     // The last ends come: another container had the port.
     world.see_alone(ended("simulator-1", 3, "portTaken", 1, 102));
     world.go_to(103);
@@ -160,6 +160,6 @@ fn a_crash_counts_once_while_its_container_is_about_to_begin_again() {
             reasons::STOPPING
         };
         let plan = world.pass_to(Running, reason);
-        assert_eq!(plan.status.pairs[0].crashes, if begins_anew { 3 } else { 4 });
+        assert_eq!(plan.status.workers[0].crashes, if begins_anew { 3 } else { 4 });
     }
 }

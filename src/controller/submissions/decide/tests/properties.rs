@@ -200,7 +200,7 @@ fn observed_report() -> impl Strategy<Value = ObservedReport> {
             why: is_refused.then(|| "nonsense".into()),
             ..report(done)
         };
-        told.pairs[0].crashes = crashes;
+        told.workers[0].crashes = crashes;
         ObservedReport::Ours(Arc::new((&told).into()))
     });
     prop_oneof![

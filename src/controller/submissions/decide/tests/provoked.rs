@@ -30,7 +30,7 @@ fn runs_again(world: &mut World) {
 
 fn of_pair(reason: &str) -> Failure {
     Failure {
-        pair: Some(1),
+        worker: Some(1),
         ..infrastructure(reason, "It failed.")
     }
 }
@@ -99,14 +99,14 @@ fn an_agent_that_crashes_its_simulator_gets_a_second_job_and_a_third_only_if_it_
         jobs: 0,
     };
     assert_eq!(
-        (world.status().routes_before, world.status().failed_nodes),
+        (world.status().done_before, world.status().failed_nodes),
         (Some(1), vec![suspect]),
         "the next Job prefers other nodes, and no node is forbidden"
     );
 
     simulator_fails(&mut world, 2);
     runs_again(&mut world);
-    assert_eq!((world.status().retry, world.status().routes_before), (2, Some(2)));
+    assert_eq!((world.status().retry, world.status().done_before), (2, Some(2)));
 
     simulator_fails(&mut world, 2);
     let status = world.pass_to(Failed, reasons::SIMULATION_CRASHED).status;
@@ -121,7 +121,7 @@ fn an_agent_that_crashes_its_simulator_gets_a_second_job_and_a_third_only_if_it_
 
     world.submission().spec.attempt = Attempt(2);
     let status = world.pass_to(Pending, reasons::PREPARING).status;
-    assert_eq!(status.routes_before, None, "another attempt begins anew");
+    assert_eq!(status.done_before, None, "another attempt begins anew");
 }
 
 #[test]
@@ -147,7 +147,7 @@ fn an_interruption_between_two_failures_counts_the_routes_of_its_own_job_alone()
     world.report(report(2));
     world.view.node.leaving = None;
     runs_again(&mut world);
-    assert_eq!(world.status().routes_before, Some(2));
+    assert_eq!(world.status().done_before, Some(2));
     simulator_fails(&mut world, 2);
     world.pass_to(Failed, reasons::SIMULATION_CRASHED);
 }

@@ -258,11 +258,11 @@ fn crashes_of_an_earlier_pod_are_not_counted_twice() {
     world.see_agents();
     // The report is still the first Pod's.
     let mut told = report(1);
-    told.pairs[0].crashes = 4;
+    told.workers[0].crashes = 4;
     world.report(told);
     world.see(ended("agent-1", 0, "exited", 1, 300));
     let plan = world.pass_to(Running, reasons::RUNNING);
-    assert_eq!(plan.status.pairs[0].crashes, 1);
+    assert_eq!(plan.status.workers[0].crashes, 1);
 }
 
 #[test]

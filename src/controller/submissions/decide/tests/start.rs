@@ -195,7 +195,7 @@ fn an_image_whose_user_the_pod_forbids_is_refused_at_once_at_the_participants_co
         world.job_gone();
         let status = world.pass_to(Failed, reasons::IMAGE_INVALID).status;
         let failure = status.failure.unwrap();
-        assert_eq!((failure.class, failure.pair, status.retry), (Participant, Some(1), 0));
+        assert_eq!((failure.class, failure.worker, status.retry), (Participant, Some(1), 0));
         assert!(failure.message.contains(words), "{}", failure.message);
         let shown = failure.participant_message.unwrap();
         assert!(
@@ -222,7 +222,7 @@ fn the_hosts_containers_are_looked_at_before_the_agents() {
         .status
         .failure
         .unwrap();
-    assert_eq!((failure.class, failure.pair), (Infrastructure, None));
+    assert_eq!((failure.class, failure.worker), (Infrastructure, None));
 }
 
 #[test]

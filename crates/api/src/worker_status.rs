@@ -1,4 +1,4 @@
-//! One simulator-agent pair: what it does, and what ended its last round.
+//! One worker of a run: what it does, and what ended its last round.
 //!
 //! Part of a Submission's status. Pure.
 
@@ -8,43 +8,44 @@ use k8s_openapi::apimachinery::pkg::apis::meta::v1::Time;
 use schemars::JsonSchema;
 use serde::{Deserialize, Serialize};
 
-/// What a pair does.
+/// State of a worker.
 #[derive(Serialize, Deserialize, JsonSchema, Clone, Copy, Debug, Default, PartialEq, Eq)]
-pub enum PairState {
+pub enum WorkerState {
     /// Its agent has not begun.
     #[default]
     Waiting,
     Running,
     Done,
-    /// Its agent or its simulator ended too early and is started again.
+    /// Its agent or its environment ended too early and is started again.
     Crashed,
     /// A state that this operator does not know, from a Pod of another version.
     #[serde(other)]
     Unknown,
 }
 
-/// One simulator-agent pair.
+/// One worker: an agent with the environment that it acts in.
 #[derive(Serialize, Deserialize, JsonSchema, Clone, Debug, PartialEq)]
-pub struct PairStatus {
-    /// From 1.
+#[serde(rename_all = "camelCase")]
+pub struct WorkerStatus {
+    /// Id is the worker's number, from 1.
     pub id: i32,
-    /// Routes done.
+    /// Done counts the units that the worker has done.
     pub done: i32,
-    /// Routes of its slice, times repetitions.
+    /// Total counts the worker's units.
     pub total: i32,
-    /// Crashes so far.
+    /// Crashes counts how often the worker has crashed so far.
     pub crashes: i32,
-    /// What it does.
-    pub state: PairState,
-    /// How its last container ended.
+    /// State shows what the worker does.
+    pub state: WorkerState,
+    /// Last shows how the worker's last container ended.
     #[serde(default, skip_serializing_if = "Option::is_none")]
     pub last: Option<Box<LastEnd>>,
-    /// How often its containers were ended from outside and started again, which is no crash.
-    #[serde(default, rename = "endedFromOutside", skip_serializing_if = "is_zero")]
+    /// EndedFromOutside counts how often the worker's containers were ended from outside and started again, which is no crash.
+    #[serde(default, skip_serializing_if = "is_zero")]
     pub ended_from_outside: i32,
-    /// Its simulator has failed in this attempt: by its own container's word, or by the kubelet's.
-    #[serde(default, rename = "simulatorFailed", skip_serializing_if = "std::ops::Not::not")]
-    pub simulator_failed: bool,
+    /// EnvironmentFailed is true if the worker's environment has failed in this attempt, by its own container's word or by the kubelet's.
+    #[serde(default, skip_serializing_if = "std::ops::Not::not")]
+    pub environment_failed: bool,
 }
 
 #[expect(clippy::trivially_copy_pass_by_ref, reason = "serde hands out references")]
@@ -52,7 +53,7 @@ fn is_zero(number: &i32) -> bool {
     *number == 0
 }
 
-/// What ended a round of a pair.
+/// Cause that ended a round of a worker.
 #[derive(Serialize, Deserialize, JsonSchema, Clone, Copy, Debug, PartialEq, Eq)]
 pub enum EndReason {
     /// The agent's command ended by itself.
@@ -101,16 +102,16 @@ impl fmt::Display for EndReason {
     }
 }
 
-/// How a container ended.
+/// End of a container.
 #[derive(Serialize, Deserialize, JsonSchema, Clone, Debug, PartialEq)]
 #[serde(rename_all = "camelCase")]
 pub struct LastEnd {
-    /// What ended it.
+    /// Reason names the cause of the end.
     pub reason: EndReason,
-    /// Exit code of the process.
+    /// ExitCode is the exit code of the container's process.
     #[serde(default, skip_serializing_if = "Option::is_none")]
     pub exit_code: Option<i32>,
-    /// When.
+    /// Time is when the container ended.
     #[serde(default, skip_serializing_if = "Option::is_none")]
     pub time: Option<Time>,
 }
@@ -122,12 +123,12 @@ mod tests {
     #[test]
     fn a_state_of_another_version_is_unknown() {
         assert_eq!(
-            serde_json::from_str::<PairState>("\"Running\"").unwrap(),
-            PairState::Running
+            serde_json::from_str::<WorkerState>("\"Running\"").unwrap(),
+            WorkerState::Running
         );
         assert_eq!(
-            serde_json::from_str::<PairState>("\"Dreaming\"").unwrap(),
-            PairState::Unknown
+            serde_json::from_str::<WorkerState>("\"Dreaming\"").unwrap(),
+            WorkerState::Unknown
         );
     }
 }
