@@ -4,14 +4,11 @@
 
 pub mod allowed;
 pub mod ask;
-pub mod backoff;
 pub mod bridge;
 pub mod cli;
 pub mod controller;
 pub mod crds;
 pub mod kubernetes;
-mod lock;
-pub mod object_key;
 pub mod observability;
 pub mod page;
 pub mod pod;

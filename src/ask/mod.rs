@@ -23,10 +23,10 @@ use tokio::sync::Notify;
 use tokio::time::Instant;
 use tracing::Instrument;
 
-use crate::lock::lock;
-use crate::object_key::ObjectKey;
-use crate::observability::about::LogSpan;
-use crate::observability::tasks::Tasks;
+use leaderboard_base::lock::lock;
+use leaderboard_base::object_key::ObjectKey;
+use leaderboard_base::spans::LogSpan;
+use leaderboard_base::tasks::Tasks;
 use question::{Ask, Failure, Lookup};
 use state::{State, Work};
 

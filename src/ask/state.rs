@@ -7,8 +7,8 @@ use std::time::Duration;
 use tokio::time::Instant;
 
 use super::question::{Answered, Ask, Failure, Lookup, Service};
-use crate::object_key::ObjectKey;
-use crate::observability::about::LogSpan;
+use leaderboard_base::object_key::ObjectKey;
+use leaderboard_base::spans::LogSpan;
 
 /// How long a question is kept that nobody repeats.
 pub(super) const KEPT: Duration = Duration::from_mins(10);

@@ -8,7 +8,7 @@ use tokio::sync::{mpsc, watch};
 use super::question::Service;
 use super::state::KEPT;
 use super::*;
-use crate::observability::shutdown::Stop;
+use leaderboard_base::shutdown::Stop;
 
 const SECOND: Duration = Duration::from_secs(1);
 

@@ -16,12 +16,12 @@ use tracing::Span;
 use super::message::Message;
 use super::route::{NotIngested, Outcome};
 use crate::kubernetes::{CallError, call_within};
-use crate::observability::about;
 use crate::services::evalai::Swept;
 use leaderboard_api::ingested::SWEEP;
 use leaderboard_api::{
     Attempt, EvalaiRef, Ingested, RefusedAttempt, State, Submission, SubmissionSpec, SubmissionStatus, names,
 };
+use leaderboard_base::spans as about;
 
 /// Age below which the sweep leaves a row alone, in milliseconds: its message may be on the way.
 const SWEEP_AGE_MS: i64 = 120_000;

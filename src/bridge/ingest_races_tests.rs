@@ -4,7 +4,7 @@ use tracing::Instrument;
 
 use super::*;
 use crate::observability::logging::tests::Lines;
-use crate::observability::trace_id::TraceId;
+use leaderboard_base::trace_id::TraceId;
 
 #[tokio::test]
 async fn the_sweep_leaves_a_hosts_cancel_as_it_is() {

@@ -25,9 +25,9 @@ use kube::runtime::watcher::Config;
 use crate::allowed::Allowed;
 use crate::kubernetes::{Clients, Namespaces, Shape, spawn_watch};
 use crate::observability::Observability;
-use crate::observability::tasks::TaskFailed;
 use crate::services::aws::Aws;
 use leaderboard_api::Leaderboard;
+use leaderboard_base::tasks::TaskFailed;
 use pollers::{Problems, Shared, follow};
 use sqs::{Connection, Pulse, SqsQueue, desired};
 

@@ -20,10 +20,10 @@ use super::message;
 use super::pollers::Shared;
 use super::route::{self, DeadReason, Envelope, Later, MessageOutcome, Outcome, Rules};
 use super::source::{Received, Source, named};
-use crate::backoff::Backoff;
 use crate::kubernetes::call_within;
 use leaderboard_api::text::one_line;
 use leaderboard_api::{Leaderboard, reasons};
+use leaderboard_base::backoff::Backoff;
 
 /// Longest time that one message may take; half of it is over when its visibility is extended.
 const MESSAGE_LIMIT: Duration = Duration::from_secs(20);

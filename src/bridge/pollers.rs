@@ -15,10 +15,10 @@ use super::leaderboards::Leaderboards;
 use super::poller::Poller;
 use super::source::Source;
 use crate::kubernetes::Watch;
-use crate::lock::lock;
 use crate::observability::Observability;
 use crate::observability::readiness::Readiness;
 use leaderboard_api::Leaderboard;
+use leaderboard_base::lock::lock;
 
 /// How long messages in hand may take to be finished when the program stops.
 const DRAIN: Duration = Duration::from_secs(20);

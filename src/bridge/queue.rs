@@ -18,8 +18,8 @@ use super::dead_letter::{self, DeadLetter};
 use super::route::DeadReason;
 use super::source::Received;
 use crate::services::fault::{self, Fault};
-use crate::services::meter::Meter;
 use crate::services::metered::Metered;
+use leaderboard_base::meter::Meter;
 
 /// How long a receive waits for a message, in seconds: the longest that SQS allows.
 const LONG_POLL: i32 = 20;
@@ -266,8 +266,8 @@ mod tests {
     use tokio::net::TcpListener;
 
     use super::*;
-    use crate::lock::lock;
     use crate::services::aws::Aws;
+    use leaderboard_base::lock::lock;
 
     /// The messages that a queue was sent, and how many of the next ones it finds too large.
     type Sent = Arc<Mutex<(VecDeque<Value>, usize)>>;

@@ -13,7 +13,7 @@ use tower_test::mock::{Handle, pair};
 use super::sqs::{PULSE_AGE, PULSE_LIMIT};
 use super::*;
 use crate::observability::metrics::Program;
-use crate::observability::shutdown::Stop;
+use leaderboard_base::shutdown::Stop;
 
 type Server = Handle<Request<Body>, Response<Body>>;
 

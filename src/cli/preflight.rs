@@ -132,7 +132,7 @@ mod tests {
     use super::*;
     use crate::observability::Observability;
     use crate::observability::health::HealthServer;
-    use crate::observability::shutdown::Stop;
+    use leaderboard_base::shutdown::Stop;
 
     #[tokio::test]
     async fn a_program_reports_itself_what_it_lacks() {

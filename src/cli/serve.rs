@@ -18,7 +18,6 @@ use crate::kubernetes::{Clients, Namespaces, watch_client};
 use crate::observability::health::HealthServer;
 use crate::observability::logging::{self, Format};
 use crate::observability::metrics::Program;
-use crate::observability::shutdown::on_signals;
 #[cfg(feature = "otel")]
 use crate::observability::traces::otlp;
 use crate::observability::{Observability, REVISION};
@@ -30,6 +29,7 @@ use crate::pod::{logcopy as logcopy_program, ownlog, workspace as workspace_prog
 use crate::services::aws::Aws;
 use leaderboard_api::client_errors;
 use leaderboard_api::names::OPERATOR;
+use leaderboard_base::shutdown::on_signals;
 
 /// What the exit code of controller and bridge means.
 pub(super) const EXIT_CODES: &str = "Exit code 0: it was stopped. 1: an error, which is the last line of its log. 2: arguments or \

@@ -6,9 +6,10 @@ use kube::runtime::reflector::ObjectRef;
 use kube::{Resource, ResourceExt};
 use tracing::Span;
 
-use crate::object_key::ObjectKey;
-use crate::observability::about::{self, LogSpan};
 use leaderboard_api::{Leaderboard, Submission, names};
+use leaderboard_base::object_key::ObjectKey;
+use leaderboard_base::spans as about;
+use leaderboard_base::spans::LogSpan;
 
 /// Puts an object into its work queue.
 pub type Wake<K> = Box<dyn Fn(ObjectRef<K>) + Send + Sync>;

@@ -14,7 +14,7 @@ use kube::runtime::reflector::Lookup;
 
 use super::store::key_of;
 
-use crate::lock::lock;
+use leaderboard_base::lock::lock;
 
 /// An object that was added, changed or deleted.
 #[derive(Debug)]

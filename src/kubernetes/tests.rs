@@ -20,8 +20,8 @@ use kube::runtime::watcher::Config;
 use super::preflight::{Need, access_missing, await_kinds};
 use super::*;
 use crate::observability::Observability;
-use crate::observability::shutdown::Stop;
 use leaderboard_api::Leaderboard;
+use leaderboard_base::shutdown::Stop;
 
 /// Longer than anything here may take.
 const LIMIT: Duration = Duration::from_mins(20);

@@ -17,12 +17,12 @@ use super::item::{Item, Watchable};
 use super::objects::Texts;
 use super::source::{self, Source, is_refusal};
 use super::store::{Index, Store, Writer, key_of};
-use crate::lock::lock;
 use crate::observability::Observability;
 use crate::observability::metrics::WatchMetrics;
 use crate::observability::readiness::Readiness;
-use crate::observability::shutdown::Stop;
 use leaderboard_api::client_errors;
+use leaderboard_base::lock::lock;
+use leaderboard_base::shutdown::Stop;
 
 /// Objects of one page of a list, each of up to 50 KB: a page is in memory as a whole while it is decoded.
 pub(super) const PAGE: u32 = 100;

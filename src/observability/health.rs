@@ -112,8 +112,8 @@ fn page(problems: &[String]) -> Response {
 
 #[cfg(test)]
 mod tests {
-    use super::super::shutdown::Stop;
     use super::*;
+    use leaderboard_base::shutdown::Stop;
     use tokio::io::{AsyncReadExt, AsyncWriteExt};
     use tokio::net::TcpStream;
 

@@ -9,7 +9,7 @@ use std::time::Duration;
 
 use tokio::time::Instant;
 
-use crate::lock::lock;
+use leaderboard_base::lock::lock;
 
 /// A watch that is broken for so long does not recover by itself.
 const STUCK_AFTER: Duration = Duration::from_mins(10);

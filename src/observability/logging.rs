@@ -76,9 +76,9 @@ where
 
 #[cfg(test)]
 pub(crate) mod tests {
-    use super::super::about;
-    use super::super::trace_id::TraceId;
     use super::*;
+    use leaderboard_base::spans as about;
+    use leaderboard_base::trace_id::TraceId;
     use std::io::Write;
     use std::sync::{Arc, Mutex};
 

@@ -3,25 +3,21 @@
 //! Called by every program that stays: `controller` and `bridge`. Knows no Kubernetes object and no policy; parts report
 //! what they do and what they miss.
 
-pub mod about;
 pub mod health;
 mod json_lines;
 pub mod liveness;
 pub mod logging;
 pub mod metrics;
 pub mod readiness;
-pub mod shutdown;
-pub mod tasks;
-pub mod trace_id;
 pub mod traces;
 
 use std::sync::Arc;
 
+use leaderboard_base::shutdown::Stop;
+use leaderboard_base::tasks::Tasks;
 use liveness::Liveness;
 use metrics::{Metrics, Program};
 use readiness::Readiness;
-use shutdown::Stop;
-use tasks::Tasks;
 use traces::Traces;
 
 /// The commit that was built; empty where the build was given none.

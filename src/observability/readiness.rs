@@ -6,7 +6,7 @@
 use std::collections::BTreeMap;
 use std::sync::{Arc, Mutex};
 
-use crate::lock::lock;
+use leaderboard_base::lock::lock;
 
 /// Name of the check that stands for those which are not registered yet.
 const START: &str = "process";

@@ -12,7 +12,7 @@ use futures::{FutureExt, Stream, StreamExt};
 use tokio::sync::{Notify, OwnedSemaphorePermit, Semaphore, watch};
 use tokio::time::{sleep, timeout};
 
-use crate::observability::shutdown::Stop;
+use leaderboard_base::shutdown::Stop;
 
 /// So many may look at once. Each can hold one view that is no longer the newest.
 pub(super) const VIEWERS: usize = 32;

@@ -16,7 +16,7 @@ use axum::routing::{MethodRouter, get};
 use futures::StreamExt;
 
 use super::hub::Hub;
-use crate::observability::shutdown::Stop;
+use leaderboard_base::shutdown::Stop;
 
 /// What the browser may load and run: our own files. Texts never become markup.
 const POLICY: &str = include_str!("web/policy.txt");

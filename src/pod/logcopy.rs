@@ -26,11 +26,11 @@ use super::tree::{Tree, TreeError};
 use super::upload::quota::Quota;
 use super::upload::send::Uploader;
 use super::watch::Watch;
-use crate::observability::shutdown;
-use crate::observability::tasks::{TaskFailed, Tasks};
 use crate::services::archive::{Archive, ArchiveError};
 use crate::services::aws::Aws;
 use crate::services::logs::LogClient;
+use leaderboard_base::shutdown;
+use leaderboard_base::tasks::{TaskFailed, Tasks};
 use leaderboard_runner::protocol::StatusFile;
 use round::{News, Rounds, Why};
 

@@ -18,10 +18,10 @@ use super::report::Logs;
 use super::run::console;
 use super::tree::{Tree, TreeError};
 use super::upload::Memory;
-use crate::backoff::Backoff;
 use crate::pod::keys::{CONTENTS_LOG, OWN_LOG, WORKSPACE_LOG};
 use crate::services::logs::{BETWEEN_BATCHES, LogClient, LogEvent, LogsError, Miss, OVERHEAD, cut};
 use leaderboard_api::RunId;
+use leaderboard_base::backoff::Backoff;
 use leaderboard_runner::protocol::Pair;
 
 /// Bytes read of one file at once.

@@ -16,9 +16,9 @@ use hyper::body::Bytes;
 use tokio::io::AsyncWriteExt;
 
 use crate::services::aws::Aws;
-use crate::services::meter::Meter;
 use crate::services::metered::Metered;
 use leaderboard_api::{RunId, Storage, effective};
+use leaderboard_base::meter::Meter;
 
 pub use error::{ArchiveError, Cause};
 pub use listing::{Listed, Listing};

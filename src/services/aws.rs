@@ -12,8 +12,8 @@ use aws_sdk_s3::config::{RequestChecksumCalculation, ResponseChecksumValidation}
 use aws_smithy_http_client::tls::Provider;
 use aws_smithy_http_client::tls::rustls_provider::CryptoMode;
 
-use super::meter::Meter;
 use leaderboard_api::names::OPERATOR;
+use leaderboard_base::meter::Meter;
 
 /// Where nothing sets the region.
 pub const USUAL_REGION: &str = "us-east-1";

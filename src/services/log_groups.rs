@@ -10,9 +10,9 @@ use aws_sdk_cloudwatchlogs::types::LogGroup as Described;
 
 use super::aws::Aws;
 use super::fault::{self, Fault};
-use super::meter::Meter;
 use crate::services::metered::Metered;
 use leaderboard_api::LogGroup;
+use leaderboard_base::meter::Meter;
 
 /// Why a log group is not as the Leaderboard wants it.
 #[derive(Clone, Debug, PartialEq, Eq, thiserror::Error)]

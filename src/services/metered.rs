@@ -6,7 +6,7 @@ use aws_sdk_sqs::config::http::HttpResponse;
 use aws_sdk_sqs::error::{ProvideErrorMetadata, SdkError};
 
 use super::fault;
-use super::meter::Meter;
+use leaderboard_base::meter::Meter;
 
 /// What a [`Meter`] does for clients of AWS.
 pub trait Metered {

@@ -8,7 +8,6 @@ pub mod evalai;
 pub mod fault;
 pub mod log_groups;
 pub mod logs;
-pub mod meter;
 pub mod metered;
 pub mod public;
 pub mod queue;

@@ -26,9 +26,9 @@ pub use recorder::Recorder;
 
 use crate::services::aws::Aws;
 use crate::services::fault::{self, Fault};
-use crate::services::meter::Meter;
 use crate::services::metered::Metered;
 use leaderboard_api as api;
+use leaderboard_base::meter::Meter;
 
 /// Column with the attempt, a number.
 const ATTEMPT: &str = "attempt";

@@ -20,6 +20,8 @@ use tokio::sync::watch;
 
 use crate::support::{apiserver, ministack};
 use leaderboard_api::{Attempt, Ingested, Leaderboard, Submission, names};
+use leaderboard_base::shutdown::Stop;
+use leaderboard_base::tasks::TaskFailed;
 use leaderboard_operator::allowed::Allowed;
 use leaderboard_operator::bridge;
 use leaderboard_operator::bridge::ingest::{self, Incoming, Source};
@@ -27,8 +29,6 @@ use leaderboard_operator::bridge::route::Outcome;
 use leaderboard_operator::kubernetes::{Clients, Namespaces};
 use leaderboard_operator::observability::Observability;
 use leaderboard_operator::observability::metrics::Program;
-use leaderboard_operator::observability::shutdown::Stop;
-use leaderboard_operator::observability::tasks::TaskFailed;
 use leaderboard_operator::services::aws::Aws;
 use leaderboard_operator::services::evalai::Swept;
 

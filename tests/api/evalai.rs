@@ -25,15 +25,15 @@ use tokio::sync::mpsc;
 use tokio::time::Instant;
 
 use leaderboard_api::Attempt;
-use leaderboard_operator::observability::about::LogSpan;
-use leaderboard_operator::observability::shutdown::Stop;
-use leaderboard_operator::observability::tasks::Tasks;
+use leaderboard_base::meter::Meter;
+use leaderboard_base::shutdown::Stop;
+use leaderboard_base::spans::LogSpan;
+use leaderboard_base::tasks::Tasks;
 use leaderboard_operator::pod::report::ContentId;
 use leaderboard_operator::services::evalai::{
     Changed, DesiredUpdate, Ended, Hub, ImageAnswer, Key, Misfit, Options, Outcome, Outline, Patience, Payload,
     Progress, Publisher, Run, Status, StoredResult, Subject, SubmissionState, SweepRow, Target, Timeouts, Timing,
 };
-use leaderboard_operator::services::meter::Meter;
 use leaderboard_operator::services::token::Token;
 
 /// A stand-in, a hub that speaks to it, and what the controller would hold.

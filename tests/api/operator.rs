@@ -7,6 +7,7 @@ use tokio::sync::watch;
 use tokio::task::JoinHandle;
 
 use crate::support::apiserver::server;
+use leaderboard_base::shutdown::Stop;
 use leaderboard_operator::allowed::Allowed;
 use leaderboard_operator::controller::runtime as run;
 use leaderboard_operator::controller::runtime::leader::{self, Identity, Timing};
@@ -15,7 +16,6 @@ use leaderboard_operator::controller::settings::Settings;
 use leaderboard_operator::controller::submissions::job_spec::OwnImage;
 use leaderboard_operator::kubernetes::{Namespaces, watch_client};
 use leaderboard_operator::observability::Observability;
-use leaderboard_operator::observability::shutdown::Stop;
 use leaderboard_operator::services::aws::Aws;
 
 /// Longer than it takes to end, with a write to EvalAI under way.

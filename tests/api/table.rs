@@ -14,10 +14,10 @@ use tokio::sync::mpsc;
 use super::bridge::{LIMIT, StandIn};
 use crate::support::throttle::Throttle;
 use leaderboard_api as api;
-use leaderboard_operator::object_key::ObjectKey;
-use leaderboard_operator::observability::about::LogSpan;
-use leaderboard_operator::observability::shutdown::Stop;
-use leaderboard_operator::observability::tasks::Tasks;
+use leaderboard_base::object_key::ObjectKey;
+use leaderboard_base::shutdown::Stop;
+use leaderboard_base::spans::LogSpan;
+use leaderboard_base::tasks::Tasks;
 use leaderboard_operator::services::table::{Recorder, Row, Table, Written};
 
 fn client(stand_in: &StandIn) -> aws_sdk_dynamodb::Client {

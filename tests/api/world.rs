@@ -18,6 +18,7 @@ use kube::{Api, Client, ResourceExt};
 use leaderboard_api::{
     Attempt, JobNumber, Leaderboard, Storage, Submission, SubmissionStatus, conditions, names, reasons,
 };
+use leaderboard_base::shutdown::Stop;
 use leaderboard_operator::allowed::Allowed;
 use leaderboard_operator::controller::runtime::leader::{self, Identity};
 use leaderboard_operator::controller::runtime::{self as run, Clients};
@@ -25,7 +26,6 @@ use leaderboard_operator::controller::settings::Settings;
 use leaderboard_operator::controller::submissions::job_spec::OwnImage;
 use leaderboard_operator::kubernetes::Namespaces;
 use leaderboard_operator::observability::Observability;
-use leaderboard_operator::observability::shutdown::Stop;
 use leaderboard_operator::page::Page;
 use leaderboard_operator::pod::workspace::WorkspaceError;
 use leaderboard_operator::services::archive::Archive;

@@ -132,5 +132,4 @@ fn is_like(pattern: &[u8], text: &[u8]) -> bool {
 }
 
 #[cfg(test)]
-#[path = "image_pattern_tests.rs"]
 mod tests;

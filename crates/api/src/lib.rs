@@ -10,6 +10,7 @@ pub mod conditions;
 pub mod effective;
 mod evalai_mode;
 mod evalai_queue;
+pub mod evalai_status;
 mod failed_node;
 pub mod gpu;
 pub mod image;

@@ -9,11 +9,11 @@ use std::time::Duration;
 
 use jiff::{SignedDuration, Timestamp};
 
-use crate::backoff::Backoff;
 use crate::controller::leaderboards::view::Unreachable;
 use leaderboard_api::conditions::Truth;
 use leaderboard_api::reasons;
 use leaderboard_api::text::sentence;
+use leaderboard_base::backoff::Backoff;
 
 /// What was good is looked at again after this long.
 const AGAIN: SignedDuration = SignedDuration::from_mins(5);

@@ -7,8 +7,8 @@ use std::collections::HashMap;
 use std::sync::Mutex;
 use std::time::Duration;
 
-use crate::backoff::Backoff;
-use crate::lock::lock;
+use leaderboard_base::backoff::Backoff;
+use leaderboard_base::lock::lock;
 
 /// Its pauses: half of one of these and more.
 const RETRY: Backoff = Backoff::new(Duration::from_secs(1), Duration::from_mins(5));

@@ -21,11 +21,11 @@ use crate::controller::submissions::observe::workers::Workers;
 use crate::controller::submissions::{act, observe};
 use crate::kubernetes::Writer;
 use crate::kubernetes::objects::Pod;
-use crate::object_key::ObjectKey;
 use crate::observability::metrics::Metrics;
 use crate::observability::traces::Traces;
 use crate::services::aws::Aws;
 use leaderboard_api::Leaderboard;
+use leaderboard_base::object_key::ObjectKey;
 
 /// Shared by all reconciles.
 pub struct Context {

@@ -21,9 +21,9 @@ use crate::controller::slots;
 use crate::controller::stores::Stores;
 use crate::kubernetes::objects::{Job, Pod};
 use crate::kubernetes::{Store, WatchEvent};
-use crate::object_key::ObjectKey;
 use crate::services::evalai::Changed;
 use leaderboard_api::{Leaderboard, Submission, conditions, names};
+use leaderboard_base::object_key::ObjectKey;
 
 /// What the services report.
 pub(super) struct Reports {

@@ -9,7 +9,7 @@ use super::super::reconciles::Queues;
 use super::*;
 use crate::controller::fixtures::{self, Cluster, surroundings};
 use crate::observability::metrics::Metrics;
-use crate::observability::shutdown::Stop;
+use leaderboard_base::shutdown::Stop;
 
 const NOW: &str = "2026-01-01T01:00:00Z";
 

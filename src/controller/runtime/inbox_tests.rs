@@ -33,8 +33,8 @@ fn reader(name: &str, second: i64) -> Arc<Leaderboard> {
 }
 
 fn inbox() -> Inbox {
-    let (_stop, signal) = crate::observability::shutdown::Stop::new();
-    let tasks = crate::observability::tasks::Tasks::new(signal);
+    let (_stop, signal) = leaderboard_base::shutdown::Stop::new();
+    let tasks = leaderboard_base::tasks::Tasks::new(signal);
     Inbox {
         way: Way {
             server: "https://e".into(),

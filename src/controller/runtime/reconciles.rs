@@ -15,7 +15,6 @@ use tracing::Instrument;
 use super::Shared;
 use super::events::Events;
 use super::queue::{After, Class, Limits, Queue, Turn, urgency};
-use crate::backoff::jittered;
 use crate::controller::leaderboards::{self, Reconciled, operator};
 use crate::controller::objects::{span_of, uid_of};
 use crate::controller::slots::Slots;
@@ -24,9 +23,10 @@ use crate::controller::submissions::decide::{SlotUse, decide};
 use crate::controller::submissions::observe::observe;
 use crate::kubernetes::CallError;
 use crate::observability::metrics::Metrics;
-use crate::observability::tasks::panic_message;
 use leaderboard_api::reasons::OTHER_OPERATOR;
 use leaderboard_api::{Leaderboard, Submission};
+use leaderboard_base::backoff::jittered;
+use leaderboard_base::tasks::panic_message;
 
 /// The kinds as their watches call them, for metrics.
 pub(super) const SUBMISSION: &str = "Submission";

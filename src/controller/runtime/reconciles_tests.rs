@@ -12,7 +12,7 @@ use crate::controller::fixtures::{Cluster, leaderboard, surroundings, with_job};
 use crate::controller::runtime::backoff::BackoffMap;
 use crate::kubernetes::call;
 use crate::observability::Observability;
-use crate::observability::shutdown::Stop;
+use leaderboard_base::shutdown::Stop;
 
 /// Submissions that wait for a bucket which takes connections and never answers.
 const BEHIND: usize = 300;

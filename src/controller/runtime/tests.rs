@@ -15,7 +15,7 @@ use crate::controller::runtime::leader::Identity;
 use crate::controller::runtime::leader::tests::fake_server::FakeServer;
 use crate::controller::submissions::job_spec::OwnImage;
 use crate::kubernetes::Namespaces;
-use crate::observability::shutdown::Stop;
+use leaderboard_base::shutdown::Stop;
 
 /// All that runs in a leader without Leaderboards, in the order of names.
 const TASKS: [&str; 19] = [

@@ -20,8 +20,8 @@ use tokio::time::Instant;
 
 use crate::controller::objects::{Wake, board_of, uid};
 use crate::controller::stores::Stores;
-use crate::lock::lock;
 use leaderboard_api::{Leaderboard, Submission, SubmissionStatus};
+use leaderboard_base::lock::lock;
 use line::Line;
 use member::Member;
 pub use member::{check_team, mark};

@@ -12,14 +12,14 @@ use super::result_texts;
 use super::view::{EvalaiEnd, EvalaiInfo, EvalaiView, RecordView, Standing, View};
 use crate::allowed::Allowed;
 use crate::controller::objects::{key_of, log_span_of, uid};
-use crate::lock::lock;
-use crate::object_key::ObjectKey;
 use crate::services::evalai::{
     self, DesiredUpdate, Ended, Hub, ImageAnswer, Outcome, Patience, Publisher, Run, Status, Subject, SubmissionState,
     Target,
 };
 use crate::services::table::Recorder;
 use leaderboard_api::{Ingested, JobNumber, Leaderboard, Submission, SubmissionStatus, names};
+use leaderboard_base::lock::lock;
+use leaderboard_base::object_key::ObjectKey;
 
 /// Doors to both services, and what each Leaderboard needs to go through them.
 pub struct ExternalSystems {

@@ -9,8 +9,8 @@ use std::time::Duration;
 use tokio::time::Instant;
 
 use crate::controller::objects::{self, uid, version_number};
-use crate::lock::lock;
 use leaderboard_api::{Attempt, Submission, SubmissionStatus};
+use leaderboard_base::lock::lock;
 
 /// Time between two writes of places in line, over all Submissions.
 const PLACE_PACE: Duration = Duration::from_secs(1);

@@ -9,8 +9,8 @@ use serde_json::json;
 use super::super::report_digest::left_out;
 use super::*;
 use crate::controller::fixtures::{Cluster, surroundings};
-use crate::lock::lock;
 use crate::services::evalai::Patience;
+use leaderboard_base::lock::lock;
 
 /// Objects by their key below the run's prefix.
 type Objects = Arc<Mutex<HashMap<&'static str, String>>>;

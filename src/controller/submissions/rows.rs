@@ -7,10 +7,10 @@ use std::sync::{Arc, Mutex};
 use super::questions::{ForeignRun, Row};
 use crate::ask::question::Failure;
 use crate::ask::{Asker, Wake};
-use crate::lock::lock;
-use crate::observability::tasks::Tasks;
 use crate::services::aws::Aws;
 use crate::services::table::{ObservedRow, Table, TableError, TableId};
+use leaderboard_base::lock::lock;
+use leaderboard_base::tasks::Tasks;
 
 /// What the old pipeline's row shows of a run that has not ended.
 const UNDER_WAY: [&str; 2] = ["SUBMITTED", "RUNNING"];

@@ -7,9 +7,9 @@ use sha2::{Digest, Sha256};
 
 use super::phases::{Ended, Phase, restarted};
 use crate::controller::objects::uid_of;
-use crate::observability::trace_id::TraceId;
 use crate::observability::traces::{Kind, Span, Value};
 use leaderboard_api::{Submission, SubmissionStatus, names, reasons};
+use leaderboard_base::trace_id::TraceId;
 
 /// The spans of what has ended with `new`.
 pub fn of(submission: &Submission, new: &SubmissionStatus, ended: &[Ended]) -> Vec<Span> {

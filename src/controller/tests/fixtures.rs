@@ -34,13 +34,13 @@ use crate::controller::submissions::observe::causes::Causes;
 use crate::controller::submissions::observe::workers::Workers;
 use crate::kubernetes::objects::{Job, Owner, Pod};
 use crate::kubernetes::{Namespaces, Store, Synced, Writer};
-use crate::observability::shutdown::Stop;
-use crate::observability::tasks::Tasks;
 use crate::observability::traces::Traces;
 use crate::services::aws::Aws;
 use crate::services::evalai::{Hub, Options};
 use crate::services::table::Recorder;
 use leaderboard_api::{Attempt, JobNumber, Leaderboard, State, Submission, SubmissionStatus, Times, effective, names};
+use leaderboard_base::shutdown::Stop;
+use leaderboard_base::tasks::Tasks;
 
 /// Namespace of everything here.
 pub const NAMESPACE: &str = "one";

@@ -8,7 +8,7 @@ use prometheus_client::collector::Collector;
 use prometheus_client::encoding::DescriptorEncoder;
 use prometheus_client::metrics::MetricType;
 
-use crate::lock::lock;
+use leaderboard_base::lock::lock;
 
 /// A gauge with `N` labels: its name after `leaderboard_`, its labels and its meaning.
 #[derive(Debug)]

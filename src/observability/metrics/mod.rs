@@ -24,10 +24,10 @@ use prometheus_client::metrics::info::Info;
 use prometheus_client::registry::Registry;
 
 use super::REVISION;
-use crate::lock::lock;
-use crate::services::meter::Meter;
 use families::{Counters, Families, Gauges, Timings};
 use leader::{Leader, Samples};
+use leaderboard_base::lock::lock;
+use leaderboard_base::meter::Meter;
 use process::Process;
 
 /// Media type of `Metrics::text`.

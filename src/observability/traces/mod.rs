@@ -8,7 +8,7 @@ pub mod otlp;
 
 use jiff::Timestamp;
 
-use super::trace_id::TraceId;
+use leaderboard_base::trace_id::TraceId;
 
 /// A span that is over.
 #[derive(Clone, Debug, PartialEq)]

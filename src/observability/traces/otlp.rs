@@ -15,8 +15,8 @@ use tokio::task::JoinHandle;
 
 use super::{Kind, Span, Traces, Value};
 use crate::observability::metrics::Metrics;
-use crate::observability::tasks::Tasks;
 use leaderboard_api::names::OPERATOR;
+use leaderboard_base::tasks::Tasks;
 
 /// Spans that wait: those of some 200 submissions that end at once.
 const QUEUE: usize = 2048;

@@ -12,8 +12,8 @@ use opentelemetry_proto::tonic::collector::trace::v1::ExportTraceServiceRequest;
 use prost::Message;
 
 use super::*;
-use crate::observability::shutdown::Stop;
-use crate::observability::trace_id::TraceId as Trace;
+use leaderboard_base::shutdown::Stop;
+use leaderboard_base::trace_id::TraceId as Trace;
 
 /// A collector that answers with one status.
 async fn collector(status: StatusCode) -> (String, Arc<Mutex<Vec<ExportTraceServiceRequest>>>) {

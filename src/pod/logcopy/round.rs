@@ -12,7 +12,6 @@ use tokio::sync::watch;
 
 use super::describe::{describe, to_bytes};
 use super::{LANDING, LAST_FLUSH, LogcopyError, create};
-use crate::lock::lock;
 use crate::pod::blocking;
 use crate::pod::gather::{Gathered, Gatherer, Object};
 use crate::pod::judge::{Ending, Judge, Outside, Step, decide};
@@ -27,6 +26,7 @@ use crate::pod::upload::send::{Uploader, Window};
 use crate::pod::upload::wanted::{Files, Wanted};
 use crate::pod::watch::Watch;
 use crate::services::archive::{Archive, ArchiveError, Fetched};
+use leaderboard_base::lock::lock;
 use leaderboard_runner::protocol::{self, Mark, Pair, StatusFile};
 
 /// Rounds of a container whose status files are stored: far more than retries a host forgives.

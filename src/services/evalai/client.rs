@@ -17,9 +17,9 @@ use super::http::{ClientError, Need, Timeouts, answer, builder, made};
 use super::request::{Reply, Request, SubmissionRef};
 use super::row::Row;
 use super::types::Payload;
-use crate::services::meter::Meter;
 use crate::services::public::Reach;
 use crate::services::token::Token;
+use leaderboard_base::meter::Meter;
 
 /// Largest answer that is read about one submission, in bytes: a row has some 2 kB, and its participant can write into it.
 const LARGEST_ROW: usize = 1 << 20;

@@ -11,11 +11,11 @@ use tokio::net::{TcpListener, TcpStream};
 
 use super::super::http::is_canceled;
 use super::super::request::Purpose;
-use super::super::status::{Outcome, Progress};
 use super::super::types::Key;
 use super::*;
-use crate::observability::about::LogSpan;
 use leaderboard_api::Attempt;
+use leaderboard_api::evalai_status::{Outcome, Progress};
+use leaderboard_base::spans::LogSpan;
 
 /// Reads one request, with its body. False at the end of the connection.
 async fn read(stream: &mut TcpStream) -> bool {

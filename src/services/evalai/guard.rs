@@ -7,8 +7,8 @@
 //! `failed` are about this attempt. So does `cancelled`, but EvalAI resumes only what has failed: before an attempt that it has
 //! asked for has begun, `cancelled` is a new cancel. Only an attempt that a person has begun here follows a cancelled one.
 
-use super::status::{Outcome, Progress, Status};
 use leaderboard_api as api;
+use leaderboard_api::evalai_status::{Outcome, Progress, Status};
 
 /// The attempt that a status may be about.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]

@@ -22,9 +22,9 @@ use super::types::{
     Changed, DesiredUpdate, InboxTrouble, Key, Load, PayloadReader, Publisher, Subject, SubmissionState, SweepRow,
     Target, Usage, WriteGuard,
 };
-use crate::lock::lock;
-use crate::observability::tasks::Tasks;
-use crate::services::meter::Meter;
+use leaderboard_base::lock::lock;
+use leaderboard_base::meter::Meter;
+use leaderboard_base::tasks::Tasks;
 
 /// What a hub needs.
 pub struct Options {

@@ -122,7 +122,7 @@ mod tests {
 
     fn target(phases: &[i64], labels: &[&str]) -> Target {
         Target {
-            leaderboard: crate::object_key::ObjectKey {
+            leaderboard: leaderboard_base::object_key::ObjectKey {
                 namespace: "ns".into(),
                 name: "board".into(),
                 uid: "board".into(),

@@ -19,7 +19,6 @@ mod payload;
 pub mod queue;
 pub mod request;
 pub mod row;
-pub mod status;
 mod task;
 pub mod types;
 
@@ -27,9 +26,9 @@ pub use crate::pod::report::Patience;
 pub use http::{ClientError, Timeouts};
 pub use hub::{Hub, Options};
 pub use labels::{Labels, Misfit};
+pub use leaderboard_api::evalai_status::{Outcome, Progress, Status};
 pub use queue::Timing;
 pub use row::Row;
-pub use status::{Outcome, Progress, Status};
 pub use types::{
     Changed, DesiredUpdate, Ended, ImageAnswer, InboxTrouble, Key, Outline, Payload, PayloadProblem, PayloadReader,
     Publisher, Run, StoredResult, Subject, SubmissionState, SweepRow, Swept, Target, Usage, WriteGuard,

@@ -6,10 +6,10 @@ use jiff::Timestamp;
 
 use super::answer::Answer;
 use super::row::{DatasetSplit, Phase, Received, Row, Split};
-use super::status::{Outcome, Progress};
 use super::types::{ImageAnswer, Key, Payload};
-use crate::observability::about::LogSpan;
 use leaderboard_api::Attempt;
+use leaderboard_api::evalai_status::{Outcome, Progress};
+use leaderboard_base::spans::LogSpan;
 
 /// Whom a request is about.
 #[derive(Clone, Debug, PartialEq, Eq)]

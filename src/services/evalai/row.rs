@@ -8,7 +8,7 @@ use serde::{Deserialize, Deserializer};
 use serde_json::Value;
 
 use super::job_names::JobNames;
-use super::status::Status;
+use leaderboard_api::evalai_status::Status;
 use leaderboard_api::text::{LONGEST_NAME, one_line};
 use leaderboard_api::{Attempt, ImageReference, names};
 

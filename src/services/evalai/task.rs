@@ -16,8 +16,8 @@ use super::client::Client;
 use super::queue::{Next, Now, PAYLOADS, Place, Queue, Ticket};
 use super::request::{Reply, Request};
 use super::types::{Changed, Key, Outline, Payload, PayloadProblem, PayloadReader, SweepRow, WriteGuard};
-use crate::lock::lock;
 use crate::services::token::Token;
+use leaderboard_base::lock::lock;
 
 /// How long answers are waited for at the end: longer than a write may take.
 const DRAIN: Duration = Duration::from_secs(70);

@@ -9,9 +9,9 @@ use std::time::Duration;
 use tokio::time::Instant;
 
 use super::{Row, TableError, Written};
-use crate::object_key::ObjectKey;
-use crate::observability::about::LogSpan;
 use leaderboard_api as api;
+use leaderboard_base::object_key::ObjectKey;
+use leaderboard_base::spans::LogSpan;
 
 /// How long a row that was refused for its own sake is not retried.
 const REFUSED: Duration = Duration::from_mins(5);

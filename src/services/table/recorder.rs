@@ -14,13 +14,13 @@ use tokio::time::Instant;
 
 use super::ledger::{Ledger, RowState, RowUpdate, TableId};
 use super::{Row, Table, TableError, Written};
-use crate::backoff::Backoff;
-use crate::lock::lock;
-use crate::object_key::ObjectKey;
-use crate::observability::about::LogSpan;
-use crate::observability::tasks::Tasks;
 use crate::services::aws::Aws;
 use leaderboard_api as api;
+use leaderboard_base::backoff::Backoff;
+use leaderboard_base::lock::lock;
+use leaderboard_base::object_key::ObjectKey;
+use leaderboard_base::spans::LogSpan;
+use leaderboard_base::tasks::Tasks;
 
 /// A worker that nobody gives a row ends after this long.
 const LINGERS: Duration = Duration::from_mins(1);

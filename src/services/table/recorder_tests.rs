@@ -5,7 +5,7 @@ use std::sync::atomic::{AtomicBool, Ordering};
 use tokio::sync::watch;
 
 use super::*;
-use crate::observability::shutdown::Stop;
+use leaderboard_base::shutdown::Stop;
 
 type Log = Arc<Mutex<Vec<(Duration, String, String)>>>;
 

@@ -16,11 +16,11 @@ use tokio::time::{Instant, sleep};
 use super::decide::{Decision, Leading, Loss, ObservedLease, decide, is_overdue};
 use super::record::{Record, held, released};
 use super::{Fence, Leadership, Settings};
-use crate::backoff::jittered;
 use crate::kubernetes::{CallError, call_within};
 use crate::observability::Observability;
 use crate::observability::liveness::Liveness;
 use crate::observability::metrics::Metrics;
+use leaderboard_base::backoff::jittered;
 
 /// Looks at a Lease that changes while it is being released.
 const RELEASE_TRIES: u32 = 3;

@@ -17,10 +17,10 @@ use tokio::sync::Notify;
 use tokio::task::JoinSet;
 use tokio::time::{Instant, sleep_until};
 
-use crate::lock::lock;
 use crate::observability::metrics::Histogram;
-use crate::observability::shutdown::Stop;
 pub use lanes::Class;
+use leaderboard_base::lock::lock;
+use leaderboard_base::shutdown::Stop;
 pub use state::{After, Limits};
 use state::{Begun, State};
 

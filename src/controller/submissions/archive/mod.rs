@@ -24,11 +24,11 @@ use tracing::Instrument;
 use super::failure_log::{LogDemand, Tail};
 use super::view::{ObservedFence, ObservedLog, ReportDemand, ReportView};
 use crate::controller::objects::{Wake, uid};
-use crate::lock::lock;
-use crate::observability::tasks::Tasks;
 use crate::services::archive::Archive;
 use crate::services::aws::Aws;
 use leaderboard_api::{RunPlan, Storage, Submission, SubmissionStatus, effective};
+use leaderboard_base::lock::lock;
+use leaderboard_base::tasks::Tasks;
 use request::{Done, Target, Uid, Work};
 use state::State;
 

@@ -9,8 +9,8 @@ use tracing::Span;
 use crate::controller::submissions::failure_log::{LogAnswer, LogDemand, Tail};
 use crate::controller::submissions::report_digest::ReportDigest;
 use crate::controller::submissions::view::ReportDemand;
-use crate::observability::about;
 use leaderboard_api::{Attempt, JobNumber};
+use leaderboard_base::spans as about;
 
 pub(super) type Uid = Arc<str>;
 

@@ -16,9 +16,9 @@ use crate::controller::stores::Stores;
 use crate::controller::submissions::view::ScaleUp;
 use crate::kubernetes::Store;
 use crate::kubernetes::objects::{Event, Involved, Job, Meta, Pod};
-use crate::lock::lock;
 use leaderboard_api::Submission;
 use leaderboard_api::text::{LONGEST_MESSAGE, one_line};
+use leaderboard_base::lock::lock;
 
 /// Why Jobs have no Pod.
 pub const OF_JOBS: &str = "involvedObject.kind=Job,reason=FailedCreate";

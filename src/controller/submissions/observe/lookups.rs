@@ -15,9 +15,9 @@ use tokio::time::Instant;
 use super::node;
 use crate::controller::objects::Wake;
 use crate::controller::submissions::view::NodeView;
-use crate::lock::lock;
-use crate::observability::tasks::Tasks;
 use leaderboard_api::Submission;
+use leaderboard_base::lock::lock;
+use leaderboard_base::tasks::Tasks;
 
 /// How many questions are under way at once.
 const AT_ONCE: usize = 4;

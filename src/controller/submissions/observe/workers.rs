@@ -9,9 +9,9 @@ use crate::controller::objects::Wake;
 use crate::controller::submissions::archive::ArchiveWorkers;
 use crate::controller::submissions::questions::Row;
 use crate::controller::submissions::rows;
-use crate::observability::tasks::Tasks;
 use crate::services::aws::Aws;
 use leaderboard_api::Submission;
+use leaderboard_base::tasks::Tasks;
 
 /// Who asks them, and what was answered.
 pub struct Workers {

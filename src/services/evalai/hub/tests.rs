@@ -1,12 +1,12 @@
 mod tokens;
 
 use super::*;
-use crate::observability::about::LogSpan;
-use crate::observability::shutdown::Stop;
 use crate::services::evalai::types::Run;
 use crate::services::token::Token;
 use futures::FutureExt;
 use leaderboard_api::Attempt;
+use leaderboard_base::shutdown::Stop;
+use leaderboard_base::spans::LogSpan;
 use std::time::Duration;
 
 /// A hub that nobody listens to.

@@ -10,12 +10,12 @@ use jiff::SignedDuration;
 use super::poll::pause;
 use super::sub::{RETRY_END, Sub};
 use super::{Busy, Now, Queue, Ticket};
-use crate::backoff::Backoff;
 use crate::services::evalai::answer::{About, Answer, Refusal, Silence};
 use crate::services::evalai::request::{Reply, Request, SubmissionRef};
 use crate::services::evalai::row::Row;
-use crate::services::evalai::status::{Outcome, Status};
 use crate::services::evalai::types::{Changed, Ended, ImageAnswer, Outline};
+use leaderboard_api::evalai_status::{Outcome, Status};
+use leaderboard_base::backoff::Backoff;
 
 /// After a refused token nothing is asked for so long, unless it is renewed.
 const TOKEN_PAUSE: Duration = Duration::from_mins(1);

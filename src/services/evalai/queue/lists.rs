@@ -13,8 +13,8 @@ use super::{Now, Queue};
 use crate::services::evalai::answer::{About, Answer};
 use crate::services::evalai::request::{Purpose, Reply, Request};
 use crate::services::evalai::row::{Row, Split};
-use crate::services::evalai::status::Status;
 use crate::services::evalai::types::{Changed, Key, SweepRow, Swept};
+use leaderboard_api::evalai_status::Status;
 use leaderboard_api::names;
 
 /// What the sweep has found is not handed out again for so long.

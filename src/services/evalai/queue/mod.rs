@@ -39,8 +39,8 @@ use self::sub::{Pending, Sub};
 use super::budget::WINDOW;
 use super::labels::{Labels, compare};
 use super::request::{Purpose, Request};
-use super::status::{Outcome, Progress};
 use super::types::{Changed, DesiredUpdate, Ended, Key, Outline, Subject, SubmissionState, SweepRow, Target, Usage};
+use leaderboard_api::evalai_status::{Outcome, Progress};
 
 /// Requests about submissions that may wait for an answer at once; lists come on top, one of a kind.
 const MAX_IN_FLIGHT: usize = 4;

@@ -11,8 +11,8 @@ use tokio::sync::OwnedSemaphorePermit;
 use super::sub::{Sub, Write};
 use super::{Busy, Next, Now, Queue};
 use crate::services::evalai::payload::{check, for_split};
-use crate::services::evalai::status::Outcome;
 use crate::services::evalai::types::{Changed, Key, Outline, Payload, PayloadProblem, Target};
+use leaderboard_api::evalai_status::Outcome;
 
 /// Payloads that are held at once: with a second one, a write that EvalAI does not answer holds no other up.
 pub const PAYLOADS: usize = 2;

@@ -7,10 +7,10 @@ use std::time::Duration;
 
 use jiff::Timestamp;
 
-use crate::backoff::Backoff;
 use crate::services::evalai::labels::Catalog;
 use crate::services::evalai::request::{Purpose, Request};
 use crate::services::evalai::row::{Phase, Split};
+use leaderboard_base::backoff::Backoff;
 
 /// Waits after failures in a row. Without jitter: one task makes all requests of a token.
 const RETRY: Backoff = Backoff::new(Duration::from_secs(5), Duration::from_mins(1));

@@ -6,8 +6,8 @@ use std::collections::BTreeMap;
 use std::sync::{Arc, Mutex, MutexGuard};
 use std::time::Duration;
 
-use crate::lock::lock;
 use crate::services::evalai::budget::Budget;
+use leaderboard_base::lock::lock;
 
 /// See the module's text.
 #[derive(Debug)]

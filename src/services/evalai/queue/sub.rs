@@ -11,8 +11,8 @@ use super::Now;
 use super::poll::pause;
 use crate::services::evalai::guard::{self, Attempt, End, Start, Verdict};
 use crate::services::evalai::row::Row;
-use crate::services::evalai::status::{Outcome, Progress, Status};
 use crate::services::evalai::types::{Ended, ImageAnswer, Outline, Run, SubmissionState, Target};
+use leaderboard_api::evalai_status::{Outcome, Progress, Status};
 
 /// Wait before an unknown status of EvalAI is read again.
 const UNCLEAR_PAUSE: Duration = Duration::from_mins(1);

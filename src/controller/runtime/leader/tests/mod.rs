@@ -11,8 +11,8 @@ use tokio::sync::watch;
 use tokio::time::{Instant, sleep, timeout};
 
 use super::*;
-use crate::observability::shutdown::Stop;
 use fake_server::{FakeServer, Fault};
+use leaderboard_base::shutdown::Stop;
 
 /// Longer than anything an election may take.
 const LIMIT: Duration = Duration::from_mins(5);

@@ -8,8 +8,8 @@ use tokio::io::{AsyncReadExt, AsyncWriteExt};
 use tokio::net::{TcpListener, TcpStream};
 
 use super::*;
-use crate::services::evalai::status::Outcome;
 use crate::services::evalai::types::{Ended, Outline};
+use leaderboard_api::evalai_status::Outcome;
 
 /// One request of a server of the test's own.
 #[derive(Clone, Debug, PartialEq, Eq)]

@@ -13,15 +13,15 @@ mod simulation;
 use jiff::SignedDuration;
 
 use super::*;
-use crate::observability::about::LogSpan;
 use crate::pod::report::{ContentId, Patience};
 use crate::services::evalai::answer::{About, Answer, Refusal, Silence};
 use crate::services::evalai::request::{Purpose, Reply};
 use crate::services::evalai::row::{DatasetSplit, Phase, Row, Schema, Split};
-use crate::services::evalai::status::Status;
 use crate::services::evalai::types::{ImageAnswer, Payload, PayloadProblem, Run, StoredResult, Usage};
 use crate::services::token::Token;
 use leaderboard_api::Attempt;
+use leaderboard_api::evalai_status::Status;
+use leaderboard_base::spans::LogSpan;
 
 /// A queue whose time is ours.
 struct Bench {

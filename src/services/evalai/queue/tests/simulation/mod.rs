@@ -14,8 +14,8 @@ use crate::services::evalai::answer::{Answer, Silence};
 use crate::services::evalai::budget::WINDOW;
 use crate::services::evalai::request::{Purpose, Reply};
 use crate::services::evalai::row::Row;
-use crate::services::evalai::status::Status;
 use crate::services::token::Token;
+use leaderboard_api::evalai_status::Status;
 
 const SUBMISSIONS: i64 = 12;
 /// Those that their participant deletes at some time.

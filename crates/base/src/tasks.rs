@@ -28,7 +28,7 @@ pub struct Tasks {
     stop: Stop,
     failed: watch::Sender<Option<TaskFailed>>,
     /// So that a test can end a task of a name.
-    #[cfg(test)]
+    #[cfg(any(test, feature = "fixtures"))]
     running: std::sync::Arc<std::sync::Mutex<Vec<(String, tokio::task::AbortHandle)>>>,
 }
 
@@ -38,7 +38,7 @@ impl Tasks {
         Self {
             stop,
             failed: watch::Sender::new(None),
-            #[cfg(test)]
+            #[cfg(any(test, feature = "fixtures"))]
             running: std::sync::Arc::default(),
         }
     }
@@ -101,10 +101,10 @@ impl Tasks {
             name,
             may_end: false,
         };
-        #[cfg(test)]
+        #[cfg(any(test, feature = "fixtures"))]
         let name = guard.name.clone();
         let task = tokio::spawn(watched(guard, stays, work));
-        #[cfg(test)]
+        #[cfg(any(test, feature = "fixtures"))]
         self.lock().push((name, task.abort_handle()));
         task
     }
@@ -125,7 +125,8 @@ impl Tasks {
     }
 }
 
-#[cfg(test)]
+#[cfg(any(test, feature = "fixtures"))]
+#[allow(clippy::unwrap_used, clippy::panic)]
 impl Tasks {
     fn lock(&self) -> std::sync::MutexGuard<'_, Vec<(String, tokio::task::AbortHandle)>> {
         self.running.lock().unwrap()

@@ -1,0 +1,13 @@
+//! What every part of the operator shares, and what knows none of them.
+//!
+//! Tasks that end the process when they fail (`tasks`), the stop that all of them watch (`shutdown`), pauses between tries (`backoff`),
+//! the span that all log lines of a submission share (`spans`, `trace_id`), the meter that calls to other services are counted by.
+
+pub mod backoff;
+pub mod lock;
+pub mod meter;
+pub mod object_key;
+pub mod shutdown;
+pub mod spans;
+pub mod tasks;
+pub mod trace_id;
