@@ -62,6 +62,7 @@ pub use progress::{MAX_METRICS, MAX_NAME, Metric, Progress, Score};
 pub use retention::Retention;
 pub use route_slice::{NotASlice, RouteSlice};
 pub use run_id::{NotARunId, RunId};
+pub use run_plan::{Given, Part};
 pub use shared_text::SharedText;
 pub use submission::{EvalaiRef, Submission, SubmissionSpec};
 pub use submission_status::*;

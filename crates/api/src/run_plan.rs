@@ -2,7 +2,9 @@
 //!
 //! Pure. Fields of one kind alone are read here, and in `evaluation`.
 
-use super::{LeaderboardSpec, RouteSlice, RunPlan};
+use k8s_openapi::api::core::v1::{EnvVar, ResourceRequirements, SecurityContext};
+
+use super::{LeaderboardSpec, RouteSlice, RunPlan, Track, effective};
 
 impl RunPlan {
     /// How many workers share the work.
@@ -46,7 +48,58 @@ impl RunPlan {
     }
 }
 
+/// A container whose fields the host writes.
+#[derive(Clone, Copy, Debug, PartialEq, Eq)]
+pub enum Part {
+    /// Fills the volumes with what the host keeps private.
+    Contents,
+    /// The container of a worker with the host's image.
+    Host,
+    /// The container of a worker with the participant's image.
+    Agent,
+}
+
+/// Fields of a container that Kubernetes gets as the host writes them.
+#[derive(Clone, Debug)]
+pub struct Given<'a> {
+    /// Where they stand below `spec`.
+    pub path: &'static str,
+    pub env: &'a [EnvVar],
+    pub resources: Option<ResourceRequirements>,
+    pub security: Option<&'a SecurityContext>,
+}
+
 impl LeaderboardSpec {
+    /// What the host writes of a container, with the overrides of a track.
+    pub fn given<'a>(&'a self, track: Option<&Track>, part: Part) -> Given<'a> {
+        match part {
+            Part::Contents => Given {
+                path: "contents",
+                env: &self.contents.env,
+                resources: self.contents.resources.clone(),
+                security: self.contents.security_context.as_ref(),
+            },
+            Part::Host => Given {
+                path: "simulator",
+                env: &self.simulator.env,
+                resources: effective::resources(
+                    track.and_then(|track| track.simulator.as_ref()),
+                    self.simulator.resources.as_ref(),
+                ),
+                security: self.simulator.security_context.as_ref(),
+            },
+            Part::Agent => Given {
+                path: "agent",
+                env: &self.agent.env,
+                resources: effective::resources(
+                    track.and_then(|track| track.agent.as_ref()),
+                    self.agent.resources.as_ref(),
+                ),
+                security: self.agent.security_context.as_ref(),
+            },
+        }
+    }
+
     /// Images of the host, which are nobody's submission.
     pub fn host_images(&self) -> [&str; 2] {
         [&self.contents.image, &self.simulator.image]

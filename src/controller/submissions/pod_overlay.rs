@@ -3,18 +3,19 @@
 //! Pure, and on JSON, so that Pod fields newer than this client survive. Called by `job_spec` (apply) and by the check of a
 //! Leaderboard (validate). The rules, for people too: objects are merged deep; lists by `name`, volumeMounts by
 //! `mountPath`; variables are replaced whole, tolerations added, all other lists replaced; `null` removes;
-//! `simulator` and `agent` stand for the containers of every pair, `agent-2` for one, whichever comes first in the list.
+//! the names of the two roles stand for the containers of every worker, `agent-2` for one, whichever comes first in the list.
 
 mod rules;
 #[cfg(test)]
 mod tests;
 
+use leaderboard_runner::protocol::Side;
 use serde_json::{Map, Value};
 
 pub use rules::{OverlayError, validate, validate_overlay};
 
-/// Names that stand for the containers of all pairs.
-const ALIASES: [&str; 2] = ["simulator", "agent"];
+/// Names that stand for the containers of all workers.
+const ALIASES: [&str; 2] = [Side::Host.name(), Side::Agent.name()];
 
 /// Lays `overlay` over a PodTemplateSpec, or a part of one. Only for overlays that [`validate_overlay`] accepts.
 pub(super) fn apply(base: &mut Value, overlay: &Value) {

@@ -4,7 +4,7 @@
 
 use super::commands::{self, Adapter};
 use super::display;
-use super::workload::{Asked, Mount, Role, Workload};
+use super::workload::{Asked, Contents, Mount, Role, Workload};
 use crate::controller::submissions::pod_layout::{AGENT, CONTENTS_VOLUMES, SAVED};
 use crate::pod::keys::agent_folder;
 use crate::pod::layout::{CARLA_ROOT, LEADERBOARD_ROOT, SCENARIO_RUNNER_ROOT, python_path};
@@ -23,6 +23,16 @@ const SIMULATOR_LOG_LIMIT: u64 = 64 << 20;
 /// Port of a pair's simulator.
 fn port(pair: Pair) -> usize {
     2000 + 100 * pair.index()
+}
+
+/// The container with the private contents.
+pub fn contents(asked: &Asked<'_>) -> Contents {
+    let spec = &asked.spec.contents;
+    let host = commands::of_host(spec.command.as_deref(), spec.args.as_deref());
+    Contents {
+        image: asked.plan.contents_image.to_string(),
+        command: host.unwrap_or_else(commands::contents),
+    }
 }
 
 /// The simulator and the agent of a pair.

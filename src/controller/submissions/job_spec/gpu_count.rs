@@ -3,25 +3,22 @@
 use leaderboard_runner::protocol::Pair;
 use serde_json::{Value, json};
 
-use super::gpu;
+use super::{gpu, pairs};
 use crate::controller::gpu_claims::source;
 use crate::controller::submissions::pod_overlay;
-use leaderboard_api::{GpuSource, LeaderboardSpec, RunPlan, Track, effective};
+use leaderboard_api::{GpuSource, LeaderboardSpec, RunPlan, Track};
 
 /// GPUs that the Pod of a plan requests or claims; shares of GPUs and MIG slices count as one each.
 pub fn gpus(spec: &LeaderboardSpec, track: Option<&Track>, plan: &RunPlan) -> i64 {
     let source = source(spec);
-    let simulators = track.and_then(|track| track.simulator.as_ref());
-    let agents = track.and_then(|track| track.agent.as_ref());
-    let of_simulator = effective::resources(simulators, spec.simulator.resources.as_ref());
-    let of_agent = effective::resources(agents, spec.agent.resources.as_ref());
-    let of_pair = |pair: Pair| {
-        [(pair.host(), &of_simulator), (pair.agent(), &of_agent)].map(|(member, hosts)| {
-            let resources = gpu::resources(source, member, hosts.clone());
+    let of_worker = |worker: Pair| {
+        [worker.host(), worker.agent()].map(|member| {
+            let hosts = spec.given(track, pairs::part(member.side)).resources;
+            let resources = gpu::resources(source, member, hosts);
             json!({"name": member.to_string(), "resources": resources})
         })
     };
-    let containers: Vec<Value> = Pair::first(plan.workers()).flat_map(of_pair).collect();
+    let containers: Vec<Value> = Pair::first(plan.workers()).flat_map(of_worker).collect();
     let mut template = json!({"spec": {"containers": containers}});
     let overlay = spec.pod_overrides.as_ref();
     if let Some(overlay) = overlay.filter(|pod| pod_overlay::validate_overlay(pod).is_ok()) {
@@ -35,7 +32,7 @@ pub fn gpus(spec: &LeaderboardSpec, track: Option<&Track>, plan: &RunPlan) -> i6
     each.fold(claimed(source, plan), i64::saturating_add)
 }
 
-/// One device for each pair.
+/// One device for each worker.
 fn claimed(source: GpuSource<'_>, plan: &RunPlan) -> i64 {
     match source {
         GpuSource::Claim(_) => i64::try_from(plan.workers()).unwrap_or(i64::MAX),
@@ -60,6 +57,7 @@ mod tests {
     use serde_json::json;
 
     use super::*;
+    use leaderboard_api::effective;
 
     /// GPUs of a Leaderboard of four pairs with these fields.
     fn counted(fields: &Value) -> i64 {

@@ -1,4 +1,4 @@
-//! The containers that start before the pairs: `contents` of the host, and our own `workspace` and `logcopy`. Pure.
+//! The containers that start before the workers: `contents` of the host, and our own `workspace` and `logcopy`. Pure.
 //!
 //! Only our own two ever get an identity towards AWS.
 
@@ -7,26 +7,28 @@ use k8s_openapi::api::core::v1::{
 };
 
 use super::security::{confined, context, resources};
-use super::{JobInput, commands, is_resumed, own_uid, run_document, variable, volumes};
+use super::{JobInput, carla, is_resumed, own_uid, run_document, variable, volumes};
 use crate::controller::submissions::pod_layout::CONTENTS_LOG_FOLDER;
 use crate::pod::keys::CONTENTS_LOG;
 use crate::pod::run::{ENV_CHECKSUMS, ENV_POD_UID, ENV_ROLE_ARN, ENV_RUN, RUNNER, TOOLS};
-use leaderboard_api::names;
+use leaderboard_api::{Part, names};
 
 /// Copying prints little; what floods must not fill the disk. In bytes.
 const CONTENTS_LOG_LIMIT: u64 = 16 << 20;
 
 /// Copies the private contents into their volumes.
 pub(super) fn contents(input: &JobInput<'_>) -> Container {
-    let spec = &input.spec().contents;
-    let host = commands::of_host(spec.command.as_deref(), spec.args.as_deref());
+    let (contents, hosts) = (
+        carla::contents(&input.asked()),
+        input.spec().given(None, Part::Contents),
+    );
     Container {
         name: names::CONTAINER_CONTENTS.into(),
-        image: Some(input.plan.contents_image.to_string()),
-        command: Some(kept(host.unwrap_or_else(commands::contents))),
-        env: Some(contents_env(input)),
-        resources: spec.resources.clone(),
-        security_context: Some(context(spec.security_context.as_ref())),
+        image: Some(contents.image),
+        command: Some(kept(contents.command)),
+        env: Some(contents_env(input, hosts.env)),
+        resources: hosts.resources,
+        security_context: Some(context(hosts.security)),
         volume_mounts: Some(volumes::of_contents()),
         ..Container::default()
     }
@@ -47,8 +49,8 @@ fn kept(command: Vec<String>) -> Vec<String> {
 
 /// What the contents of the old pipeline were given; a command of the host's may read it. The host's own variables replace ours of the
 /// same name, and come behind them, so that they can refer to them.
-fn contents_env(input: &JobInput<'_>) -> Vec<EnvVar> {
-    let (plan, hosts) = (input.plan, &input.spec().contents.env);
+fn contents_env(input: &JobInput<'_>, hosts: &[EnvVar]) -> Vec<EnvVar> {
+    let plan = input.plan;
     let ours = [
         variable("SUBMISSION_ID", plan.run_id.as_str()),
         // The evaluator takes any text for a yes.
@@ -68,7 +70,7 @@ pub(super) fn workspace(input: &JobInput<'_>) -> Container {
     }
 }
 
-/// Merges, uploads and reports beside the pairs.
+/// Merges, uploads and reports beside the workers.
 pub(super) fn logcopy(input: &JobInput<'_>) -> Container {
     Container {
         restart_policy: Some("Always".into()),

@@ -1,6 +1,6 @@
 //! The two containers of each worker: strangers' images behind our runner. Pure.
 
-use k8s_openapi::api::core::v1::{Container, EnvVar, ResourceRequirements, SecurityContext};
+use k8s_openapi::api::core::v1::{Container, EnvVar};
 use serde_json::Value;
 
 use super::security::context;
@@ -9,7 +9,7 @@ use super::{JobInput, carla, gpu, variable, volumes};
 use crate::controller::gpu_claims::source;
 use crate::controller::submissions::pod_layout::{FIXED_ENV, STATUS};
 use crate::pod::run::{RUNNER, TOOLS};
-use leaderboard_api::effective;
+use leaderboard_api::Part;
 use leaderboard_runner::protocol::{Member, Pair, Side};
 
 pub(super) fn workload(input: &JobInput<'_>, pair: Pair) -> Workload {
@@ -24,35 +24,6 @@ fn role(input: &JobInput<'_>, member: Member) -> Option<Role> {
     }
 }
 
-/// What the host writes of a container and Kubernetes gets as it is.
-struct OfHost<'a> {
-    env: &'a [EnvVar],
-    resources: Option<ResourceRequirements>,
-    security: Option<&'a SecurityContext>,
-}
-
-fn of_host<'a>(input: &'a JobInput<'_>, side: Side) -> OfHost<'a> {
-    let (spec, track) = (input.spec(), input.track());
-    match side {
-        Side::Host => {
-            let own = track.and_then(|track| track.simulator.as_ref());
-            OfHost {
-                env: &spec.simulator.env,
-                resources: effective::resources(own, spec.simulator.resources.as_ref()),
-                security: spec.simulator.security_context.as_ref(),
-            }
-        }
-        Side::Agent => {
-            let own = track.and_then(|track| track.agent.as_ref());
-            OfHost {
-                env: &spec.agent.env,
-                resources: effective::resources(own, spec.agent.resources.as_ref()),
-                security: spec.agent.security_context.as_ref(),
-            }
-        }
-    }
-}
-
 /// The hosts' containers of all workers, then the agents'.
 pub(super) fn all(input: &JobInput<'_>) -> Vec<Container> {
     let pairs = Pair::first(input.pairs());
@@ -63,7 +34,8 @@ pub(super) fn all(input: &JobInput<'_>) -> Vec<Container> {
 }
 
 fn container(input: &JobInput<'_>, member: Member, role: Role) -> Container {
-    let (gpus, hosts, name) = (source(input.spec()), of_host(input, member.side), member.to_string());
+    let (gpus, name) = (source(input.spec()), member.to_string());
+    let hosts = input.spec().given(input.track(), part(member.side));
     let env = role.env.iter().map(|(name, value)| variable(name, value));
     let env = env.chain(gpu::variables(gpus, member)).collect();
     let flags = role.flags.into_iter().chain(gpu::flags(gpus, member.side, role.draws));
@@ -78,6 +50,13 @@ fn container(input: &JobInput<'_>, member: Member, role: Role) -> Container {
         volume_mounts: Some(volumes::of_member(input, member, &role.mounts)),
         name,
         ..Container::default()
+    }
+}
+
+pub(super) fn part(side: Side) -> Part {
+    match side {
+        Side::Host => Part::Host,
+        Side::Agent => Part::Agent,
     }
 }
 

@@ -17,6 +17,14 @@ pub struct Asked<'a> {
     pub has_gpus: bool,
 }
 
+/// The container that fills the volumes with what the host keeps private.
+#[derive(Clone, Debug, PartialEq, Eq)]
+pub struct Contents {
+    pub image: String,
+    /// As Kubernetes gets it.
+    pub command: Vec<String>,
+}
+
 /// The containers of one worker.
 #[derive(Clone, Debug, PartialEq, Eq)]
 pub struct Workload {

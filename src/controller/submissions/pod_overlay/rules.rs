@@ -2,7 +2,7 @@
 
 use std::borrow::Cow;
 
-use k8s_openapi::api::core::v1::{EnvVar, PodTemplateSpec};
+use k8s_openapi::api::core::v1::PodTemplateSpec;
 use serde_json::{Map, Value};
 
 use super::without_nulls;
@@ -10,7 +10,7 @@ use crate::controller::submissions::pod_layout::{
     ANNOTATION_SKIP_CONTAINERS, CONTENTS_VOLUMES, FIXED_ENV, OWN_VOLUMES, protected_mounts,
 };
 use crate::pod::run::{ENV_POD_UID, ENV_ROLE_ARN, ENV_RUN};
-use leaderboard_api::{LeaderboardSpec, names};
+use leaderboard_api::{LeaderboardSpec, Part, names};
 
 /// Why a Leaderboard's `podOverrides` cannot be used. `path` is below `spec` of the Leaderboard.
 #[derive(thiserror::Error, Debug, PartialEq, Eq)]
@@ -105,9 +105,10 @@ const OWN_ENV: [&str; 6] = [
 
 /// Checks all of a Leaderboard that goes into its Pods: `podOverrides`, and the variables of its containers.
 pub fn validate(spec: &LeaderboardSpec) -> Checked {
-    for (side, env) in [("simulator", &spec.simulator.env), ("agent", &spec.agent.env)] {
-        let names = env.iter().map(|variable: &EnvVar| variable.name.as_str());
-        fixed_names(&format!("{side}.env"), names)?;
+    for part in [Part::Host, Part::Agent] {
+        let hosts = spec.given(None, part);
+        let names = hosts.env.iter().map(|variable| variable.name.as_str());
+        fixed_names(&format!("{}.env", hosts.path), names)?;
     }
     spec.pod_overrides.as_ref().map_or(Ok(()), validate_overlay)
 }
@@ -198,8 +199,8 @@ enum Whose {
     Own,
     /// `contents`.
     Contents,
-    /// `simulator`, `agent`, one or all.
-    Pair,
+    /// The host's or the agent's of one worker or all.
+    Worker,
     /// An init container of the host's.
     Added,
 }
@@ -209,7 +210,7 @@ fn check_container(path: &str, container: &Map<String, Value>, init: bool) -> Ch
     let whose = whose(name);
     match (whose, init) {
         (Whose::Own | Whose::Contents, false) => return protected(path.into(), "it is an init container"),
-        (Whose::Pair, true) => return protected(path.into(), "it belongs to containers"),
+        (Whose::Worker, true) => return protected(path.into(), "it belongs to containers"),
         (Whose::Added, false) => {
             let why = "a further container would keep the Pod from ending; add it to initContainers with restartPolicy Always";
             return protected(path.into(), why);
@@ -237,7 +238,7 @@ fn whose(name: &str) -> Whose {
     match name {
         names::CONTAINER_WORKSPACE | names::CONTAINER_LOGCOPY => Whose::Own,
         names::CONTAINER_CONTENTS => Whose::Contents,
-        name if super::ALIASES.iter().any(|alias| *alias == name || numbered(alias)) => Whose::Pair,
+        name if super::ALIASES.iter().any(|alias| *alias == name || numbered(alias)) => Whose::Worker,
         _ => Whose::Added,
     }
 }
@@ -257,7 +258,7 @@ fn env(path: &str, container: &Map<String, Value>, whose: Whose) -> Checked {
             ),
             None => Ok(()),
         },
-        Whose::Pair => fixed_names(&path, names),
+        Whose::Worker => fixed_names(&path, names),
         Whose::Contents | Whose::Added => Ok(()),
     }
 }
