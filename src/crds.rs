@@ -75,6 +75,7 @@ fn definition(
     each(&mut value, &|value: &mut Value| {
         whole_number(value);
         whole_list(value);
+        null_is_default(value);
     });
     if let Some(versions) = value.pointer_mut("/spec/versions").and_then(Value::as_array_mut) {
         for status in versions
@@ -108,6 +109,17 @@ fn without_rules(value: &mut Value) {
 fn whole_list(value: &mut Value) {
     if value["type"] == "array" && value["x-kubernetes-list-type"].is_null() {
         value["x-kubernetes-list-type"] = "atomic".into();
+    }
+}
+
+/// A null of a field with a default is as good as none: the API server keeps a null where it is allowed. `kube` allows one in each
+/// quantity.
+fn null_is_default(value: &mut Value) {
+    if value["x-kubernetes-int-or-string"] == true
+        && !value["default"].is_null()
+        && let Some(object) = value.as_object_mut()
+    {
+        object.remove("nullable");
     }
 }
 

@@ -226,7 +226,7 @@ fn scores_that_do_not_follow_are_reported_or_refused() {
     let case = inputs("v2/case25");
     let told = |flags: &[&str]| stderr(&results("v2", folder.path(), flags, &case));
     assert!(told(&[]).lines().all(|line| line.starts_with("warning: pair ")) && !told(&[]).is_empty());
-    assert_eq!(told(&["--verify", "off"]), "");
+    assert_eq!(told(&["--verify", "disabled"]), "");
     let said = leaves_all("v2", &["--verify", "refuse"], &case, 2);
     assert!(said.contains("but score_route x score_penalty is"), "{said}");
 }
@@ -253,7 +253,7 @@ fn arguments_that_can_not_be_meant_are_refused() {
             "the slices 0-4 and 4-9 overlap",
         ),
         (vec!["--slices", "0-4,5-9,10-14,15-19", "--workers", "4"], "--workers"),
-        (vec!["--verify", "maybe"], "possible values: off, warn, refuse"),
+        (vec!["--verify", "maybe"], "possible values: disabled, warn, refuse"),
     ] {
         let said = leaves_all("v2", &flags, &four, 2);
         assert!(said.contains(words), "{flags:?}: {said}");

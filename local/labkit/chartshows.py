@@ -92,7 +92,7 @@ def own_objects(component: str, deployment: str) -> list[Case]:
     return [
         case(
             {
-                f"{component}.roleArn": ROLE,
+                f"{component}.roleARN": ROLE,
                 f"{component}.serviceAccount": {"name": "own", "annotations": {"team": "one"}},
             },
             ("ServiceAccount/own", "metadata.annotations", {"eks.amazonaws.com/role-arn": ROLE, "team": "one"}),
@@ -284,7 +284,7 @@ PROGRAMS = [
         (f"RoleBinding/{RELEASE}-secrets", "subjects.0.namespace", SYSTEM),
     ),
     case(
-        {"aws": {"region": "eu-central-1", "endpointUrl": "http://aws.example:4566", "secretName": "aws"}},
+        {"aws": {"region": "eu-central-1", "endpointURL": "http://aws.example:4566", "secretName": "aws"}},
         (
             BRIDGE,
             f"{CONTAINER}.env",

@@ -50,7 +50,7 @@ impl From<FormatName> for Format {
 
 #[derive(ValueEnum, Clone, Copy, Debug)]
 enum VerifyName {
-    Off,
+    Disabled,
     Warn,
     Refuse,
 }
@@ -183,7 +183,7 @@ impl Results {
     fn plan(&self) -> Result<Plan, Failure> {
         let format = Format::from(self.format);
         let verify = match self.verify {
-            VerifyName::Off => Verify::Off,
+            VerifyName::Disabled => Verify::Disabled,
             VerifyName::Warn => Verify::Warn,
             VerifyName::Refuse => Verify::Refuse,
         };

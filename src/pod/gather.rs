@@ -57,7 +57,7 @@ pub fn results_plan(run: &Run) -> Result<Plan, Refusal> {
         pairs,
         repetitions: u32::try_from(run.plan.repetitions).unwrap_or(0),
         verify: match run.verify {
-            Verify::Off => leaderboard_results::Verify::Off,
+            Verify::Disabled => leaderboard_results::Verify::Disabled,
             Verify::Warn => leaderboard_results::Verify::Warn,
             Verify::Refuse => leaderboard_results::Verify::Refuse,
         },

@@ -36,7 +36,7 @@ impl World {
         };
         let storage = json!({"bucket": world.aws.name("bucket"), "endpoint": world.aws.endpoint});
         let gpu = json!({"mode": "Claim", "claim": claim});
-        let network = json!({"enforcement": "Off"});
+        let network = json!({"enforcement": "Disabled"});
         let patch = json!({"spec": {"storage": storage, "gpu": gpu, "network": network, "agent": {"images": []}}});
         let api = Kind::Leaderboard.api(&world.client, &world.namespace);
         let object = Kind::Leaderboard.object(NAME, &[&patch]);

@@ -74,14 +74,12 @@ async fn a_minimal_leaderboard_reads_back_whole() {
         "agent": {"logSizeLimit": "2Gi"},
         "pairs": 4,
         "routes": 20,
-        "retries": {"perPair": 3, "infrastructure": 2},
+        "retries": {"perWorker": 3, "infrastructure": 2},
         "deadlines": {
-            "scheduleSeconds": 0,
             "pullSeconds": 5400,
             "startSeconds": 1800,
             "readySeconds": 3600,
             "idleSeconds": 800,
-            "runSeconds": 0,
             "cancelSeconds": 120,
             "flushSeconds": 1800,
             "finalizeSeconds": 900,
@@ -133,20 +131,19 @@ fn half_filled_runs() -> Vec<HalfFilled> {
         ),
         (
             "retries",
-            json!({"perPair": 0}),
-            json!({"perPair": 0, "infrastructure": 2}),
+            json!({"perWorker": 0}),
+            json!({"perWorker": 0, "infrastructure": 2}),
         ),
         (
             "retries",
             json!({"infrastructure": 0}),
-            json!({"perPair": 3, "infrastructure": 0}),
+            json!({"perWorker": 3, "infrastructure": 0}),
         ),
         (
             "deadlines",
             json!({"startSeconds": 5, "runSeconds": 7200}),
             json!({
-                "scheduleSeconds": 0,
-                "pullSeconds": 5400,
+                    "pullSeconds": 5400,
                 "startSeconds": 5,
                 "readySeconds": 3600,
                 "idleSeconds": 800,
@@ -180,9 +177,9 @@ fn half_filled_pods() -> Vec<HalfFilled> {
         (
             "tracks",
             json!([{"name": "sensors", "codename": "SENSORS", "routeSubsets": ["0-4", "5-9", "10-14", "15-19"],
-                    "deadlines": {"runSeconds": 0}, "agent": {"resources": {"limits": {"memory": "1Gi"}}}}]),
+                    "deadlines": {"runSeconds": 3601}, "agent": {"resources": {"limits": {"memory": "1Gi"}}}}]),
             json!([{"name": "sensors", "codename": "SENSORS", "routeSubsets": ["0-4", "5-9", "10-14", "15-19"],
-                    "deadlines": {"runSeconds": 0}, "agent": {"resources": {"limits": {"memory": "1Gi"}}}}]),
+                    "deadlines": {"runSeconds": 3601}, "agent": {"resources": {"limits": {"memory": "1Gi"}}}}]),
         ),
         ("concurrency", json!({"total": 3}), json!({"total": 3})),
         (
@@ -308,7 +305,7 @@ async fn a_null_is_as_good_as_a_field_left_out() {
                 "bucket": "results", "prefix": null, "region": null, "endpoint": null, "sizeLimit": null, "kmsKeyARN": null,
                 "storageClass": null,
             },
-            "deadlines": {"runSeconds": null},
+            "deadlines": {"scheduleSeconds": null, "runSeconds": null},
             "concurrency": {"total": null, "perTeam": null},
             "agent": {"command": null, "args": null, "resources": null, "logSizeLimit": null, "images": null},
             "contents": {"image": "contents:1", "command": null, "args": null, "securityContext": null},
@@ -349,6 +346,23 @@ async fn a_null_does_not_get_around_a_rule() {
     object["spec"]["evalai"] = Value::Null;
     object["spec"]["team"] = Value::Null;
     create(&api, object, false).await.unwrap();
+}
+
+#[tokio::test]
+async fn no_limit_is_written_as_zero() {
+    let server = server().await;
+    let api = Kind::Leaderboard.api(&server.client(), &server.namespace("zero").await);
+    for field in ["runSeconds", "scheduleSeconds"] {
+        let zero = json!({"spec": {"deadlines": {field: 0}}});
+        let refused = create(&api, Kind::Leaderboard.object("a", &[&zero]), true)
+            .await
+            .unwrap_err();
+        let first = &causes(&refused)[0];
+        assert!(
+            first.contains(field) && first.contains("greater than or equal to 1"),
+            "{first}"
+        );
+    }
 }
 
 #[tokio::test]

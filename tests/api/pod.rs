@@ -276,7 +276,7 @@ fn run(bucket: &str) -> Run {
             earlier_attempts: 0,
             submission_uid: None,
         },
-        verify: Verify::Off,
+        verify: Verify::Disabled,
         period_seconds: 1,
         flush_seconds: 60,
         cancel_seconds: 20,

@@ -243,7 +243,7 @@ fn times() -> Vec<Case> {
         create(
             Leaderboard,
             "a track's deadlines.runSeconds must be longer",
-            &json!({"tracks": [track(&json!({"deadlines": {"runSeconds": 0}}))]}),
+            &json!({"tracks": [track(&json!({"deadlines": {"runSeconds": null}}))]}),
             &json!({"tracks": [track(&json!({"deadlines": {"runSeconds": 800}}))], "deadlines": {"readySeconds": 1}}),
         ),
         create(
@@ -428,19 +428,24 @@ fn sizes_and_images() -> Vec<Case> {
     let case = |message, good: &Value, bad: &Value| create(Leaderboard, message, good, bad);
     vec![
         case(
-            "storage.sizeLimit must be",
-            &json!({"storage": {"sizeLimit": "1Ti"}}),
-            &json!({"storage": {"sizeLimit": "2Ti"}}),
+            "storage.sizeLimit must be 1Ti",
+            &json!({"storage": {"sizeLimit": "0.5Ti"}}),
+            &json!({"storage": {"sizeLimit": "1.5Ti"}}),
         ),
         case(
-            "storage.sizeLimit must be",
-            &json!({"storage": {"sizeLimit": "16777216"}}),
-            &json!({"storage": {"sizeLimit": "16M"}}),
+            "storage.sizeLimit must be 16Mi",
+            &json!({"storage": {"sizeLimit": 16_777_216}}),
+            &json!({"storage": {"sizeLimit": 16_000_000}}),
         ),
         case(
-            "agent.shmSize must be",
+            "agent.shmSize must be 1Mi",
             &json!({"agent": {"shmSize": "1Mi"}}),
             &json!({"agent": {"shmSize": "1M"}}),
+        ),
+        case(
+            "agent.shmSize must be 1Ti",
+            &json!({"agent": {"shmSize": "1024Gi"}}),
+            &json!({"agent": {"shmSize": "1025Gi"}}),
         ),
         case(
             "logGroup.retentionDays must be",
@@ -453,9 +458,14 @@ fn sizes_and_images() -> Vec<Case> {
             &json!({"logGroup": {"name": "logs", "retentionDays": null, "tags": {"team": "challenge"}}}),
         ),
         case(
-            "agent.logSizeLimit must be",
+            "agent.logSizeLimit must be 1Mi",
             &json!({"agent": {"logSizeLimit": "1Mi"}}),
             &json!({"agent": {"logSizeLimit": "1M"}}),
+        ),
+        case(
+            "agent.logSizeLimit must be 1Ti",
+            &json!({"agent": {"logSizeLimit": "1Ti"}}),
+            &json!({"agent": {"logSizeLimit": "2T"}}),
         ),
         case(
             "team 7 would get the images of team 17",

@@ -175,7 +175,7 @@ impl World {
                 "leaderboardVersion": "V2",
                 "contents": {"image": "contents:1"}, "simulator": {"image": "simulator:1"},
                 "agent": {"images": []},
-                "pairs": 1, "routes": 1, "retries": {"perPair": 0}, "syncPeriodSeconds": 1,
+                "pairs": 1, "routes": 1, "retries": {"perWorker": 0}, "syncPeriodSeconds": 1,
                 "storage": {"bucket": self.bucket, "endpoint": self.aws.endpoint},
             },
         });

@@ -29,7 +29,7 @@ async fn a_participant_who_edits_the_own_row_gets_one_attempt_at_most() {
             "Failed AgentCrashed (participant, charged); Failed AgentCrashed (participant, charged); attempt 2 is the last",
         );
         let crashes = json!({
-            "retries": {"perPair": 0},
+            "retries": {"perWorker": 0},
             "evalai": {"sweepSeconds": 10},
             "agent": {"env": [{"name": "AGENT_KNOBS", "value": "crash@1"}]},
         });

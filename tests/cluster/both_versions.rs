@@ -59,7 +59,7 @@ async fn leaderboard_10_comes_from_a_message_over_a_resume_to_its_score() {
             "evalai": {"challenge": 2},
             "tracks": [{"name": "map", "codename": "MAP", "phase": 4, "routesFile": ROUTES, "scenariosFile": SCENARIOS}],
             "pairs": 2, "routes": 6, "repetitions": 2,
-            "retries": {"perPair": 0},
+            "retries": {"perWorker": 0},
             "agent": {"env": [prints(), {"name": "AGENT_KNOBS", "value": "pair=2,crash@4"}]},
         });
         scene.evalai_leaderboard("lb-10", &evalai, change).await;

@@ -71,7 +71,7 @@ async fn a_message_delivered_again_and_again_runs_once_and_only_a_resume_runs_ag
         scene.cloud.set_visibility(3).await;
         let change = json!({
             "pairs": 2, "routes": 6,
-            "retries": {"perPair": 0},
+            "retries": {"perWorker": 0},
             // At every start: what it has left takes less time than a stop needs to reach it.
             "agent": {"env": [{"name": "AGENT_KNOBS", "value": "pair=2,crash@3"}]},
         });

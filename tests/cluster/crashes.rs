@@ -35,7 +35,7 @@ async fn kills_at_random_moments_change_no_score_and_cost_a_route_of_a_pair_each
     scenario("crashes", async |scene: &Scene| {
         let change = json!({
             "agent": {"env": [{"name": "ROUTE_MS", "value": ROUTE_MS}]},
-            "retries": {"perPair": 19},
+            "retries": {"perWorker": 19},
         });
         scene.leaderboard("lb", change).await;
         let _controller = controller(scene);

@@ -213,7 +213,7 @@ async fn leaderboard(scene: &Scene, gpu: Value, more: Value) {
         // In place of a driver's file.
         "simulator": {"env": [{"name": "VK_DRIVER_FILES", "value": "/home/carla/CarlaUE4.sh"}]},
         "agent": {"env": [{"name": "AGENT_KNOBS", "value": "hang@1"}]},
-        "retries": {"infrastructure": 0, "perPair": 0},
+        "retries": {"infrastructure": 0, "perWorker": 0},
     });
     lay_over(&mut change, more);
     scene.leaderboard("lb", change).await;

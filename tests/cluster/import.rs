@@ -83,7 +83,7 @@ fn decisions(scene: &Scene) -> Value {
         "queue": {"region": region, "endpoint": scene.gate.url, "deadLetterURL": scene.cloud.dead_url},
         "podIdentity": {"secretName": "aws", "serviceAccountName": null, "roleARN": null},
         "network": {
-            "dns": "None", "enforcement": "Off", "egress": [{"cidr": format!("{}/32", scene.lab.host), "ports": [443]}],
+            "dns": "None", "enforcement": "Disabled", "egress": [{"cidr": format!("{}/32", scene.lab.host), "ports": [443]}],
         },
         "concurrency": {"total": 2, "perTeam": 2},
         "syncPeriodSeconds": 2,

@@ -150,7 +150,7 @@ fn of_agents() -> Vec<Row> {
             "agent idle",
             with(
                 agent("hang@2"),
-                json!({"deadlines": {"idleSeconds": 15}, "retries": {"perPair": 0}}),
+                json!({"deadlines": {"idleSeconds": 15}, "retries": {"perWorker": 0}}),
             ),
             "Failed Idle (participant, charged); 1/2 routes; EvalAI failed",
         ),
@@ -164,7 +164,7 @@ fn of_agents() -> Vec<Row> {
         },
         row(
             "results malformed",
-            with(agent("nonsense@1"), json!({"retries": {"perPair": 0}})),
+            with(agent("nonsense@1"), json!({"retries": {"perWorker": 0}})),
             "Failed InvalidResults (participant, charged); EvalAI failed",
         ),
         row(
@@ -216,7 +216,7 @@ fn of_simulators() -> Vec<Row> {
                 // A restarted simulator counts its routes anew, and would not hang again: the route it drives then lasts longer than
                 // the way of the stop.
                 json!({
-                    "deadlines": {"idleSeconds": 15}, "retries": {"perPair": 0},
+                    "deadlines": {"idleSeconds": 15}, "retries": {"perWorker": 0},
                     "agent": {"env": [{"name": "ROUTE_MS", "value": "5000"}]},
                 }),
             ),
@@ -260,7 +260,7 @@ async fn board(scene: &Scene, evalai: &Evalai, phase: u64, change: Value) -> Str
     let base = json!({
         "pairs": 1,
         "routes": 2,
-        "retries": {"perPair": 1, "infrastructure": 0},
+        "retries": {"perWorker": 1, "infrastructure": 0},
         "deadlines": {"cancelSeconds": 20},
         "evalai": {"requestsPerMinute": 600},
         "tracks": [{"name": "sensors", "codename": "SENSORS", "phase": phase}],

@@ -130,7 +130,7 @@ fn is_running(container: &k8s_openapi::api::core::v1::ContainerStatus) -> bool {
 async fn between_tries(scene: &Scene) {
     let mut case = Case::open("cancel between two tries", "Pending Replacing; Cancelled");
     let crashes = json!({
-        "retries": {"perPair": 0, "infrastructure": 4},
+        "retries": {"perWorker": 0, "infrastructure": 4},
         "simulator": {"env": [{"name": "SIM_KNOBS", "value": "crash@1"}]},
     });
     board(scene, "tries", crashes).await;

@@ -64,7 +64,7 @@ fn small(change: Value) -> Value {
     let mut base = json!({
         "pairs": 1,
         "routes": 2,
-        "retries": {"perPair": 1, "infrastructure": 0},
+        "retries": {"perWorker": 1, "infrastructure": 0},
         "deadlines": {"cancelSeconds": 1},
     });
     lay_over(&mut base, change);
@@ -122,7 +122,7 @@ async fn unknown_track(scene: &Scene) {
 async fn quota(scene: &Scene) {
     let mut case = Case::open("quota exceeded", "Pending QuotaExceeded; Finished");
     // It counts Pods without a time limit alone: all others here have one, and the quota is of the whole namespace.
-    let no_limit = json!({"deadlines": {"runSeconds": 0}});
+    let no_limit = json!({"deadlines": {"runSeconds": null}});
     let none = json!({"metadata": {"name": "none"}, "spec": {"hard": {"pods": "0"}, "scopes": ["NotTerminating"]}});
     let none: ResourceQuota = serde_json::from_value(none).unwrap();
     scene.api().create(&PostParams::default(), &none).await.unwrap();
@@ -367,7 +367,7 @@ async fn on_the_lost_node(case: &mut Case, scene: &Scene, nodes: &Api<Node>, lab
     board(
         scene,
         "lost-node",
-        json!({"tracks": [track], "retries": {"perPair": 0}}),
+        json!({"tracks": [track], "retries": {"perWorker": 0}}),
     )
     .await;
     scene.submit_to("lost-node", "lost-node", "agent:standard").await;

@@ -32,7 +32,7 @@ fn base(ending: &Ending) -> Value {
     json!({
         "pairs": 1,
         "routes": 2,
-        "retries": {"perPair": 0, "infrastructure": 2},
+        "retries": {"perWorker": 0, "infrastructure": 2},
         "deadlines": {"readySeconds": 60, "idleSeconds": 60, "cancelSeconds": 20, "flushSeconds": 120},
         "agent": {"env": [{"name": VARIABLE, "value": ending.id}]},
     })

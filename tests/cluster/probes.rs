@@ -68,7 +68,7 @@ fn with_network(change: Value) -> Value {
         "pairs": 2,
         "routes": 2,
         "repetitions": 1,
-        "network": {"dns": "None", "egress": [{"cidr": "0.0.0.0/0"}, {"cidr": "::/0"}], "enforcement": "Off"},
+        "network": {"dns": "None", "egress": [{"cidr": "0.0.0.0/0"}, {"cidr": "::/0"}], "enforcement": "Disabled"},
     });
     crate::scene::lay_over(&mut base, change);
     base

@@ -24,7 +24,7 @@ fn board(replays: [&str; 4]) -> Value {
     json!({
         "pairs": 4,
         "routes": 16,
-        "retries": {"perPair": 1, "infrastructure": 0},
+        "retries": {"perWorker": 1, "infrastructure": 0},
         "agent": {"env": [{"name": "AGENT_KNOBS", "value": knobs}]},
     })
 }

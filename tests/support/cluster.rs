@@ -206,7 +206,7 @@ impl Scene {
             "network": {
                 "dns": "None",
                 "egress": [{"cidr": format!("{}/32", self.lab.host)}],
-                "enforcement": "Off",
+                "enforcement": "Disabled",
             },
             "syncPeriodSeconds": 1,
             "deadlines": {"readySeconds": 120, "idleSeconds": 60, "runSeconds": 1800},

@@ -148,7 +148,7 @@ subjects:
 - name: AWS_REGION
   value: {{ . | quote }}
 {{- end }}
-{{- with $values.aws.endpointUrl }}
+{{- with $values.aws.endpointURL }}
 - name: AWS_ENDPOINT_URL
   value: {{ . | quote }}
 {{- end }}

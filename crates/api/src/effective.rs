@@ -65,7 +65,7 @@ pub fn deadlines(spec: &LeaderboardSpec, track: Option<&Track>) -> Deadlines {
     Deadlines {
         pull_seconds: own.pull_seconds.unwrap_or(spec.deadlines.pull_seconds),
         start_seconds: own.start_seconds.unwrap_or(spec.deadlines.start_seconds),
-        run_seconds: own.run_seconds.unwrap_or(spec.deadlines.run_seconds),
+        run_seconds: own.run_seconds.or(spec.deadlines.run_seconds),
         ..spec.deadlines
     }
 }

@@ -35,7 +35,7 @@ pub enum LeaderboardVersion {
 #[derive(Serialize, Deserialize, JsonSchema, Clone, Copy, Debug, Default, PartialEq, Eq)]
 pub enum Verify {
     /// Nothing is recomputed.
-    Off,
+    Disabled,
     /// A difference is shown, the results count.
     #[default]
     Warn,
@@ -117,9 +117,9 @@ pub struct TrackDeadlines {
     #[serde(default, skip_serializing_if = "Option::is_none")]
     #[schemars(range(min = 1, max = 31_536_000))]
     pub start_seconds: Option<i64>,
-    /// Of a run, from its first agent; 0 is no limit.
+    /// Seconds of a run, from its first agent. A track can set another limit than the Leaderboard's, and cannot remove it.
     #[serde(default, skip_serializing_if = "Option::is_none")]
-    #[schemars(range(min = 0, max = 31_536_000))]
+    #[schemars(range(min = 1, max = 31_536_000))]
     pub run_seconds: Option<i64>,
 }
 
@@ -209,8 +209,10 @@ pub struct CheckImage {
 #[derive(Serialize, Deserialize, KubeSchema, Clone, Debug, PartialEq)]
 #[serde(rename_all = "camelCase")]
 #[x_kube(
-    validation = Rule::new("!has(self.logSizeLimit) || (quantity(self.logSizeLimit).compareTo(quantity('1Mi')) >= 0 && quantity(self.logSizeLimit).compareTo(quantity('1Ti')) <= 0)").message("agent.logSizeLimit must be 1Mi to 1Ti"),
-    validation = Rule::new("!has(self.shmSize) || (quantity(self.shmSize).compareTo(quantity('1Mi')) >= 0 && quantity(self.shmSize).compareTo(quantity('1Ti')) <= 0)").message("agent.shmSize must be 1Mi to 1Ti"),
+    validation = Rule::new("!has(self.logSizeLimit) || quantity(string(self.logSizeLimit)).compareTo(quantity('1Mi')) >= 0").message("agent.logSizeLimit must be 1Mi or more"),
+    validation = Rule::new("!has(self.logSizeLimit) || quantity(string(self.logSizeLimit)).compareTo(quantity('1Ti')) <= 0").message("agent.logSizeLimit must be 1Ti or less"),
+    validation = Rule::new("!has(self.shmSize) || quantity(string(self.shmSize)).compareTo(quantity('1Mi')) >= 0").message("agent.shmSize must be 1Mi or more"),
+    validation = Rule::new("!has(self.shmSize) || quantity(string(self.shmSize)).compareTo(quantity('1Ti')) <= 0").message("agent.shmSize must be 1Ti or less"),
     validation = Rule::new("!has(self.images) || self.images.all(p, !p.matches('[a-z0-9*}][{]team[}]|[{]team[}][a-z0-9*{]'))").message("an entry of agent.images has a letter, a digit or * next to {team}: team 7 would get the images of team 17; put -, _, . or / between"),
     validation = Rule::new("!has(self.args) || has(self.command)").message("agent.args without agent.command would be added to the default command; write the command too")
 )]
@@ -249,9 +251,9 @@ pub struct AgentContainer {
 #[serde(rename_all = "camelCase")]
 pub struct Retries {
     /// How often a pair may be started again after a crash; 0 ends the run at the first one.
-    #[serde(default = "defaults::retries_per_pair")]
+    #[serde(default = "defaults::retries_per_worker")]
     #[schemars(range(min = 0, max = 100))]
-    pub per_pair: i32,
+    pub per_worker: i32,
     /// New Jobs after infrastructure failures. After a second failure of an attempt that an agent can cause a Job follows only if the one
     /// before has finished a route.
     #[serde(default = "defaults::retries_infrastructure")]
@@ -263,8 +265,8 @@ pub struct Retries {
 #[derive(Serialize, Deserialize, KubeSchema, Clone, Copy, Debug, PartialEq, Eq)]
 #[serde(rename_all = "camelCase")]
 #[x_kube(
-    validation = Rule::new("self.runSeconds == 0 || self.idleSeconds < self.runSeconds").message("deadlines.idleSeconds must be shorter than runSeconds: it could never be reached"),
-    validation = Rule::new("self.runSeconds == 0 || self.readySeconds < self.runSeconds").message("deadlines.readySeconds must be shorter than runSeconds: the run would end before a simulator may be ready"),
+    validation = Rule::new("!has(self.runSeconds) || self.idleSeconds < self.runSeconds").message("deadlines.idleSeconds must be shorter than runSeconds: it could never be reached"),
+    validation = Rule::new("!has(self.runSeconds) || self.readySeconds < self.runSeconds").message("deadlines.readySeconds must be shorter than runSeconds: the run would end before a simulator may be ready"),
     validation = Rule::new("self.cancelSeconds <= self.flushSeconds").message("deadlines.cancelSeconds may not be longer than flushSeconds: a cancelled run would be given more time for its results than a finished one")
 )]
 #[allow(
@@ -272,10 +274,10 @@ pub struct Retries {
     reason = "the unit belongs into the name of every duration of the API"
 )]
 pub struct Deadlines {
-    /// Until a node is found; 0 waits without an end and shows why.
-    #[serde(default = "defaults::schedule_seconds")]
-    #[schemars(range(min = 0, max = 31_536_000))]
-    pub schedule_seconds: i64,
+    /// Seconds until a node is found. Absent: the Pod waits without an end, and the status shows why.
+    #[serde(default, skip_serializing_if = "Option::is_none")]
+    #[schemars(range(min = 1, max = 31_536_000))]
+    pub schedule_seconds: Option<i64>,
     /// For the pulls of all images of a Pod. While a container waits for its image, `startSeconds` does not count.
     #[serde(default = "defaults::pull_seconds")]
     #[schemars(range(min = 1, max = 31_536_000))]
@@ -292,10 +294,10 @@ pub struct Deadlines {
     #[serde(default = "defaults::idle_seconds")]
     #[schemars(range(min = 1, max = 31_536_000))]
     pub idle_seconds: i64,
-    /// Of a run, from its first agent; 0 is no limit. A stranger's agent without a limit may keep its nodes until somebody cancels it.
-    #[serde(default = "defaults::run_seconds")]
-    #[schemars(range(min = 0, max = 31_536_000))]
-    pub run_seconds: i64,
+    /// Seconds of a run, from its first agent. Absent: no limit, so an agent that does not end keeps its nodes until a person cancels it.
+    #[serde(default, skip_serializing_if = "Option::is_none")]
+    #[schemars(range(min = 1, max = 31_536_000))]
+    pub run_seconds: Option<i64>,
     /// From a cancel to the end of the Pod.
     #[serde(default = "defaults::cancel_seconds")]
     #[schemars(range(min = 1, max = 31_536_000))]
@@ -365,7 +367,7 @@ impl Default for AgentContainer {
 impl Default for Retries {
     fn default() -> Self {
         Self {
-            per_pair: defaults::retries_per_pair(),
+            per_worker: defaults::retries_per_worker(),
             infrastructure: defaults::retries_infrastructure(),
         }
     }
@@ -374,12 +376,12 @@ impl Default for Retries {
 impl Default for Deadlines {
     fn default() -> Self {
         Self {
-            schedule_seconds: defaults::schedule_seconds(),
+            schedule_seconds: None,
             pull_seconds: defaults::pull_seconds(),
             start_seconds: defaults::start_seconds(),
             ready_seconds: defaults::ready_seconds(),
             idle_seconds: defaults::idle_seconds(),
-            run_seconds: defaults::run_seconds(),
+            run_seconds: None,
             cancel_seconds: defaults::cancel_seconds(),
             flush_seconds: defaults::flush_seconds(),
             finalize_seconds: defaults::finalize_seconds(),
@@ -398,14 +400,11 @@ mod defaults {
     pub(super) fn log_size_limit() -> ByteQuantity {
         ByteQuantity::gibibytes(2)
     }
-    pub(super) fn retries_per_pair() -> i32 {
+    pub(super) fn retries_per_worker() -> i32 {
         3
     }
     pub(super) fn retries_infrastructure() -> i32 {
         2
-    }
-    pub(super) fn schedule_seconds() -> i64 {
-        0
     }
     pub(super) fn pull_seconds() -> i64 {
         5400
@@ -418,9 +417,6 @@ mod defaults {
     }
     pub(super) fn idle_seconds() -> i64 {
         800
-    }
-    pub(super) fn run_seconds() -> i64 {
-        0
     }
     pub(super) fn cancel_seconds() -> i64 {
         120

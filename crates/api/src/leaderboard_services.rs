@@ -170,7 +170,8 @@ pub struct Queue {
 #[derive(Serialize, Deserialize, KubeSchema, Clone, Debug, PartialEq, Eq)]
 #[serde(rename_all = "camelCase")]
 #[x_kube(
-    validation = Rule::new("!has(self.sizeLimit) || (quantity(self.sizeLimit).compareTo(quantity('16Mi')) >= 0 && quantity(self.sizeLimit).compareTo(quantity('1Ti')) <= 0)").message("storage.sizeLimit must be 16Mi to 1Ti"),
+    validation = Rule::new("!has(self.sizeLimit) || quantity(string(self.sizeLimit)).compareTo(quantity('16Mi')) >= 0").message("storage.sizeLimit must be 16Mi or more"),
+    validation = Rule::new("!has(self.sizeLimit) || quantity(string(self.sizeLimit)).compareTo(quantity('1Ti')) <= 0").message("storage.sizeLimit must be 1Ti or less"),
     validation = Rule::new(PLAIN_ENDPOINT).message("storage.endpoint may hold neither a query nor credentials: podIdentity and the operator's own identity sign what is asked there")
 )]
 pub struct Storage {

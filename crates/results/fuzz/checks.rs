@@ -80,7 +80,7 @@ pub fn merge(data: &[u8]) -> Seen {
         .map(|file| (!file.is_empty()).then(|| file.to_vec()))
         .collect();
     let verify = match switches >> 1 & 3 {
-        0 => Verify::Off,
+        0 => Verify::Disabled,
         1 => Verify::Refuse,
         _ => Verify::Warn,
     };

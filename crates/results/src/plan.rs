@@ -40,7 +40,7 @@ pub enum Strictness {
 #[derive(Clone, Copy, Debug, PartialEq, Eq, Hash, Serialize, Deserialize)]
 pub enum Verify {
     /// Nothing is recomputed.
-    Off,
+    Disabled,
     /// The mismatch is listed in [`Merged::warnings`](crate::Merged::warnings).
     Warn,
     /// The file is refused.
@@ -98,7 +98,7 @@ impl Plan {
             pairs: Vec::new(),
             routes: 0,
             repetitions: 1,
-            verify: Verify::Off,
+            verify: Verify::Disabled,
             as_original: false,
         }
     }

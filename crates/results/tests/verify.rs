@@ -45,7 +45,7 @@ fn said(format: Format, drive: &Drive) -> Option<String> {
         ..plan.clone()
     });
     let off = warnings(&Plan {
-        verify: Verify::Off,
+        verify: Verify::Disabled,
         ..plan.clone()
     });
     assert!(off.is_ok(), "off means off");

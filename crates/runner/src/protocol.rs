@@ -20,7 +20,7 @@ const LOGCOPY_FOLDER: &str = "logcopy";
 /// is not empty.
 pub const KEPT_CHECKPOINT: &str = "checkpoint.json";
 
-/// Rounds a pair may count. Far above any `retries.perPair`; it bounds what a reader looks up for a folder full of forgeries.
+/// Rounds a pair may count. Far above any `retries.perWorker`; it bounds what a reader looks up for a folder full of forgeries.
 pub const MAX_ROUNDS: u32 = 1000;
 
 /// The number of a simulator–agent pair: 1 to 999.

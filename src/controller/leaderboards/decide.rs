@@ -312,7 +312,7 @@ fn tracks(leaderboard: &Leaderboard) -> Vec<TrackStatus> {
 /// Tracks whose runs have no time limit, as a note.
 fn without_limit(leaderboard: &Leaderboard) -> Option<String> {
     let spec = &leaderboard.spec;
-    let has_none = |track: &&Track| effective::deadlines(spec, Some(*track)).run_seconds == 0;
+    let has_none = |track: &&Track| effective::deadlines(spec, Some(*track)).run_seconds.is_none();
     let names: Vec<&str> = spec
         .tracks
         .iter()

@@ -269,7 +269,7 @@ fn rows_that_wait_for_the_table_are_shown_while_there_are_some() {
 fn a_leaderboard_whose_runs_have_no_time_limit_shows_it() {
     let mut one = leaderboard("one", 1, 7, "https://e", "a/");
     let spec = &mut Arc::make_mut(&mut one).spec;
-    spec.deadlines.run_seconds = 0;
+    spec.deadlines.run_seconds = None;
     let plan = decide(&view(&one, &[]));
     let ready = conditions::get(&plan.status.conditions, conditions::READY).unwrap();
     assert_eq!(

@@ -18,9 +18,8 @@ pub fn condition(
         }
         Policy::Refused(why) => (Truth::False, reasons::FORBIDDEN, why.clone()),
         Policy::NotApplied(why) => (Truth::False, reasons::NOT_APPLIED, why.clone()),
-        Policy::InPlace if leaderboard.spec.network.enforcement == Enforcement::Off => {
-            let message =
-                "The NetworkPolicy is in place. Whether it is enforced is not measured: network.enforcement is Off.";
+        Policy::InPlace if leaderboard.spec.network.enforcement == Enforcement::Disabled => {
+            let message = "The NetworkPolicy is in place. Whether it is enforced is not measured: network.enforcement is Disabled.";
             (Truth::Unknown, reasons::NOT_MEASURED, message.into())
         }
         Policy::InPlace => measured.map_or_else(

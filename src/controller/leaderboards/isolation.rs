@@ -199,7 +199,7 @@ async fn apply(client: &Client, leaderboard: &Leaderboard) -> Policy {
 /// while the condition shows something else, as this process remembers it.
 pub(super) fn measured(state: &LeaderboardState, leaderboard: &Leaderboard) -> Option<WorkspaceVerdict> {
     let network = &leaderboard.spec.network;
-    if network.policy == PolicySource::External || network.enforcement == Enforcement::Off {
+    if network.policy == PolicySource::External || network.enforcement == Enforcement::Disabled {
         // The condition does not show it.
         return None;
     }

@@ -47,7 +47,7 @@ fn only_what_was_measured_is_called_enforced() {
     use WorkspaceReason::{Enforced, NotEnforced, NotIsolated, NotKnownIsolated, NotMeasured};
     let (on, off) = (
         leaderboard(&json!({}), 2),
-        leaderboard(&json!({"enforcement": "Off"}), 2),
+        leaderboard(&json!({"enforcement": "Disabled"}), 2),
     );
     let in_place = || Policy::InPlace;
     let cases = [

@@ -41,7 +41,7 @@ pub(crate) fn run() -> Run {
             earlier_attempts: 0,
             submission_uid: None,
         },
-        verify: Verify::Off,
+        verify: Verify::Disabled,
         period_seconds: 1,
         flush_seconds: 60,
         cancel_seconds: 20,

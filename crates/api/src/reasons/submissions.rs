@@ -121,15 +121,15 @@ reasons! {
     }
     Participant {
         AGENT_CRASHED = "AgentCrashed",
-            "An agent crashed more often than `retries.perPair` allows.",
+            "An agent crashed more often than `retries.perWorker` allows.",
             "Look at `agent/agent<n>/leaderboard.log` of the results; the participant fixes the agent and submits again.",
             log: "the log of agent `<n>`, `agent/agent<n>/leaderboard.log`";
         OUT_OF_MEMORY = "OutOfMemory",
-            "An agent crashed more often than `retries.perPair` allows, the last time because it ran out of memory.",
+            "An agent crashed more often than `retries.perWorker` allows, the last time because it ran out of memory.",
             "The participant reduces the agent's memory use; its limit is `agent.resources` of the Leaderboard.",
             log: "the log of agent `<n>`, `agent/agent<n>/leaderboard.log`";
         IDLE = "Idle",
-            "An agent ended early more often than `retries.perPair` allows, the last time because it printed nothing for \
+            "An agent ended early more often than `retries.perWorker` allows, the last time because it printed nothing for \
              `deadlines.idleSeconds`.",
             "Look at `agent/agent<n>/leaderboard.log` of the results; the participant fixes the agent and submits again.",
             log: "the log of agent `<n>`, `agent/agent<n>/leaderboard.log`";
@@ -183,7 +183,7 @@ reasons! {
     }
     Infrastructure {
         SIMULATION_CRASHED = "SimulationCrashed",
-            "A simulator crashed, or was not ready, more often than `retries.perPair` allows; or the results name a crash of the simulation, \
+            "A simulator crashed, or was not ready, more often than `retries.perWorker` allows; or the results name a crash of the simulation, \
              and that pair's simulator has failed in this attempt.",
             "Look at the simulator's log, then resume the submission; it repeats the route it was at.",
             log: "the log of simulator `<n>`, read from its node before the Pod ends; else `simulator/console-<n>.log`";

@@ -62,7 +62,7 @@ fn both_leaderboards_run_what_the_original_ran() {
         .zip([(LeaderboardVersion::V1, 5), (LeaderboardVersion::V2, 1)])
     {
         assert_eq!(spec.leaderboard_version, version);
-        assert_eq!(spec.deadlines.run_seconds, 0);
+        assert_eq!(spec.deadlines.run_seconds, None);
         let evalai = spec.evalai.as_ref().unwrap();
         assert_eq!((evalai.challenge, evalai.requests_per_minute), (2098, 54));
         let token = evalai.token.secrets_manager.as_ref().unwrap();

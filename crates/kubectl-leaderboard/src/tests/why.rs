@@ -53,7 +53,7 @@ fn a_participant_failure_has_its_class_and_where_the_log_is() {
 submission-42 is Failed since 2026-11-01 11:57:00 UTC (3 min ago).
 
 Track:       sensors of Leaderboard carla-20; EvalAI submission 42, phase 7
-Reason:      AgentCrashed: An agent crashed more often than retries.perPair allows.
+Reason:      AgentCrashed: An agent crashed more often than retries.perWorker allows.
 Message:     Agent 2 crashed 4 times. Look at agent/agent2/leaderboard.log of the results; the
              participant fixes the agent and submits again.
 Failure:     AgentCrashed in worker 2: participant failure, counts as an attempt.

@@ -277,7 +277,7 @@ fn records(plan: &Plan, pair: usize, values: Vec<Value>) -> Result<Vec<Record>, 
 
 fn verified(plan: &Plan, pair: usize, records: &[Record]) -> Result<Vec<String>, Refusal> {
     let mut warnings = Vec::new();
-    if plan.verify == Verify::Off {
+    if plan.verify == Verify::Disabled {
         return Ok(warnings);
     }
     for record in records {

@@ -81,10 +81,10 @@ const fn ending(id: &'static str, attack: &'static str, image: Image, expected: 
 }
 
 /// The agent crashes once, its forged start counts as another crash, and then it is an honest one.
-const TWICE: &str = r#"{"retries": {"perPair": 2}}"#;
+const TWICE: &str = r#"{"retries": {"perWorker": 2}}"#;
 
 /// Both pairs run, and each may come back once.
-const TWO_PAIRS: &str = r#"{"pairs": 2, "retries": {"perPair": 1}}"#;
+const TWO_PAIRS: &str = r#"{"pairs": 2, "retries": {"perWorker": 1}}"#;
 const NOT_ROOT: &str = r#"{"agent": {"securityContext": {"runAsNonRoot": true}}}"#;
 
 /// All of them. Those that take longest come first.

@@ -111,7 +111,7 @@ fn worker_entry(status: &mut SubmissionStatus, id: i32) -> &mut WorkerStatus {
 
 /// The failure of a pair that has crashed as often as it may, or cannot start at all. It waits until the cause is settled.
 pub(super) fn too_many(draft: &mut PlanBuilder<'_>) -> Option<Failure> {
-    let limit = draft.retries().per_pair.saturating_add(1);
+    let limit = draft.retries().per_worker.saturating_add(1);
     let is_too_many = |worker: &&WorkerStatus| {
         worker.crashes >= limit || (worker.crashes > 0 && cause(worker).is_some_and(is_hopeless))
     };

@@ -150,7 +150,7 @@ fn of_job(draft: &PlanBuilder<'_>, end: &JobEnd) -> Failure {
     match end {
         JobEnd::Complete { .. } => failure::results_not_stored(),
         // Without a limit on the run the deadline is not ours.
-        JobEnd::Failed { reason, .. } if reason == "DeadlineExceeded" && draft.deadlines().run_seconds > 0 => {
+        JobEnd::Failed { reason, .. } if reason == "DeadlineExceeded" && draft.deadlines().run_seconds.is_some() => {
             failure::charged(
                 reasons::TIME_LIMIT,
                 "The Pod reached its time limit; finished routes are kept.",

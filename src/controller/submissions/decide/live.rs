@@ -285,10 +285,9 @@ fn watch_run(draft: &mut PlanBuilder<'_>) {
     let Some(ran) = clock::run_seconds(draft).filter(|_| draft.leaderboard().is_some()) else {
         return;
     };
-    let limit = draft.deadlines().run_seconds;
-    if limit == 0 {
+    let Some(limit) = draft.deadlines().run_seconds else {
         return;
-    }
+    };
     if ran >= limit {
         draft.fail(failure::time_limit(limit));
     } else if clock::goes_on(draft) {

@@ -101,7 +101,7 @@ impl<'a> PlanBuilder<'a> {
             return self.leaderboard().map(|l| l.retries).unwrap_or_default();
         }
         Retries {
-            per_pair: 0,
+            per_worker: 0,
             infrastructure: 0,
         }
     }

@@ -291,22 +291,22 @@ fn unschedulable(draft: &mut PlanBuilder<'_>, job: &JobView, words: &str, scale_
 
 /// Whether no node has had the Pod for as long as `scheduleSeconds` allows: then the attempt fails.
 fn is_late(draft: &mut PlanBuilder<'_>, job: &JobView, reason: &str, message: &str) -> bool {
+    let Some(limit) = draft.deadlines().schedule_seconds else {
+        return false;
+    };
     let had_pod = draft.status.times.scheduled.is_some();
     let since = if had_pod {
         draft.blocked_since(reason)
     } else {
         job.created
     };
-    let limit = draft.deadlines().schedule_seconds;
-    if limit > 0 {
-        let deadline = after(since.unwrap_or(draft.now()), limit);
-        if draft.now() >= deadline {
-            let what = format!("No node accepted the Pod within {limit} s: {message}");
-            draft.fail(infrastructure(reasons::SCHEDULE_DEADLINE, &what));
-            return true;
-        }
-        draft.requeue_at(deadline);
+    let deadline = after(since.unwrap_or(draft.now()), limit);
+    if draft.now() >= deadline {
+        let what = format!("No node accepted the Pod within {limit} s: {message}");
+        draft.fail(infrastructure(reasons::SCHEDULE_DEADLINE, &what));
+        return true;
     }
+    draft.requeue_at(deadline);
     false
 }
 

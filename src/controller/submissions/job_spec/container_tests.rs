@@ -361,7 +361,7 @@ fn the_pod_gets_what_to_measure_and_the_next_one_what_was_found() {
         ),
         json!({"enforcement": "Require", "probe": "192.0.2.1:80", "egress": ["10.0.0.0/8"], "isKnownOpen": false})
     );
-    for unmeasured in [json!({"enforcement": "Off"}), json!({"policy": "External"})] {
+    for unmeasured in [json!({"enforcement": "Disabled"}), json!({"policy": "External"})] {
         assert_eq!(asked(unmeasured, None), Value::Null);
     }
     // It is 12:00.

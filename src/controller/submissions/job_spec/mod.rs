@@ -175,7 +175,7 @@ fn run_document(input: &JobInput<'_>) -> Run {
 /// How the Pod measures whether its policy is enforced. What policies of the cluster's own forbid is not known.
 fn isolation(leaderboard: &Leaderboard, now: Timestamp) -> Option<Isolation> {
     let network = &leaderboard.spec.network;
-    if network.policy == PolicySource::External || network.enforcement == Enforcement::Off {
+    if network.policy == PolicySource::External || network.enforcement == Enforcement::Disabled {
         return None;
     }
     let is_open = leaderboard.condition(conditions::ISOLATED).is_some_and(|found| {
@@ -237,20 +237,17 @@ fn backoff_limit(input: &JobInput<'_>) -> i32 {
     let pairs = i32::try_from(input.pairs()).unwrap_or(i32::MAX);
     pairs
         .saturating_mul(2)
-        .saturating_mul(input.spec().retries.per_pair.saturating_add(1))
+        .saturating_mul(input.spec().retries.per_worker.saturating_add(1))
         .saturating_add(SPARE_RESTARTS)
 }
 
 /// The net for an absent controller; none without a limit on the run. It belongs to the Pod and not to the Job, whose own
 /// would count the wait for a node.
 fn active_deadline(deadlines: &Deadlines) -> Option<i64> {
-    if deadlines.run_seconds == 0 {
-        return None;
-    }
     let seconds = [
         deadlines.pull_seconds,
         deadlines.start_seconds,
-        deadlines.run_seconds,
+        deadlines.run_seconds?,
         deadlines.cancel_seconds,
         deadlines.flush_seconds,
     ]

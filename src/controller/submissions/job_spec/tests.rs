@@ -225,12 +225,12 @@ fn the_nets_are_wider_than_the_rules_above_them() {
     let cases = [
         (json!({}), 52, None),
         (
-            json!({"pairs": 1, "retries": {"perPair": 0}, "deadlines": {"runSeconds": 7200}}),
+            json!({"pairs": 1, "retries": {"perWorker": 0}, "deadlines": {"runSeconds": 7200}}),
             22,
             Some(5400 + 1800 + 7200 + 120 + 1800 + 1800),
         ),
         (
-            json!({"pairs": 16, "retries": {"perPair": 100}, "deadlines": {"runSeconds": i64::MAX}}),
+            json!({"pairs": 16, "retries": {"perWorker": 100}, "deadlines": {"runSeconds": i64::MAX}}),
             3252,
             Some(i32::MAX.into()),
         ),

@@ -47,7 +47,7 @@ fn pulling_pod(second: i64) -> PodView {
 /// A run that may take `LIMIT` seconds.
 fn limited() -> World {
     let mut world = World::local().running();
-    world.leaderboard().deadlines.run_seconds = LIMIT;
+    world.leaderboard().deadlines.run_seconds = Some(LIMIT);
     world
 }
 
@@ -163,7 +163,7 @@ fn the_preparation_of_a_pod_that_takes_anothers_place_costs_no_time() {
         assert_eq!((status.ran_seconds, status.times.agent_started), (GONE - 10, None));
     }
     let mut used_up = world.clone();
-    used_up.leaderboard().deadlines.run_seconds = GONE - 10;
+    used_up.leaderboard().deadlines.run_seconds = Some(GONE - 10);
     used_up.pass_to(Running, reasons::STOPPING);
 
     gets_agents(&mut world, GONE + PULLS);

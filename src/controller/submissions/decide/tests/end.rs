@@ -278,7 +278,7 @@ fn an_agent_that_ends_by_itself_with_a_refused_checkpoint_gets_what_is_wrong_wit
         ("exited", None, reasons::AGENT_CRASHED),
     ] {
         let mut world = World::local().running();
-        world.leaderboard().retries.per_pair = 0;
+        world.leaderboard().retries.per_worker = 0;
         world.see(ended("agent-1", 0, word, 1, 20));
         world.pass_to(Running, reasons::STOPPING);
         world.complete();
@@ -327,7 +327,7 @@ fn a_failed_job_is_blamed_on_its_worst_pair_or_on_nobody() {
     fail(&mut late, "DeadlineExceeded");
     late.pass_to(Failed, reasons::TIME_LIMIT);
     // The Pod's deadline was not ours: what its pair reported counts.
-    unlimited.leaderboard().deadlines.run_seconds = 0;
+    unlimited.leaderboard().deadlines.run_seconds = None;
     fail(&mut unlimited, "DeadlineExceeded");
     unlimited.pass_to(Failed, reasons::IDLE);
 }

@@ -67,7 +67,7 @@ fn of_a_sandbox_that_is_made_anew_one_side_may_be_seen_first() {
 #[test]
 fn a_simulator_that_is_kept_away_for_want_of_processes_ends_the_run_at_the_agents_cost() {
     let mut world = World::local().running();
-    world.leaderboard().retries.per_pair = 1;
+    world.leaderboard().retries.per_worker = 1;
     world.see(ended("agent-2", 0, "exited", 1, 100));
     world.pass_to(Running, reasons::RUNNING);
     world.see_alone(running("agent-2"));

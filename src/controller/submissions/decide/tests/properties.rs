@@ -37,7 +37,7 @@ enum Change {
     Leaderboard {
         present: bool,
         infrastructure: i32,
-        schedule_seconds: i64,
+        schedule_seconds: Option<i64>,
     },
     Cancel,
     Resume,
@@ -304,7 +304,7 @@ fn change() -> impl Strategy<Value = Change> {
         ObservedNode::Silent { since: at(60_000) },
         ObservedNode::Gone,
     ];
-    let leaderboard = (prop::bool::weighted(0.8), 0..3, select(vec![0i64, 0, 300]));
+    let leaderboard = (prop::bool::weighted(0.8), 0..3, select(vec![None, None, Some(300_i64)]));
     prop_oneof![
         6 => select(vec![1i64, 20, 130, 2000, 90_000, -500, -200_000]).prop_map(Change::Time),
         8 => job().prop_map(Change::Job),

@@ -144,7 +144,7 @@ fn the_run_deadline_counts_from_the_first_agent_to_the_second() {
 #[test]
 fn a_run_without_a_limit_goes_on_and_a_track_has_its_own() {
     let mut world = World::local().running();
-    world.leaderboard().deadlines.run_seconds = 0;
+    world.leaderboard().deadlines.run_seconds = None;
     world.go_to(400 * 86_400);
     world.pass_to(Running, reasons::RUNNING);
     world.leaderboard().tracks[0].deadlines = Some(leaderboard_api::TrackDeadlines {
@@ -157,9 +157,9 @@ fn a_run_without_a_limit_goes_on_and_a_track_has_its_own() {
 
 #[test]
 fn a_pair_is_started_again_as_often_as_the_leaderboard_allows() {
-    for (per_pair, crashes, fails) in [(0, 1, true), (1, 1, false), (1, 2, true), (3, 3, false), (3, 4, true)] {
+    for (per_worker, crashes, fails) in [(0, 1, true), (1, 1, false), (1, 2, true), (3, 3, false), (3, 4, true)] {
         let mut world = World::local().running();
-        world.leaderboard().retries.per_pair = per_pair;
+        world.leaderboard().retries.per_worker = per_worker;
         world.see(ended("agent-1", crashes - 1, "exited", 1, 100));
         let (state, reason) = if fails {
             (Running, reasons::STOPPING)
@@ -173,7 +173,7 @@ fn a_pair_is_started_again_as_often_as_the_leaderboard_allows() {
 #[test]
 fn a_run_that_outlives_its_leaderboard_meets_no_deadline_of_ours() {
     let mut world = World::local().running();
-    world.leaderboard().deadlines.run_seconds = 200_000;
+    world.leaderboard().deadlines.run_seconds = Some(200_000);
     let leaderboard = world.view.leaderboard.take();
     world.go_to(150_000);
     world.pass_to(Running, reasons::RUNNING);
@@ -229,7 +229,7 @@ fn a_lost_pod_is_replaced_and_the_state_stays() {
 #[test]
 fn a_replacing_pod_has_its_own_time_to_be_scheduled() {
     let mut world = World::local().running();
-    world.leaderboard().deadlines.schedule_seconds = 600;
+    world.leaderboard().deadlines.schedule_seconds = Some(600);
     world.go_to(5000);
     let mut second = pod(0);
     second.scheduled = None;
@@ -268,24 +268,24 @@ fn crashes_of_an_earlier_pod_are_not_counted_twice() {
 #[test]
 fn deadlines_and_retries_are_the_leaderboards_of_this_moment() {
     let mut world = World::local().running();
-    world.leaderboard().deadlines.run_seconds = 1000;
+    world.leaderboard().deadlines.run_seconds = Some(1000);
     world.go_to(1009);
-    world.leaderboard().deadlines.run_seconds = 5000;
+    world.leaderboard().deadlines.run_seconds = Some(5000);
     world.go_to(1010);
     world.pass_to(Running, reasons::RUNNING);
-    world.leaderboard().deadlines.run_seconds = 1100;
+    world.leaderboard().deadlines.run_seconds = Some(1100);
     world.go_to(1110);
     let failure = world.pass_to(Running, reasons::STOPPING).status.failure.unwrap();
     assert_eq!(failure.reason, reasons::TIME_LIMIT);
     // What was recorded stands.
-    world.leaderboard().deadlines.run_seconds = 90_000;
+    world.leaderboard().deadlines.run_seconds = Some(90_000);
     world.pass_to(Running, reasons::STOPPING);
 
     let mut world = World::local().running();
     world.see(ended("agent-1", 3, "exited", 1, 100));
-    world.leaderboard().retries.per_pair = 8;
+    world.leaderboard().retries.per_worker = 8;
     world.pass_to(Running, reasons::RUNNING);
-    world.leaderboard().retries.per_pair = 3;
+    world.leaderboard().retries.per_worker = 3;
     world.pass_to(Running, reasons::STOPPING);
 }
 

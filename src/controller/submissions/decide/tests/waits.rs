@@ -35,7 +35,7 @@ fn without_a_node_it_waits_without_a_limit_and_shows_why() {
     world.go_to(1_000_000);
     world.pass_to(Pending, reasons::UNSCHEDULABLE);
 
-    world.leaderboard().deadlines.schedule_seconds = 1_000_001;
+    world.leaderboard().deadlines.schedule_seconds = Some(1_000_001);
     world.pass_to(Pending, reasons::UNSCHEDULABLE);
     world.go_to(1_000_001);
     world.pass_to(Pending, reasons::STOPPING);
@@ -217,7 +217,7 @@ fn what_waits_is_looked_at_again_by_the_clock_or_when_it_is_woken() {
             deadlines.schedule_seconds,
             deadlines.pull_seconds,
             deadlines.start_seconds,
-        ) = (0, 10_000, 10_000);
+        ) = (None, 10_000, 10_000);
         sees(&mut world);
         world.go_to(second);
         assert_eq!(whole(world.pass().requeue), Some(expected), "{what}");
