@@ -11,7 +11,7 @@ use axum::extract::{Request, State};
 use axum::http::{Method, StatusCode, header};
 use axum::response::{IntoResponse, Response};
 use leaderboard_api::{Attempt, Metric, WorkerState};
-use leaderboard_operator::pod::report::{REPORT_KEY, Report, ReportWorker, SCHEMA, StoredFile};
+use leaderboard_contract::report::{REPORT_KEY, Report, ReportWorker, SCHEMA, StoredFile};
 use tokio::net::TcpListener;
 use tokio::task::JoinHandle;
 

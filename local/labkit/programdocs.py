@@ -11,7 +11,7 @@ PAGE = Path("docs/reference/programs.md")
 END = "<!-- end -->"
 OPERATOR = "src/cli"
 RUNNER = "crates/runner/src"
-PROTOCOL = f"{RUNNER}/protocol.rs"
+PROTOCOL = "crates/protocol/src/files.rs"
 # The pages of its help, which the plugin's own tests compare with the program.
 PLUGIN = "crates/kubectl-leaderboard/src/tests/shown/help.txt"
 TEXT = r"((?: *///[^\n]*\n)+)"

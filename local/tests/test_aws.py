@@ -176,7 +176,7 @@ class Policies(unittest.TestCase):
             self.assertNotIn('"*"', [a for a, _ in awscalls.actions(file)])
 
     def test_the_controller_writes_two_objects_of_a_run(self) -> None:
-        keys = "".join((REPOSITORY / name).read_text() for name in ("src/pod/report.rs", "crates/api/src/names.rs"))
+        keys = "".join((REPOSITORY / name).read_text() for name in ("crates/contract/src/report.rs", "crates/api/src/names.rs"))
         wanted = set(re.findall(r'(?:OWNER_KEY|FAILURE_LOG_KEY): &str = "(.+)"', keys))
         self.assertEqual(len(wanted), 2)
         put = [

@@ -24,12 +24,12 @@ use crate::observability::{Observability, REVISION};
 use crate::page::Page;
 use crate::pod::judge::Pace;
 use crate::pod::places::{Places, Setting};
-use crate::pod::run::ENV_CHECKSUMS;
 use crate::pod::{logcopy as logcopy_program, ownlog, workspace as workspace_program};
 use crate::services::aws::Aws;
 use leaderboard_api::client_errors;
 use leaderboard_api::names::OPERATOR;
 use leaderboard_base::shutdown::on_signals;
+use leaderboard_contract::run::ENV_CHECKSUMS;
 
 /// What the exit code of controller and bridge means.
 pub(super) const EXIT_CODES: &str = "Exit code 0: it was stopped. 1: an error, which is the last line of its log. 2: arguments or \
@@ -54,7 +54,10 @@ pub(super) fn bridge(options: Server) -> ExitCode {
 }
 
 pub(super) fn workspace(options: &InPod) -> ExitCode {
-    ownlog::start(&Places::below(&options.root).logs, crate::pod::keys::WORKSPACE_LOG);
+    ownlog::start(
+        &Places::below(&options.root).logs,
+        leaderboard_contract::keys::WORKSPACE_LOG,
+    );
     start_logged("workspace", THREADS_IN_POD, || async {
         let setting = setting(options)?;
         workspace_program::main(setting).await.map_err(|e| e.to_string())
@@ -63,7 +66,7 @@ pub(super) fn workspace(options: &InPod) -> ExitCode {
 
 pub(super) fn logcopy(options: &InPod) -> ExitCode {
     // Its log is one of the results as well.
-    ownlog::start(&Places::below(&options.root).logs, crate::pod::keys::OWN_LOG);
+    ownlog::start(&Places::below(&options.root).logs, leaderboard_contract::keys::OWN_LOG);
     start_logged("logcopy", THREADS_IN_POD, || async {
         let setting = setting(options)?;
         let stop = on_signals().map_err(|e| e.to_string())?;

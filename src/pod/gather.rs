@@ -11,15 +11,15 @@ use std::sync::Arc;
 use bytes::Bytes;
 use sha2::{Digest, Sha256};
 
-use super::keys::{EVALAI, MERGED, checkpoint_path};
 use super::measures;
-use super::report::{ReportWorker, StoredFile};
-use super::run::{Run, STATUS_FOLDER};
-use super::tree::{Stamp, Tree, TreeError};
 use crate::pod::carla::results_format;
 use leaderboard_api::{Metric, Verify, WorkerState};
+use leaderboard_contract::keys::{EVALAI, MERGED, checkpoint_path};
+use leaderboard_contract::report::{ReportWorker, StoredFile};
+use leaderboard_contract::run::{Run, STATUS_FOLDER};
+use leaderboard_evidence::{Stamp, Tree, TreeError};
+use leaderboard_protocol::files::{KEPT_CHECKPOINT, Pair, Progress};
 use leaderboard_results::{Checkpoint, Files, Merged, Plan, Refusal, Slice, Strictness, read_worker};
-use leaderboard_runner::protocol::{KEPT_CHECKPOINT, Pair, Progress};
 
 /// The merged file under EvalAI's name.
 const METADATA: &str = "evalai/metadata.json";

@@ -10,9 +10,9 @@ use aws_credential_types::Credentials;
 use aws_credential_types::provider::{ProvideCredentials, SharedCredentialsProvider, error::CredentialsError, future};
 
 use super::places::Setting;
-use super::run::Run;
 use crate::services::aws::Aws;
 use leaderboard_api::effective::key_prefix;
+use leaderboard_contract::run::Run;
 
 /// The way to AWS for a program of this Pod.
 pub async fn aws(setting: &Setting, program: &str) -> Aws {

@@ -15,8 +15,8 @@ use std::time::Duration;
 use tokio::net::TcpStream;
 use tokio::time::{Instant, sleep, timeout};
 
-use super::run::Isolation;
 use leaderboard_api::ranges;
+use leaderboard_contract::run::Isolation;
 
 /// Time that one connection may take.
 const TRY: Duration = Duration::from_secs(1);

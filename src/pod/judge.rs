@@ -6,7 +6,7 @@
 use std::time::Duration;
 
 use super::gather::Gathered;
-use super::run::Stop;
+use leaderboard_contract::run::Stop;
 
 /// How a run ended.
 #[derive(Clone, Debug, PartialEq, Eq)]

@@ -2,16 +2,16 @@
 
 use std::sync::Arc;
 
-use leaderboard_runner::protocol::{Mark, Side};
+use leaderboard_protocol::files::{Mark, Side};
 use nix::errno::Errno;
 
 use super::tests::seen_on_a_volume::{Volume, text};
 use super::*;
 use crate::pod::fixtures::{checkpoint, put_checkpoint, put_status, run};
 use crate::pod::gather::Gatherer;
-use crate::pod::keys::MERGED;
-use crate::pod::tree::Tree;
 use leaderboard_api::RouteSlice;
+use leaderboard_contract::keys::MERGED;
+use leaderboard_evidence::Tree;
 
 /// The file as a real evaluator of V2 writes it when it is started once more on it.
 fn started_once_more(text: &str) -> String {

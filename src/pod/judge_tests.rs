@@ -123,14 +123,14 @@ pub(super) mod seen_on_a_volume {
     use std::fs;
     use std::sync::Arc;
 
-    use leaderboard_runner::protocol::{Mark, Pair, Side};
+    use leaderboard_protocol::files::{Mark, Pair, Side};
 
     use super::super::*;
     use crate::pod::fixtures::{checkpoint, put_checkpoint, put_status, run};
     use crate::pod::gather::{Gatherer, results_plan};
-    use crate::pod::keys::{EVALAI, MERGED, checkpoint_path};
-    use crate::pod::tree::Tree;
     use leaderboard_api::{RouteSlice, WorkerState};
+    use leaderboard_contract::keys::{EVALAI, MERGED, checkpoint_path};
+    use leaderboard_evidence::Tree;
 
     pub(crate) struct Volume {
         pub(crate) folder: tempfile::TempDir,

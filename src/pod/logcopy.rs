@@ -19,10 +19,7 @@ use super::blocking;
 use super::gather::{Gatherer, Refused};
 use super::identity;
 use super::places::{Places, Setting};
-use super::report::Logs;
-use super::run::Stop;
 use super::ship::{STREAM_A_DAY, Shipper};
-use super::tree::{Tree, TreeError};
 use super::upload::quota::Quota;
 use super::upload::send::Uploader;
 use super::watch::Watch;
@@ -31,7 +28,10 @@ use crate::services::aws::Aws;
 use crate::services::logs::LogClient;
 use leaderboard_base::shutdown;
 use leaderboard_base::tasks::{TaskFailed, Tasks};
-use leaderboard_runner::protocol::StatusFile;
+use leaderboard_contract::report::Logs;
+use leaderboard_contract::run::Stop;
+use leaderboard_evidence::{Tree, TreeError};
+use leaderboard_protocol::files::StatusFile;
 use round::{News, Rounds, Why};
 
 /// Longest last flush after SIGTERM; the Pod's grace is 600 s and the containers had their part of it.

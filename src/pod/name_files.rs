@@ -10,7 +10,7 @@ use std::os::unix::fs::PermissionsExt;
 use std::path::{Path, PathBuf};
 
 use super::places::Places;
-use super::run::NAME_FILES;
+use leaderboard_contract::run::NAME_FILES;
 
 /// Copies all of them, also when they are there already: a Pod whose node was restarted has another address.
 pub(super) fn copy(places: &Places) -> Result<(), (PathBuf, io::Error)> {

@@ -5,12 +5,12 @@
 use std::net::{IpAddr, SocketAddr};
 use std::path::{Path, PathBuf};
 
-use super::run::{
+use crate::pod::judge::Pace;
+use leaderboard_contract::run::{
     ENV_POD_UID, ENV_ROLE_ARN, ENV_RUN, IDENTITY, IDENTITY_TOKEN_FILE, LOGS, PODINFO, RUNNER, RUNNER_IN_IMAGE, Run,
     SCHEMA, STATUS_FOLDER, STOP_FILE, TOOLS,
 };
-use super::schema::is_read;
-use crate::pod::judge::Pace;
+use leaderboard_contract::schema::is_read;
 
 /// Files and folders.
 #[derive(Clone, Debug, PartialEq, Eq)]

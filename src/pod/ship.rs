@@ -13,16 +13,16 @@ use tokio::sync::watch;
 
 use super::blocking;
 use super::daily::{Daily, Spent, today};
-use super::keys::agent_log;
-use super::report::Logs;
-use super::run::console;
-use super::tree::{Tree, TreeError};
 use super::upload::Memory;
-use crate::pod::keys::{CONTENTS_LOG, OWN_LOG, WORKSPACE_LOG};
 use crate::services::logs::{BETWEEN_BATCHES, LogClient, LogEvent, LogsError, Miss, OVERHEAD, cut};
 use leaderboard_api::RunId;
 use leaderboard_base::backoff::Backoff;
-use leaderboard_runner::protocol::Pair;
+use leaderboard_contract::keys::agent_log;
+use leaderboard_contract::keys::{CONTENTS_LOG, OWN_LOG, WORKSPACE_LOG};
+use leaderboard_contract::report::Logs;
+use leaderboard_contract::run::console;
+use leaderboard_evidence::{Tree, TreeError};
+use leaderboard_protocol::files::Pair;
 
 /// Bytes read of one file at once.
 const CHUNK: u64 = 256 << 10;

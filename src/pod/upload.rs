@@ -20,8 +20,8 @@ use serde::{Deserialize, Serialize};
 use sha2::{Digest, Sha256};
 
 use super::daily::Daily;
-use super::tree::{Stamp, Tree, TreeError};
 use crate::services::archive::MIN_PART;
+use leaderboard_evidence::{Stamp, Tree, TreeError};
 
 /// A changed file that is not otherwise due is stored this long after the last time.
 const AT_LEAST_EVERY: Duration = Duration::from_mins(1);

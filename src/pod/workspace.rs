@@ -20,13 +20,13 @@ use super::isolation::{self, Finding};
 use super::logcopy::describe::describe;
 use super::name_files;
 use super::places::{Places, Setting};
-use super::report::{MAX_BYTES, OWNER_KEY, Owner, REPORT_KEY, Report};
-use super::run::{Run, STATUS_FOLDER};
-use super::tree::{Tree, TreeError};
-use super::verdict::{WorkspaceReason, WorkspaceVerdict};
 use crate::services::archive::{Archive, ArchiveError};
 use leaderboard_api::names::FAILURE_LOG_KEY;
 use leaderboard_api::{Attempt, Enforcement};
+use leaderboard_contract::report::{MAX_BYTES, OWNER_KEY, Owner, REPORT_KEY, Report};
+use leaderboard_contract::run::{Run, STATUS_FOLDER};
+use leaderboard_contract::verdict::{WorkspaceReason, WorkspaceVerdict};
+use leaderboard_evidence::{Tree, TreeError};
 
 /// Folders that no mount makes. The others are the kubelet's.
 const FOLDERS: [&str; 4] = ["agent", STATUS_FOLDER, "logcopy", "contents"];
@@ -269,7 +269,7 @@ mod tests {
     use super::*;
     use crate::pod::fixtures;
     use crate::pod::isolation::Blocked;
-    use crate::pod::verdict::{NotAVerdict, VERDICT_BYTES};
+    use leaderboard_contract::verdict::{NotAVerdict, VERDICT_BYTES};
 
     fn first() -> Report {
         let (run, folder) = (fixtures::run(), tempfile::tempdir().unwrap());

@@ -29,7 +29,7 @@ use leaderboard_base::meter::Meter;
 use leaderboard_base::shutdown::Stop;
 use leaderboard_base::spans::LogSpan;
 use leaderboard_base::tasks::Tasks;
-use leaderboard_operator::pod::report::ContentId;
+use leaderboard_contract::report::ContentId;
 use leaderboard_operator::services::evalai::{
     Changed, DesiredUpdate, Ended, Hub, ImageAnswer, Key, Misfit, Options, Outcome, Outline, Patience, Payload,
     Progress, Publisher, Run, Status, StoredResult, Subject, SubmissionState, SweepRow, Target, Timeouts, Timing,

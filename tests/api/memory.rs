@@ -7,7 +7,7 @@ use futures::StreamExt;
 use kube::ResourceExt;
 use kube::api::{Patch, PatchParams};
 use leaderboard_api::{Submission, SubmissionStatus, conditions};
-use leaderboard_operator::pod::report::{REPORT_KEY, Report, StoredFile};
+use leaderboard_contract::report::{REPORT_KEY, Report, StoredFile};
 use serde_json::json;
 use sha2::{Digest, Sha256};
 

@@ -29,7 +29,7 @@ use leaderboard_operator::observability::Observability;
 use leaderboard_operator::page::Page;
 use leaderboard_operator::pod::workspace::WorkspaceError;
 use leaderboard_operator::services::archive::Archive;
-use leaderboard_runner::verdict::{Verdict, What};
+use leaderboard_protocol::verdict::{Verdict, What};
 use serde_json::{Map, Value, json};
 use tokio::net::TcpListener;
 use tokio::time::timeout;

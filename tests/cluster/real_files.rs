@@ -4,7 +4,7 @@
 use std::time::Duration;
 
 use leaderboard_api::{State, Submission};
-use leaderboard_operator::pod::report::{REPORT_KEY, Report};
+use leaderboard_contract::report::{REPORT_KEY, Report};
 use serde_json::{Value, json};
 
 use super::matrix::Case;

@@ -4,7 +4,7 @@ use std::time::Duration;
 
 use fastrand::Rng;
 use leaderboard_api::LeaderboardVersion;
-use leaderboard_runner::protocol::{Mark, Side, StatusFile};
+use leaderboard_protocol::files::{Mark, Side, StatusFile};
 
 use super::kubelet::{Kubelet, Name, members};
 use super::results::{report, results};

@@ -10,7 +10,7 @@ use futures::future::{self, BoxFuture};
 use leaderboard_api::LeaderboardVersion;
 use leaderboard_operator::pod::watch::Watch;
 use leaderboard_operator::services::archive::Archive;
-use leaderboard_runner::protocol::{KEPT_CHECKPOINT, Member, Pair, Side, StatusFile};
+use leaderboard_protocol::files::{KEPT_CHECKPOINT, Member, Pair, Side, StatusFile};
 
 use super::kubelet::{Kubelet, Name, all_done, members};
 use super::process::say;

@@ -7,7 +7,7 @@ use std::path::{Path, PathBuf};
 use std::process::{ExitStatus, Stdio};
 
 use leaderboard_operator::pod::places::Places;
-use leaderboard_runner::protocol::{Mark, Member, Pair, Side, StatusFile};
+use leaderboard_protocol::files::{Mark, Member, Pair, Side, StatusFile};
 use nix::sys::signal::{Signal, kill};
 use nix::unistd::Pid;
 use tokio::sync::mpsc;

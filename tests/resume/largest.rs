@@ -8,9 +8,9 @@ use std::time::Duration;
 
 use fastrand::Rng;
 use leaderboard_api::{LeaderboardVersion, RouteSlice};
+use leaderboard_contract::report::Report;
+use leaderboard_contract::run::STATUS_FOLDER;
 use leaderboard_operator::pod::gather::results_plan;
-use leaderboard_operator::pod::report::Report;
-use leaderboard_operator::pod::run::STATUS_FOLDER;
 use serde_json::json;
 use tokio::time::timeout;
 

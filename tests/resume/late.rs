@@ -5,7 +5,7 @@ use std::time::Duration;
 
 use fastrand::Rng;
 use leaderboard_api::LeaderboardVersion;
-use leaderboard_operator::pod::report::REPORT_KEY;
+use leaderboard_contract::report::REPORT_KEY;
 use tokio::io::{AsyncReadExt, AsyncWriteExt, copy};
 use tokio::net::{TcpListener, TcpStream};
 use tokio::sync::watch;

@@ -12,7 +12,7 @@ use axum::response::{IntoResponse, Response};
 use fastrand::Rng;
 use futures::StreamExt;
 use leaderboard_api::LeaderboardVersion;
-use leaderboard_operator::pod::report::Owner;
+use leaderboard_contract::report::Owner;
 use tokio::sync::watch;
 use tokio::task::JoinHandle;
 use tokio::time::timeout;

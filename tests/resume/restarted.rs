@@ -11,9 +11,9 @@ use super::singles::{rounds_past, until_reported};
 use super::submission::{FASTER, PAIRS, ROUTES_OF_PAIR, Submission};
 use crate::ministack::server;
 use leaderboard_api::LeaderboardVersion;
+use leaderboard_contract::report::Report;
 use leaderboard_operator::pod::judge::Pace;
-use leaderboard_operator::pod::report::Report;
-use leaderboard_runner::protocol::{Mark, Side, StatusFile};
+use leaderboard_protocol::files::{Mark, Side, StatusFile};
 
 const LIMIT: Duration = Duration::from_mins(1);
 const ROUTES: u32 = 20;

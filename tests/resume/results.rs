@@ -2,7 +2,7 @@
 
 use std::collections::BTreeMap;
 
-use leaderboard_operator::pod::report::{MAX_BYTES, REPORT_KEY, Report};
+use leaderboard_contract::report::{MAX_BYTES, REPORT_KEY, Report};
 use leaderboard_operator::services::archive::Archive;
 use serde_json::Value;
 

@@ -11,7 +11,7 @@ use super::submission::{FASTER, Submission};
 use crate::ministack::{Proxy, server};
 use leaderboard_api::LeaderboardVersion;
 use leaderboard_operator::pod::judge::Pace;
-use leaderboard_runner::protocol::{Mark, Side, StatusFile};
+use leaderboard_protocol::files::{Mark, Side, StatusFile};
 
 const LIMIT: Duration = Duration::from_mins(1);
 

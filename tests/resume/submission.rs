@@ -7,10 +7,10 @@ use std::sync::OnceLock;
 use std::sync::atomic::{AtomicU32, Ordering};
 
 use leaderboard_api::{Attempt, ByteQuantity, LeaderboardVersion, RunPlan, Storage, Verify};
+use leaderboard_contract::run::{ENV_POD_UID, ENV_RUN, Run, SCHEMA};
 use leaderboard_operator::pod::places::Places;
-use leaderboard_operator::pod::run::{ENV_POD_UID, ENV_RUN, Run, SCHEMA};
 use leaderboard_operator::services::archive::Archive;
-use leaderboard_runner::protocol::{KEPT_CHECKPOINT, Member, Side};
+use leaderboard_protocol::files::{KEPT_CHECKPOINT, Member, Side};
 use tokio::process::Command;
 
 use crate::ministack::{self, server};

@@ -9,8 +9,8 @@ use std::time::Duration;
 
 use fastrand::Rng;
 use leaderboard_api::LeaderboardVersion;
-use leaderboard_operator::pod::run::Stop;
-use leaderboard_runner::protocol::{Mark, Member, Side, StatusFile};
+use leaderboard_contract::run::Stop;
+use leaderboard_protocol::files::{Mark, Member, Side, StatusFile};
 
 use super::kubelet::{Kubelet, Name, all_done, members};
 use super::process::say;

@@ -18,7 +18,7 @@ use kube::runtime::wait::await_condition;
 use kube::runtime::{WatchStreamExt, watcher};
 use kube::{Client, Resource, ResourceExt};
 use leaderboard_api::names;
-use leaderboard_operator::pod::run::Stop;
+use leaderboard_contract::run::Stop;
 use serde::de::DeserializeOwned;
 use serde_json::{Value, json};
 use tokio::sync::{oneshot, watch};

@@ -8,8 +8,8 @@ use std::time::Duration;
 
 use thiserror::Error;
 
-use crate::needs::Needs;
-use crate::protocol::{Member, Pair, Side};
+use leaderboard_protocol::files::{Member, Pair, Side};
+use leaderboard_protocol::graphics::Needs;
 
 pub const USAGE: &str = "\
 usage: leaderboard-runner simulator --pair N --status DIR --port P [options] -- CMD ARGS...

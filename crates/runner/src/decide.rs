@@ -7,8 +7,8 @@
 //! its peer has crashed in steps over it (its own crash file, no exit); one that has started is brought down. So
 //! the two counts meet again however far apart the containers restart.
 
-use leaderboard_runner::protocol::Side;
-use leaderboard_runner::verdict::{CODE_NO_PROCESS, CODE_NODE_REFUSED};
+use leaderboard_protocol::files::Side;
+use leaderboard_protocol::verdict::{CODE_NO_PROCESS, CODE_NODE_REFUSED};
 
 /// How far this container has come.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]

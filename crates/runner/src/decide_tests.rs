@@ -1,6 +1,6 @@
 //! The tables of the state machine, and a walk of both sides through every interleaving of their deaths.
 
-use leaderboard_runner::protocol::Side::{self, Agent, Host as Simulator};
+use leaderboard_protocol::files::Side::{self, Agent, Host as Simulator};
 
 use super::Action::{Announce, End, Launch, Wait};
 use super::Phase::{Booting, Opening, Running};

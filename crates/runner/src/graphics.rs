@@ -11,7 +11,7 @@ use std::path::{Path, PathBuf};
 
 use thiserror::Error;
 
-use crate::needs::{ADAPTER, INDEX, Needs};
+use leaderboard_protocol::graphics::{ADAPTER, INDEX, Needs};
 
 /// Device nodes are called so, with the number behind.
 const DEVICE: &str = "nvidia";
@@ -149,7 +149,7 @@ pub fn with_adapter(word: &OsStr, adapter: usize) -> OsString {
 
 #[cfg(test)]
 mod tests {
-    use crate::needs::NotANeed;
+    use leaderboard_protocol::graphics::NotANeed;
     use std::os::unix::fs::symlink;
 
     use tempfile::TempDir;

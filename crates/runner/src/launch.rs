@@ -89,7 +89,7 @@ fn server(job: &Job) -> Result<Command, NoGraphics> {
                 .collect();
             group::command(
                 &words,
-                &[(leaderboard_runner::needs::ADAPTER, adapter.to_string().into())],
+                &[(leaderboard_protocol::graphics::ADAPTER, adapter.to_string().into())],
             )
         }
     };

@@ -27,8 +27,8 @@ use nix::sys::stat::{Mode, umask};
 
 use crate::run::Runner;
 use crate::wake::Signals;
+use leaderboard_protocol::verdict::CODE_NODE_REFUSED;
 use leaderboard_runner::args::{self, Request};
-use leaderboard_runner::verdict::CODE_NODE_REFUSED;
 
 /// Wrong arguments (EX_USAGE).
 const CODE_USAGE: u8 = 64;

@@ -5,8 +5,8 @@ use std::io::{ErrorKind, Write};
 use std::os::unix::fs::OpenOptionsExt;
 use std::path::Path;
 
-use leaderboard_runner::protocol::Side;
-use leaderboard_runner::verdict::{Verdict, What};
+use leaderboard_protocol::files::Side;
+use leaderboard_protocol::verdict::{Verdict, What};
 use nix::fcntl::OFlag;
 
 use crate::checkpoint::{Checkpoint, Unreadable};

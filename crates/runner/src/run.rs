@@ -10,8 +10,8 @@ use std::io;
 use std::os::fd::AsFd;
 use std::time::{Duration, Instant};
 
-use leaderboard_runner::protocol::{KEPT_CHECKPOINT, MAX_ROUNDS, Mark, Member, Progress, Side, StatusFile};
-use leaderboard_runner::verdict::{CODE_NODE_REFUSED, Verdict};
+use leaderboard_protocol::files::{KEPT_CHECKPOINT, MAX_ROUNDS, Mark, Member, Progress, Side, StatusFile};
+use leaderboard_protocol::verdict::{CODE_NODE_REFUSED, Verdict};
 use nix::errno::Errno;
 use nix::poll::{PollFd, PollFlags, PollTimeout, poll};
 use nix::sys::signal::Signal;

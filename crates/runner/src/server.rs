@@ -11,7 +11,8 @@ use std::ops::RangeInclusive;
 use std::path::Path;
 use std::time::Duration;
 
-use leaderboard_runner::protocol::{self, Mark, Pair, Side, StatusFile};
+use leaderboard_protocol::files as protocol;
+use leaderboard_protocol::files::{Mark, Pair, Side, StatusFile};
 
 /// CARLA's RPC `get_episode_settings`, in MessagePack: its main loop has to answer it, and it changes nothing.
 const REQUEST: &[u8] = b"\x94\x00\x00\xb4get_episode_settings\x90";

@@ -11,8 +11,8 @@ use std::os::unix::fs::{PermissionsExt, symlink};
 use std::process::{Command, Stdio};
 use std::time::{Duration, Instant};
 
-use leaderboard_runner::protocol::{Mark, StatusFile};
-use leaderboard_runner::verdict::{CODE_NODE_REFUSED, What};
+use leaderboard_protocol::files::{Mark, StatusFile};
+use leaderboard_protocol::verdict::{CODE_NODE_REFUSED, What};
 use nix::sys::signal::Signal;
 use support::{AGENT, COMPLETE, PARTIAL, Pod, SIMULATOR, lives};
 

@@ -6,8 +6,8 @@ mod support;
 
 use std::fs;
 
-use leaderboard_runner::protocol::{Mark, StatusFile};
-use leaderboard_runner::verdict::What;
+use leaderboard_protocol::files::{Mark, StatusFile};
+use leaderboard_protocol::verdict::What;
 use support::{AGENT, Container, Pod, SIMULATOR, until_exists};
 
 /// Two route runs, as many as the pair has.

@@ -9,8 +9,8 @@ use std::net::TcpStream;
 use std::os::unix::fs::symlink;
 use std::time::{Duration, Instant};
 
-use leaderboard_runner::protocol::{Mark, StatusFile};
-use leaderboard_runner::verdict::What;
+use leaderboard_protocol::files::{Mark, StatusFile};
+use leaderboard_protocol::verdict::What;
 use support::{AGENT, COMPLETE, Pod, SIMULATOR};
 
 /// A Pod whose simulator sees these devices, and a root for it.

@@ -8,8 +8,8 @@ use std::fs;
 use std::io::Write;
 use std::process::Command;
 
-use leaderboard_runner::protocol::{Mark, StatusFile};
-use leaderboard_runner::verdict::What;
+use leaderboard_protocol::files::{Mark, StatusFile};
+use leaderboard_protocol::verdict::What;
 use support::{AGENT, Pod, SIMULATOR};
 
 /// Chains of forks at once.

@@ -9,8 +9,8 @@ use std::io::Write;
 use std::os::unix::fs::PermissionsExt;
 use std::path::{Path, PathBuf};
 
-use leaderboard_runner::protocol::{Mark, StatusFile};
-use leaderboard_runner::verdict::What;
+use leaderboard_protocol::files::{Mark, StatusFile};
+use leaderboard_protocol::verdict::What;
 use rustix::fs::XattrFlags;
 use rustix::io::Errno;
 use support::{AGENT, COMPLETE, Pod, SIMULATOR};

@@ -8,8 +8,8 @@ use std::fs;
 use std::net::TcpStream;
 use std::time::{Duration, Instant};
 
-use leaderboard_runner::protocol::{MAX_ROUNDS, Mark, StatusFile};
-use leaderboard_runner::verdict::What;
+use leaderboard_protocol::files::{MAX_ROUNDS, Mark, StatusFile};
+use leaderboard_protocol::verdict::What;
 use nix::sys::signal::Signal;
 use support::{AGENT, COMPLETE, PARTIAL, Pod, SIMULATOR};
 

@@ -9,8 +9,8 @@ use std::io::Read;
 use std::net::{TcpListener, TcpStream};
 use std::process::{Command, Stdio};
 
-use leaderboard_runner::protocol::{Mark, Member, Pair, StatusFile};
-use leaderboard_runner::verdict::What;
+use leaderboard_protocol::files::{Mark, Member, Pair, StatusFile};
+use leaderboard_protocol::verdict::What;
 use support::{Pod, SIMULATOR};
 
 #[test]

@@ -8,13 +8,13 @@ use k8s_openapi::apimachinery::pkg::apis::meta::v1::Time;
 use super::refusal::Refusal;
 use super::view::{Claims, EvalaiStanding, Policy, Unreachable};
 use crate::controller::submissions::decide::previous_controller;
-use crate::pod::verdict::WorkspaceVerdict;
 use leaderboard_api::conditions::{self, Truth};
 use leaderboard_api::leaderboard::Counts;
 use leaderboard_api::{
     Evalai, EvalaiUse, Leaderboard, LeaderboardStatus, ResourceExt, TableUse, TeamUse, Track, TrackStatus, effective,
     names, reasons,
 };
+use leaderboard_contract::verdict::WorkspaceVerdict;
 
 const CLAIMS_NOT_SERVED: &str = "gpu.mode is Claim, and the API server does not serve resource.k8s.io/v1, which Kubernetes has from 1.34 on. \
                                  Update the cluster, or choose another gpu.mode.";

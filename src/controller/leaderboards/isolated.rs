@@ -1,9 +1,9 @@
 //! What the condition `Isolated` of a Leaderboard shows. Pure.
 
 use super::view::Policy;
-use crate::pod::verdict::{WorkspaceReason, WorkspaceVerdict};
 use leaderboard_api::conditions::Truth;
 use leaderboard_api::{Enforcement, Leaderboard, reasons};
+use leaderboard_contract::verdict::{WorkspaceReason, WorkspaceVerdict};
 
 /// What `Isolated` shows.
 pub fn condition(

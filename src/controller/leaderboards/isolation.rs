@@ -21,9 +21,9 @@ use crate::controller::slots::Slots;
 use crate::controller::stores::Stores;
 use crate::kubernetes::objects::Pod;
 use crate::kubernetes::{WatchEvents, call};
-use crate::pod::verdict::{NotAVerdict, WorkspaceReason, WorkspaceVerdict};
 use leaderboard_api::text::sentence;
 use leaderboard_api::{Enforcement, Leaderboard, PolicySource, conditions, names, reasons};
+use leaderboard_contract::verdict::{NotAVerdict, WorkspaceReason, WorkspaceVerdict};
 
 /// Policies that are restored at once.
 const RESTORED_AT_ONCE: usize = 16;

@@ -9,8 +9,8 @@ use tokio::time::Instant;
 
 use super::probe::Probe;
 use crate::controller::leaderboards::view::Policy;
-use crate::pod::verdict::WorkspaceVerdict;
 use leaderboard_base::lock::lock;
+use leaderboard_contract::verdict::WorkspaceVerdict;
 
 /// A status whose counts alone have changed is written at most this often.
 pub(super) const COUNTS_EVERY: Duration = Duration::from_secs(5);

@@ -29,9 +29,9 @@ use crate::kubernetes::objects::{Job, Meta, Pod};
 use crate::kubernetes::{CallError, Watchable, Writer, Writes, call, call_within};
 use crate::observability::metrics::Metrics;
 use crate::observability::traces::Traces;
-use crate::pod::run::Stop;
 use leaderboard_api::text::one_line;
 use leaderboard_api::{JobNumber, RunPlan, State, Submission, SubmissionStatus, names, reasons};
+use leaderboard_contract::run::Stop;
 
 /// Kubernetes refuses notes above 1 kB.
 const LONGEST_NOTE: usize = 900;

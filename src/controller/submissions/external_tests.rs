@@ -136,7 +136,7 @@ fn last() -> ObservedReport {
         "schema": 1, "submissionUid": "uid-of-sub", "attempt": 1, "podUid": "p", "round": 9, "done": 4, "total": 4,
         "unit": "routes", "workers": [], "final": true, "eligible": true, "entryStatus": "Finished", "results": results.to_string(),
     });
-    let report: crate::pod::report::Report = serde_json::from_value(report).unwrap();
+    let report: leaderboard_contract::report::Report = serde_json::from_value(report).unwrap();
     ObservedReport::Ours(Arc::new((&report).into()))
 }
 

@@ -2,7 +2,7 @@
 
 use super::job_spec::workload::ContentsVolume;
 use crate::pod::layout::{CARLA_ROOT, LEADERBOARD_ROOT, SCENARIO_RUNNER_ROOT};
-use crate::pod::run::{IDENTITY, LOGS, NAME_FILES, PODINFO, TOOLS};
+use leaderboard_contract::run::{IDENTITY, LOGS, NAME_FILES, PODINFO, TOOLS};
 
 /// Volumes with the private contents.
 pub(super) const CONTENTS_VOLUMES: [ContentsVolume; 3] = [

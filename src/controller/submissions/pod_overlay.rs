@@ -9,7 +9,7 @@ mod rules;
 #[cfg(test)]
 mod tests;
 
-use leaderboard_runner::protocol::Side;
+use leaderboard_protocol::files::Side;
 use serde_json::{Map, Value};
 
 pub use rules::{OverlayError, validate, validate_overlay};

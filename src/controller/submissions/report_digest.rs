@@ -3,10 +3,10 @@
 use serde_json::{Map, Value};
 
 use crate::pod::carla;
-use crate::pod::report::{ContentId, Logs, Report, ReportError, ReportWorker};
-use crate::pod::run::Stop;
 use leaderboard_api::text::one_line;
 use leaderboard_api::{Attempt, Metric, Progress, Score};
+use leaderboard_contract::report::{ContentId, Logs, Report, ReportError, ReportWorker};
+use leaderboard_contract::run::Stop;
 
 /// Largest text that is passed on to EvalAI, in bytes.
 pub const MAX_TEXT: u64 = 4 << 20;

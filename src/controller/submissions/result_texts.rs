@@ -149,7 +149,7 @@ mod tests {
     use serde_json::json;
 
     fn report(results: &str) -> ReportDigest {
-        let report: crate::pod::report::Report = serde_json::from_value(json!({
+        let report: leaderboard_contract::report::Report = serde_json::from_value(json!({
             "schema": 1, "submissionUid": "u", "attempt": 1, "podUid": "p", "round": 9, "done": 1, "total": 4, "unit": "routes", "workers": [],
             "final": true, "eligible": true, "entryStatus": "Finished", "results": results,
         }))

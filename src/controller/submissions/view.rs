@@ -9,11 +9,11 @@ use super::report_digest::ReportDigest;
 use crate::ask::question::Lookup;
 pub use crate::controller::slots::turns::Turn;
 use crate::controller::submissions::questions::Row;
-use crate::pod::run::Stop;
-use crate::pod::verdict::WorkspaceReason;
 use crate::services::evalai::Status;
 use leaderboard_api::{Attempt, JobNumber, Leaderboard, SharedText, Submission, names};
-use leaderboard_runner::verdict::Verdict;
+use leaderboard_contract::run::Stop;
+use leaderboard_contract::verdict::WorkspaceReason;
+use leaderboard_protocol::verdict::Verdict;
 
 /// Everything a decision may depend on.
 #[derive(Clone, Debug)]

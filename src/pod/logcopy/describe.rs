@@ -5,9 +5,9 @@ use std::collections::BTreeMap;
 use crate::pod::gather::Gathered;
 use crate::pod::judge::Ending;
 use crate::pod::measures::UNIT;
-use crate::pod::report::{LONGEST_TEXT, MAX_BYTES, Report, SCHEMA};
-use crate::pod::run::Run;
 use leaderboard_api::text::one_line;
+use leaderboard_contract::report::{LONGEST_TEXT, MAX_BYTES, Report, SCHEMA};
+use leaderboard_contract::run::Run;
 
 /// Warnings of the results' check that are reported.
 const WARNINGS: usize = 50;

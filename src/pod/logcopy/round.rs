@@ -15,11 +15,7 @@ use super::{LANDING, LAST_FLUSH, LogcopyError, create};
 use crate::pod::blocking;
 use crate::pod::gather::{Gathered, Gatherer, Object};
 use crate::pod::judge::{Ending, Judge, Outside, Step, decide};
-use crate::pod::keys::agent_folder;
 use crate::pod::places::Setting;
-use crate::pod::report::{Logs, OWNER_KEY, Owner, REPORT_KEY, Report};
-use crate::pod::run::{STATUS_FOLDER, Stop};
-use crate::pod::tree::Tree;
 use crate::pod::upload::Haste;
 use crate::pod::upload::complaints::Why as Complaint;
 use crate::pod::upload::send::{Uploader, Window};
@@ -27,7 +23,12 @@ use crate::pod::upload::wanted::{Files, Wanted};
 use crate::pod::watch::Watch;
 use crate::services::archive::{Archive, ArchiveError, Fetched};
 use leaderboard_base::lock::lock;
-use leaderboard_runner::protocol::{self, Mark, Pair, StatusFile};
+use leaderboard_contract::keys::agent_folder;
+use leaderboard_contract::report::{Logs, OWNER_KEY, Owner, REPORT_KEY, Report};
+use leaderboard_contract::run::{STATUS_FOLDER, Stop};
+use leaderboard_evidence::Tree;
+use leaderboard_protocol::files as protocol;
+use leaderboard_protocol::files::{Mark, Pair, StatusFile};
 
 /// Rounds of a container whose status files are stored: far more than retries a host forgives.
 const STATUS_ROUNDS: u32 = 64;

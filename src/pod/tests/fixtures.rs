@@ -3,10 +3,10 @@
 use std::fs;
 use std::path::Path;
 
-use leaderboard_runner::protocol::{Mark, Member, Pair, Side, StatusFile};
+use leaderboard_protocol::files::{Mark, Member, Pair, Side, StatusFile};
 
-use super::run::{Run, SCHEMA, STATUS_FOLDER};
 use leaderboard_api::{Attempt, ByteQuantity, LeaderboardVersion, RouteSlice, RunPlan, Storage, Verify};
+use leaderboard_contract::run::{Run, SCHEMA, STATUS_FOLDER};
 
 /// Two pairs of two routes each, once.
 pub(crate) fn run() -> Run {

@@ -10,9 +10,9 @@ use std::time::{Duration, Instant};
 use super::{Decision, Stored, fingerprint};
 use crate::pod::blocking;
 use crate::pod::gather::Object;
-use crate::pod::tree::{Stamp, Tree, TreeError};
 use crate::pod::upload::wanted::Wanted;
 use crate::services::archive::{Archive, ArchiveError, Cause, Kept, MIN_PART, PART, read_range};
+use leaderboard_evidence::{Stamp, Tree, TreeError};
 
 /// What is left to abort an upload that was cut.
 const ABORTING: Duration = Duration::from_secs(10);

@@ -8,9 +8,9 @@ use std::fmt;
 
 use super::Decision;
 use crate::pod::daily::Spent;
-use crate::pod::keys::{EVALAI, REFUSED, known_logs};
-use crate::pod::run::STATUS_FOLDER;
 use crate::services::archive::PART;
+use leaderboard_contract::keys::{EVALAI, REFUSED, known_logs};
+use leaderboard_contract::run::STATUS_FOLDER;
 
 /// Objects of one run.
 pub const OBJECTS: u64 = 20_000;

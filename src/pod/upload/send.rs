@@ -18,8 +18,8 @@ use super::{Decision, Memory, Stored, decide_upload};
 use crate::pod::blocking;
 use crate::pod::daily::{Spent, today};
 use crate::pod::gather::Object;
-use crate::pod::tree::{Stamp, Tree, TreeError};
 use crate::services::archive::{Archive, ArchiveError, Cause};
+use leaderboard_evidence::{Stamp, Tree, TreeError};
 
 /// Files in the air at once.
 const AT_ONCE: usize = 4;

@@ -6,9 +6,9 @@ use std::collections::hash_map::DefaultHasher;
 use std::hash::{Hash, Hasher};
 
 use super::Haste;
-use crate::pod::keys::{REFUSED, agent_folder, checkpoint_path, known_logs};
-use crate::pod::tree::{Stamp, Tree};
-use leaderboard_runner::protocol::Pair;
+use leaderboard_contract::keys::{REFUSED, agent_folder, checkpoint_path, known_logs};
+use leaderboard_evidence::{Stamp, Tree};
+use leaderboard_protocol::files::Pair;
 
 /// Entries read in one agent's folder.
 const AGENT_ENTRIES: usize = 5_000;

@@ -15,15 +15,15 @@ use super::WorkspaceError;
 use crate::pod::blocking;
 use crate::pod::daily::Daily;
 use crate::pod::gather::Gatherer;
-use crate::pod::keys::{EVALAI, MERGED, REFUSED, checkpoint_path};
-use crate::pod::report::{OWNER_KEY, REPORT_KEY};
-use crate::pod::run::{Run, STATUS_FOLDER};
-use crate::pod::tree::{Stamp, Tree, TreeError, is_plain};
 use crate::pod::upload::quota::{LEAST, Quota};
 use crate::pod::upload::{Memory, Stored, fingerprint};
 use crate::services::archive::{Archive, Listed};
 use leaderboard_api::names::FAILURE_LOG_KEY;
-use leaderboard_runner::protocol::Pair;
+use leaderboard_contract::keys::{EVALAI, MERGED, REFUSED, checkpoint_path};
+use leaderboard_contract::report::{OWNER_KEY, REPORT_KEY};
+use leaderboard_contract::run::{Run, STATUS_FOLDER};
+use leaderboard_evidence::{Stamp, Tree, TreeError, is_plain};
+use leaderboard_protocol::files::Pair;
 
 /// Most objects of a run.
 const MAX_OBJECTS: usize = 100_000;

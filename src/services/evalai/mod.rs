@@ -22,11 +22,11 @@ pub mod row;
 mod task;
 pub mod types;
 
-pub use crate::pod::report::Patience;
 pub use http::{ClientError, Timeouts};
 pub use hub::{Hub, Options};
 pub use labels::{Labels, Misfit};
 pub use leaderboard_api::evalai_status::{Outcome, Progress, Status};
+pub use leaderboard_contract::report::Patience;
 pub use queue::Timing;
 pub use row::Row;
 pub use types::{

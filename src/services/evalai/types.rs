@@ -9,13 +9,13 @@ use futures::future::BoxFuture;
 use jiff::Timestamp;
 
 use super::row::Row;
-use crate::pod::report::ContentId;
-use crate::pod::report::Patience;
 use crate::services::token::Token;
 use leaderboard_api::evalai_status::{Outcome, Progress, Status};
 use leaderboard_api::{Attempt, Storage};
 pub use leaderboard_base::object_key::ObjectKey as Key;
 use leaderboard_base::spans::LogSpan;
+use leaderboard_contract::report::ContentId;
+use leaderboard_contract::report::Patience;
 
 /// The challenge of a Leaderboard and how it is asked.
 #[derive(Clone, Debug, PartialEq)]

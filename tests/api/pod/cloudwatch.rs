@@ -6,8 +6,8 @@ use tokio::sync::watch;
 
 use super::*;
 use crate::support::throttle::Throttle;
-use leaderboard_operator::pod::keys::{CONTENTS_LOG, WORKSPACE_LOG};
-use leaderboard_operator::pod::report::Logs;
+use leaderboard_contract::keys::{CONTENTS_LOG, WORKSPACE_LOG};
+use leaderboard_contract::report::Logs;
 use leaderboard_operator::services::logs::Miss;
 
 /// A Pod whose logs go to a group of its own, and the group's name.

@@ -1,6 +1,6 @@
 //! The Pod's programs where their environment names another AWS than the Leaderboard does.
 
-use leaderboard_operator::pod::run::{ENV_POD_UID, ENV_RUN, LOGS, RUNNER_IN_IMAGE, TOOLS};
+use leaderboard_contract::run::{ENV_POD_UID, ENV_RUN, LOGS, RUNNER_IN_IMAGE, TOOLS};
 use nix::sys::signal::{Signal, kill};
 use nix::unistd::Pid;
 

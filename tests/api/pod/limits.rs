@@ -1,7 +1,7 @@
 //! What a run may store and send: every byte and every object counts, over restarts too, and nothing that an agent does
 //! hides a log or keeps a report back.
 
-use leaderboard_operator::pod::keys::known_logs;
+use leaderboard_contract::keys::known_logs;
 
 use super::shelf::Shelf;
 use super::*;

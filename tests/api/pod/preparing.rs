@@ -3,7 +3,7 @@
 use std::time::Instant;
 
 use leaderboard_api::{Enforcement, RouteSlice};
-use leaderboard_operator::pod::run::Isolation;
+use leaderboard_contract::run::Isolation;
 use tokio::io::AsyncReadExt;
 use tokio::net::{TcpListener, TcpStream};
 

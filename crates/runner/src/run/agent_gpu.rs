@@ -3,9 +3,9 @@
 //! Nothing of the agent's image runs before its simulator has announced its server for the first time, and nobody else can write
 //! into its folder. So the simulator asks for the report of the agent's runner before that, believes it, and asks no more afterwards.
 
+use leaderboard_protocol::files::{Mark, StatusFile};
 use leaderboard_runner::args::Role;
 use leaderboard_runner::graphics;
-use leaderboard_runner::protocol::{Mark, StatusFile};
 
 use super::Runner;
 use crate::decide::{AgentGpu, Cause, Phase};

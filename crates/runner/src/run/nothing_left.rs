@@ -3,8 +3,8 @@
 //! An evaluator that is started on a complete checkpoint needs a simulator for nothing. In V2 it also writes the file anew without the
 //! sensors, which are named at the set-up of a route. The file's own total is no measure: a checkpoint can be of an earlier plan.
 
+use leaderboard_protocol::files::Mark;
 use leaderboard_runner::args::Role;
-use leaderboard_runner::protocol::Mark;
 
 use super::Runner;
 use crate::checkpoint::{self, Checkpoint};

@@ -13,8 +13,8 @@ use std::sync::atomic::{AtomicU32, Ordering};
 use std::sync::mpsc::{Receiver, channel};
 use std::time::{Duration, Instant};
 
-use leaderboard_runner::protocol::{KEPT_CHECKPOINT, Mark, Member, Pair, Side, StatusFile};
-use leaderboard_runner::verdict::Verdict;
+use leaderboard_protocol::files::{KEPT_CHECKPOINT, Mark, Member, Pair, Side, StatusFile};
+use leaderboard_protocol::verdict::Verdict;
 use nix::poll::{PollFd, PollFlags, PollTimeout, poll};
 use nix::sys::inotify::{AddWatchFlags, InitFlags, Inotify};
 use nix::sys::signal::{Signal, kill};

@@ -8,8 +8,8 @@ use kube::Client;
 use super::request::{Answer, Done, Target, What, Work};
 use crate::controller::submissions::failure_log;
 use crate::controller::submissions::report_digest::ReportDigest;
-use crate::pod::report::{MAX_BYTES, OWNER_KEY, Owner, REPORT_KEY};
 use crate::services::archive::{Archive, ArchiveError, Fetched};
+use leaderboard_contract::report::{MAX_BYTES, OWNER_KEY, Owner, REPORT_KEY};
 
 /// Time that reading a report, or writing the fence, may take.
 const LIMIT: Duration = Duration::from_secs(10);

@@ -11,7 +11,7 @@ use super::waits::Wait;
 use super::words;
 use crate::controller::submissions::view::{ContainerView, EndView};
 use leaderboard_api::EndReason;
-use leaderboard_runner::verdict::{CODE_NO_PROCESS, CODE_NODE_REFUSED, What};
+use leaderboard_protocol::verdict::{CODE_NO_PROCESS, CODE_NODE_REFUSED, What};
 
 /// Exit codes of a container that was ended with all others of its Pod, as by a sandbox that is made anew: killed, or lost from sight.
 const FROM_OUTSIDE: [i32; 2] = [137, 255];

@@ -6,7 +6,7 @@ use std::collections::BTreeSet;
 
 use jiff::Timestamp;
 use k8s_openapi::apimachinery::pkg::apis::meta::v1::Time;
-use leaderboard_runner::protocol::{Member, Pair, Side};
+use leaderboard_protocol::files::{Member, Pair, Side};
 
 use super::blame::{self, Crash};
 use super::failure::{infrastructure, participant};

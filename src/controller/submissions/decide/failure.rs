@@ -6,9 +6,9 @@
 use super::next_steps::{Steps, for_both, infrastructure_for_participants, of_infrastructure, of_participant};
 use crate::controller::submissions::report_digest::{ReportDigest, clamp};
 use crate::controller::submissions::view::ObservedNode;
-use crate::pod::run::Stop;
 use leaderboard_api::text::sentence;
 use leaderboard_api::{Failure, FailureClass, WorkerStatus, reasons};
+use leaderboard_contract::run::Stop;
 
 /// A failure that is the participant's: `what` happened, in one sentence, and what each reader does about it.
 pub(super) fn participant(reason: &str, what: &str, next: &Steps) -> Failure {

@@ -9,10 +9,10 @@ use super::waits::Wait;
 use crate::ask::question::{Answered, Failure};
 use crate::controller::submissions::questions::{ForeignRun, Row};
 use crate::controller::submissions::view::{ContainerView, JobView, PodView};
-use crate::pod::verdict::WorkspaceReason;
 use leaderboard_api::conditions::{self, Truth};
 use leaderboard_api::text::{LONGEST_NAME, one_line, sentence};
 use leaderboard_api::{names, reasons};
+use leaderboard_contract::verdict::WorkspaceReason;
 
 /// Why an end of what was held back is written to no other system.
 pub(super) const NOT_WRITTEN: &str = "Nothing is written of this end, because another program may run the submission. If none does, \

@@ -10,10 +10,10 @@ use super::plan_builder::PlanBuilder;
 use super::trouble;
 use super::waits::Wait;
 use crate::controller::submissions::view::{LogAt, LogPlace, ObservedLog, PodView};
-use crate::pod::keys::agent_log;
-use crate::pod::run::console;
 use leaderboard_api::{FailureClass, SubmissionStatus, conditions, names, reasons};
-use leaderboard_runner::protocol::Pair;
+use leaderboard_contract::keys::agent_log;
+use leaderboard_contract::run::console;
+use leaderboard_protocol::files::Pair;
 
 /// Requests the log of a run that is being stopped for a failure, as far as the end of its Pod would take it away. Returns how
 /// long that end waits for it.
@@ -84,7 +84,10 @@ fn places(status: &SubmissionStatus, pod: Option<&PodView>) -> Vec<LogPlace> {
         reasons::START_DEADLINE => vec![pod.and_then(trouble::failing_before_agents).and_then(on_node)],
         reasons::RESULTS_NOT_STORED | reasons::JOB_FAILED => vec![
             on_node(names::CONTAINER_LOGCOPY),
-            Some(stored(names::CONTAINER_LOGCOPY, crate::pod::keys::OWN_LOG.into())),
+            Some(stored(
+                names::CONTAINER_LOGCOPY,
+                leaderboard_contract::keys::OWN_LOG.into(),
+            )),
         ],
         // It never ran.
         reasons::IMAGE_INVALID

@@ -5,8 +5,8 @@ use std::time::Duration;
 use crate::controller::slots::turns::InLine;
 use crate::controller::submissions::questions::Row;
 use crate::controller::submissions::view::{LogPlace, ReportDemand};
-use crate::pod::run::Stop;
 use leaderboard_api::{JobNumber, SubmissionStatus, names};
+use leaderboard_contract::run::Stop;
 
 /// What a reconcile wants: the status to show, then the actions in order, then the events.
 #[derive(Clone, Debug, PartialEq)]

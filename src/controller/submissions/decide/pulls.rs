@@ -9,7 +9,7 @@ use jiff::Timestamp;
 use super::waits::after;
 use crate::controller::submissions::view::{ContainerView, PodView};
 use leaderboard_api::{Deadlines, names};
-use leaderboard_runner::protocol::Member;
+use leaderboard_protocol::files::Member;
 
 /// How a container waits that the kubelet has not come to yet.
 const NOT_BEGUN: [&str; 3] = ["", "ContainerCreating", "PodInitializing"];

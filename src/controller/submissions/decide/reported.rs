@@ -2,10 +2,10 @@
 
 use super::plan_builder::PlanBuilder;
 use crate::controller::submissions::report_digest::{ReportDigest, clamp};
-use crate::pod::report::Logs;
 use leaderboard_api::conditions::{self, Truth};
 use leaderboard_api::text::sentence;
 use leaderboard_api::{WorkerStatus, reasons};
+use leaderboard_contract::report::Logs;
 
 /// Takes in how far the run is.
 pub(super) fn take(draft: &mut PlanBuilder<'_>, report: &ReportDigest) {

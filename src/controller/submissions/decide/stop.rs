@@ -10,8 +10,8 @@ use super::plan_builder::PlanBuilder;
 use super::waits::{Wait, after};
 use super::{failure, interruption, log, reading, start};
 use crate::controller::submissions::view::{JobView, ObservedNode, PodView};
-use crate::pod::run::Stop;
 use leaderboard_api::reasons;
+use leaderboard_contract::run::Stop;
 
 /// Brings a Job to its end: first by word, then by deletion, then by force.
 pub(super) fn decide(draft: &mut PlanBuilder<'_>, job: &JobView) {

@@ -4,10 +4,10 @@
 
 use super::words::{self, Cause};
 use crate::controller::submissions::view::{ContainerView, PodView};
-use crate::pod::verdict::WorkspaceReason;
 use leaderboard_api::text::sentence;
 use leaderboard_api::{names, reasons};
-use leaderboard_runner::protocol::{Member, Side};
+use leaderboard_contract::verdict::WorkspaceReason;
+use leaderboard_protocol::files::{Member, Side};
 
 /// What is shown should `workspace` not report it itself.
 const NOT_ISOLATED: &str = "The Pod was not shown to be isolated from the network, and network.enforcement is Require. Look at the log of its \

@@ -4,7 +4,7 @@
 //! Called by `trouble` and `blame`. An image is the cause only where the words prove it. A node without disk, driver or memory must charge
 //! nobody, and its words are endless; so what the table does not know is the node's, or the registry's.
 
-use crate::pod::run::TOOLS;
+use leaderboard_contract::run::TOOLS;
 
 /// The cause that keeps a container from starting.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]

@@ -6,12 +6,12 @@ use super::commands::{self, Adapter};
 use super::display;
 use super::workload::{Asked, Contents, Mount, Role, Workload};
 use crate::controller::submissions::pod_layout::{AGENT, CONTENTS_VOLUMES, SAVED};
-use crate::pod::keys::agent_folder;
 use crate::pod::layout::{CARLA_ROOT, LEADERBOARD_ROOT, SCENARIO_RUNNER_ROOT, python_path};
-use crate::pod::run::console_name;
 use leaderboard_api::{LeaderboardVersion, SimulatorContainer};
-use leaderboard_runner::needs::Needs;
-use leaderboard_runner::protocol::Pair;
+use leaderboard_contract::keys::agent_folder;
+use leaderboard_contract::run::console_name;
+use leaderboard_protocol::files::Pair;
+use leaderboard_protocol::graphics::Needs;
 
 const ROUTES_FILE: &str = "/workspace/leaderboard/data/routes_testing.xml";
 const SCENARIOS_FILE: &str = "/workspace/leaderboard/data/all_towns_traffic_scenarios_private.json";

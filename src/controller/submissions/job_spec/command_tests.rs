@@ -85,7 +85,7 @@ fn behind_runner(words: &[String], env: &mut BTreeMap<String, String>) -> (args:
     }
     // As on a node where the pair sees all GPUs.
     let index = env
-        .get(leaderboard_runner::needs::INDEX)
+        .get(leaderboard_protocol::graphics::INDEX)
         .map_or(0, |index| index.parse().unwrap());
     let command = job
         .command
@@ -327,7 +327,7 @@ fn the_runner_gets_the_deadlines() {
             cancel: seconds(40),
             answer: Duration::from_secs(10),
             log: Some("/home/carla/CarlaUE4/Saved/console-3.log".into()),
-            gpu: Some(leaderboard_runner::needs::Needs::Vulkan),
+            gpu: Some(leaderboard_protocol::graphics::Needs::Vulkan),
             agent_gpu: false,
             unset: vec!["DISPLAY".into(), "XAUTHORITY".into()],
         }

@@ -23,7 +23,10 @@ impl Adapter {
         match self {
             Self::Unnamed => None,
             Self::Numbered(number) => Some(format!("{ADAPTER}{number}")),
-            Self::Found => Some(literal(&format!("{ADAPTER}$({})", leaderboard_runner::needs::ADAPTER))),
+            Self::Found => Some(literal(&format!(
+                "{ADAPTER}$({})",
+                leaderboard_protocol::graphics::ADAPTER
+            ))),
         }
     }
 }

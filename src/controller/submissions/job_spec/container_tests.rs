@@ -4,8 +4,8 @@ use serde_json::{Value, json};
 
 use super::run_document;
 use super::tests::{Case, OPERATOR_IMAGE, container, containers, role};
-use crate::pod::run::{ENV_ROLE_ARN, Run};
 use leaderboard_api::{Attempt, names};
+use leaderboard_contract::run::{ENV_ROLE_ARN, Run};
 
 fn env<'a>(container: &'a Value, name: &str) -> Option<&'a Value> {
     container["env"]

@@ -15,8 +15,8 @@ use super::failed_nodes::{HOSTNAME, REQUIRED};
 use super::{JobInput, variable};
 use crate::controller::gpu_claims::{source, template_name};
 use leaderboard_api::{GpuSource, LeaderboardSpec, names};
-use leaderboard_runner::needs::{INDEX, Needs};
-use leaderboard_runner::protocol::{Member, Pair, Side};
+use leaderboard_protocol::files::{Member, Pair, Side};
+use leaderboard_protocol::graphics::{INDEX, Needs};
 
 const DEVICES: &str = "NVIDIA_VISIBLE_DEVICES";
 const CAPABILITIES: &str = "NVIDIA_DRIVER_CAPABILITIES";

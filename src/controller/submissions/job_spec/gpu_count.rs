@@ -1,6 +1,6 @@
 //! How many GPUs a Pod takes from its node. Pure: read off what the host requests, as the scheduler does.
 
-use leaderboard_runner::protocol::Pair;
+use leaderboard_protocol::files::Pair;
 use serde_json::{Value, json};
 
 use super::{gpu, pairs};

@@ -9,9 +9,9 @@ use k8s_openapi::api::core::v1::{
 use super::security::{confined, context, resources};
 use super::{JobInput, carla, is_resumed, own_uid, run_document, variable, volumes};
 use crate::controller::submissions::pod_layout::CONTENTS_LOG_FOLDER;
-use crate::pod::keys::CONTENTS_LOG;
-use crate::pod::run::{ENV_CHECKSUMS, ENV_POD_UID, ENV_ROLE_ARN, ENV_RUN, RUNNER, TOOLS};
 use leaderboard_api::{Part, names};
+use leaderboard_contract::keys::CONTENTS_LOG;
+use leaderboard_contract::run::{ENV_CHECKSUMS, ENV_POD_UID, ENV_ROLE_ARN, ENV_RUN, RUNNER, TOOLS};
 
 /// Copying prints little; what floods must not fill the disk. In bytes.
 const CONTENTS_LOG_LIMIT: u64 = 16 << 20;

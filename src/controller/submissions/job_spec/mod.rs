@@ -43,12 +43,12 @@ use super::pod_layout::ANNOTATION_SKIP_CONTAINERS;
 use super::pod_overlay;
 use crate::controller::gpu_claims::source;
 use crate::controller::owner::owner_reference;
-use crate::pod::run::{Isolation, Run, SCHEMA};
 pub use gpu_count::gpus;
 use leaderboard_api::{
     Attempt, Deadlines, Enforcement, FailedNode, GpuSource, JobNumber, Leaderboard, LeaderboardSpec, PolicySource,
     RunPlan, Submission, Track, conditions, effective, names, reasons,
 };
+use leaderboard_contract::run::{Isolation, Run, SCHEMA};
 use workload::Asked;
 
 /// Seconds the containers have between SIGTERM and SIGKILL: the agents' 20 s, then logcopy's last upload.

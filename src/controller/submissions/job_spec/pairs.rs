@@ -8,9 +8,9 @@ use super::workload::{Role, Workload};
 use super::{JobInput, carla, gpu, variable, volumes};
 use crate::controller::gpu_claims::source;
 use crate::controller::submissions::pod_layout::{FIXED_ENV, STATUS};
-use crate::pod::run::{RUNNER, TOOLS};
 use leaderboard_api::Part;
-use leaderboard_runner::protocol::{Member, Pair, Side};
+use leaderboard_contract::run::{RUNNER, TOOLS};
+use leaderboard_protocol::files::{Member, Pair, Side};
 
 pub(super) fn workload(input: &JobInput<'_>, pair: Pair) -> Workload {
     carla::workload(&input.asked(), pair)

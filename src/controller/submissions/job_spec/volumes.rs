@@ -12,9 +12,11 @@ use crate::controller::submissions::pod_layout::{
     CONTENTS_LOG_FOLDER, CONTENTS_VOLUMES, IDENTITY_VOLUME, LOGS_VOLUME, PODINFO_VOLUME, SHM, SHM_VOLUME, STATUS,
     TOOLS_VOLUME,
 };
-use crate::pod::run::{IDENTITY, IDENTITY_TOKEN_FILE, LOGS, NAME_FILES, PODINFO, STATUS_FOLDER, STOP_FILE, TOOLS};
 use leaderboard_api::{ByteQuantity, names};
-use leaderboard_runner::protocol::{Member, Pair, Side};
+use leaderboard_contract::run::{
+    IDENTITY, IDENTITY_TOKEN_FILE, LOGS, NAME_FILES, PODINFO, STATUS_FOLDER, STOP_FILE, TOOLS,
+};
+use leaderboard_protocol::files::{Member, Pair, Side};
 
 const AUDIENCE: &str = "sts.amazonaws.com";
 const TOKEN_SECONDS: i64 = 3600;

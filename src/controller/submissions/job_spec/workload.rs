@@ -1,7 +1,7 @@
 //! What a Pod runs, as plain data: a kind of evaluation says it, and the other modules here make Kubernetes' objects of it.
 
 use leaderboard_api::{Deadlines, LeaderboardSpec, RunPlan, Track};
-use leaderboard_runner::needs::Needs;
+use leaderboard_protocol::graphics::Needs;
 
 /// What a workload depends on.
 #[derive(Clone, Copy, Debug)]

@@ -2,12 +2,12 @@
 
 use crate::controller::submissions::view::{ContainerView, EndView, PodView};
 use crate::kubernetes::objects::{Condition, ContainerStatus, Ended, Pod, PodStatus};
-use crate::pod::run::Stop;
-use crate::pod::verdict::{NotAVerdict, WorkspaceReason, WorkspaceVerdict};
 use leaderboard_api::names;
 use leaderboard_api::text::{LONGEST_MESSAGE, one_line};
-use leaderboard_runner::protocol::Member;
-use leaderboard_runner::verdict::Verdict;
+use leaderboard_contract::run::Stop;
+use leaderboard_contract::verdict::{NotAVerdict, WorkspaceReason, WorkspaceVerdict};
+use leaderboard_protocol::files::Member;
+use leaderboard_protocol::verdict::Verdict;
 
 /// Reduces a Pod.
 pub fn view(pod: &Pod) -> PodView {
@@ -172,7 +172,7 @@ fn short(text: &str) -> String {
 
 #[cfg(test)]
 mod tests {
-    use leaderboard_runner::verdict::What;
+    use leaderboard_protocol::verdict::What;
     use serde_json::json;
 
     use super::*;

@@ -9,8 +9,8 @@ use super::without_nulls;
 use crate::controller::submissions::pod_layout::{
     ANNOTATION_SKIP_CONTAINERS, CONTENTS_VOLUMES, FIXED_ENV, OWN_VOLUMES, protected_mounts,
 };
-use crate::pod::run::{ENV_POD_UID, ENV_ROLE_ARN, ENV_RUN};
 use leaderboard_api::{LeaderboardSpec, Part, names};
+use leaderboard_contract::run::{ENV_POD_UID, ENV_ROLE_ARN, ENV_RUN};
 
 /// Why a Leaderboard's `podOverrides` cannot be used. `path` is below `spec` of the Leaderboard.
 #[derive(thiserror::Error, Debug, PartialEq, Eq)]

@@ -14,14 +14,14 @@ use crate::controller::submissions::view::{
     ContainerView, EndView, EvalaiEnd, EvalaiInfo, EvalaiView, JobEnd, JobView, NodeView, ObservedFence, ObservedJob,
     ObservedLog, ObservedReport, PodView, RecordView, ReportView, Stage, Standing, Turn, View,
 };
-use crate::pod::report::{Report, ReportWorker};
-use crate::pod::run::Stop;
 use crate::services::evalai::Status;
 use leaderboard_api::conditions;
 use leaderboard_api::{
     Attempt, Leaderboard, LeaderboardSpec, Metric, State, Submission, SubmissionStatus, WorkerState, names, reasons,
 };
-use leaderboard_runner::verdict::{Verdict, What};
+use leaderboard_contract::report::{Report, ReportWorker};
+use leaderboard_contract::run::Stop;
+use leaderboard_protocol::verdict::{Verdict, What};
 
 /// UID of every submission here.
 pub const UID: &str = "uid-1";

@@ -3,11 +3,11 @@
 use super::builders::*;
 use crate::controller::submissions::decide::{Action, end};
 use crate::controller::submissions::view::{JobEnd, ObservedReport};
-use crate::pod::run::Stop;
 use leaderboard_api::FailureClass::{Infrastructure, Participant};
 use leaderboard_api::State::{Failed, Finished, Pending, Running};
 use leaderboard_api::reasons;
 use leaderboard_api::{FailedNode, Failure, MAX_FAILED_NODES};
+use leaderboard_contract::run::Stop;
 
 /// Each side of pair 1 ends like this until its retries are used up: what comes of it.
 fn used_up(agent: &str, simulator: &str) -> Failure {

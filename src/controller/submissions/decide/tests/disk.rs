@@ -3,10 +3,10 @@
 use serde_json::json;
 
 use super::builders::*;
-use crate::pod::report::Report;
 use leaderboard_api::FailureClass::{Infrastructure, Participant};
 use leaderboard_api::State::{Failed, Running};
 use leaderboard_api::{FailureClass, reasons};
+use leaderboard_contract::report::Report;
 
 /// A run whose Pod was evicted with these words, in a Leaderboard without another Job.
 fn evicted(words: &str) -> World {

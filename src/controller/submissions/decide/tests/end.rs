@@ -5,12 +5,12 @@ use std::time::Duration;
 use super::builders::*;
 use crate::controller::submissions::decide::{Action, Plan};
 use crate::controller::submissions::view::{JobEnd, ObservedReport};
-use crate::pod::report::Report;
 use leaderboard_api::FailureClass::{Infrastructure, Participant};
 use leaderboard_api::State::{Cancelled, Failed, Finished, Pending, Running};
 use leaderboard_api::conditions::{ARCHIVED, FINISHED, RUNNING, STALLED};
 use leaderboard_api::reasons;
 use leaderboard_api::{Attempt, Failure, JobNumber};
+use leaderboard_contract::report::Report;
 
 #[test]
 fn complete_results_that_count_finish() {

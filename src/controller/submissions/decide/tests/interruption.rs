@@ -3,10 +3,10 @@
 use super::builders::*;
 use crate::controller::submissions::decide::Action;
 use crate::controller::submissions::view::{JobEnd, ObservedNode, PodView};
-use crate::pod::report::Report;
-use crate::pod::run::Stop;
 use leaderboard_api::State::{Finished, Pending, Running};
 use leaderboard_api::{Attempt, Interruptions, JobNumber, conditions, reasons};
+use leaderboard_contract::report::Report;
+use leaderboard_contract::run::Stop;
 
 const TAINT: &str = "karpenter.sh/disrupted";
 

@@ -3,9 +3,9 @@
 use super::builders::*;
 use crate::controller::submissions::decide::{Action, EvalaiUpdate, Plan};
 use crate::controller::submissions::view::{JobEnd, LogAt, LogPlace, ObservedReport};
-use crate::pod::report::Report;
 use leaderboard_api::State::{Cancelled, Failed, Pending, Running};
 use leaderboard_api::reasons;
+use leaderboard_contract::report::Report;
 
 /// The places of a request, in short: `node agent-1`, `last simulator-1` for the run before, `s3 agent/agent1/leaderboard.log`.
 fn places(plan: &Plan) -> Vec<String> {

@@ -13,9 +13,9 @@ use crate::controller::submissions::view::{
     EvalaiEnd, EvalaiView, JobEnd, JobView, ObservedFence, ObservedJob, ObservedLog, ObservedNode, ObservedReport,
     PodView, Stage, Standing, Turn,
 };
-use crate::pod::report::Report;
-use crate::pod::run::Stop;
 use crate::services::evalai::Status;
+use leaderboard_contract::report::Report;
+use leaderboard_contract::run::Stop;
 
 /// One change of the world, after which there is a reconcile.
 #[derive(Clone, Debug)]

@@ -3,11 +3,11 @@
 use super::builders::*;
 use crate::controller::submissions::decide::{Action, EvalaiUpdate};
 use crate::controller::submissions::view::{JobEnd, ObservedNode, ObservedReport, Standing, Turn};
-use crate::pod::report::Report;
-use crate::pod::run::Stop;
 use leaderboard_api::State::{Cancelled, Finished, Pending, Resumed, Running};
 use leaderboard_api::conditions::{FINISHED, PUBLISHED, RECORDED};
 use leaderboard_api::{Attempt, JobNumber, reasons};
+use leaderboard_contract::report::Report;
+use leaderboard_contract::run::Stop;
 
 /// A run of a Leaderboard that retries nothing; its second attempt is asked for at second 100.
 fn restarted() -> World {

@@ -3,12 +3,12 @@
 use super::builders::*;
 use crate::controller::submissions::decide::{Action, EvalaiUpdate};
 use crate::controller::submissions::view::{ObservedJob, ObservedReport, PodView, Stage};
-use crate::pod::report::{Logs, Report};
-use crate::pod::run::Stop;
 use leaderboard_api::FailureClass::{Infrastructure, Participant};
 use leaderboard_api::State::{Failed, Finished, Pending, Resumed, Running};
 use leaderboard_api::conditions::{self, LOGGED, PLAUSIBLE, RUNNING, STALLED};
 use leaderboard_api::reasons;
+use leaderboard_contract::report::{Logs, Report};
+use leaderboard_contract::run::Stop;
 
 #[test]
 fn progress_is_no_transition_and_is_sent_once() {

@@ -5,11 +5,11 @@ use std::time::Duration;
 use super::builders::*;
 use crate::controller::submissions::decide::{Action, EvalaiUpdate};
 use crate::controller::submissions::view::ContainerView;
-use crate::pod::run::Stop;
 use leaderboard_api::FailureClass::{self, Infrastructure, Participant};
 use leaderboard_api::State::{Failed, Pending, Running};
 use leaderboard_api::conditions::{RUNNING, STALLED};
 use leaderboard_api::{FailedNode, reasons};
+use leaderboard_contract::run::Stop;
 
 const NOT_FOUND: &str = "rpc error: code = NotFound desc = failed to pull and unpack image \"r/x:1\": failed to resolve reference \
                          \"r/x:1\": r/x:1: not found";

@@ -3,11 +3,11 @@
 use super::builders::*;
 use crate::controller::submissions::decide::{Action, EvalaiUpdate, TableUpdate};
 use crate::controller::submissions::view::{EvalaiEnd, JobEnd, ObservedReport};
-use crate::pod::report::Report;
-use crate::pod::run::Stop;
 use crate::services::evalai::Status;
 use leaderboard_api::State::{Cancelled, Finished, Pending, Running};
 use leaderboard_api::{names, reasons};
+use leaderboard_contract::report::Report;
+use leaderboard_contract::run::Stop;
 
 type Request = fn(&mut World);
 

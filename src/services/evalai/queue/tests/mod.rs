@@ -13,7 +13,6 @@ mod simulation;
 use jiff::SignedDuration;
 
 use super::*;
-use crate::pod::report::{ContentId, Patience};
 use crate::services::evalai::answer::{About, Answer, Refusal, Silence};
 use crate::services::evalai::request::{Purpose, Reply};
 use crate::services::evalai::row::{DatasetSplit, Phase, Row, Schema, Split};
@@ -22,6 +21,7 @@ use crate::services::token::Token;
 use leaderboard_api::Attempt;
 use leaderboard_api::evalai_status::Status;
 use leaderboard_base::spans::LogSpan;
+use leaderboard_contract::report::{ContentId, Patience};
 
 /// A queue whose time is ours.
 struct Bench {

@@ -103,8 +103,8 @@ pub struct Tree {
     root: OwnedFd,
     path: PathBuf,
     /// A disk that hangs, while a test holds it, or fails.
-    #[cfg(test)]
-    pub(super) disk: std::sync::Mutex<Option<Errno>>,
+    #[cfg(any(test, feature = "fixtures"))]
+    pub disk: std::sync::Mutex<Option<Errno>>,
 }
 
 impl Tree {
@@ -117,7 +117,7 @@ impl Tree {
         Ok(Self {
             root: root.into(),
             path: path.to_owned(),
-            #[cfg(test)]
+            #[cfg(any(test, feature = "fixtures"))]
             disk: std::sync::Mutex::new(None),
         })
     }
@@ -129,7 +129,7 @@ impl Tree {
 
     /// Opens a regular file for reading; `None` if there is none.
     pub fn file(&self, relative: &str) -> Result<Option<(File, Stamp)>, TreeError> {
-        #[cfg(test)]
+        #[cfg(any(test, feature = "fixtures"))]
         if let Some(trouble) = self.disk.lock().ok().and_then(|disk| *disk) {
             return Err(trouble.into());
         }

@@ -3,7 +3,7 @@
 //! Used by all programs of the Pod that read, store or count files.
 
 use super::run::console;
-use leaderboard_runner::protocol::Pair;
+use leaderboard_protocol::files::Pair;
 
 /// Key of the merged file.
 pub const MERGED: &str = "agent/agent_results.json";

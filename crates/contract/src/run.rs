@@ -5,7 +5,7 @@
 use serde::{Deserialize, Serialize};
 
 use leaderboard_api::{Attempt, Enforcement, LogGroup, RunPlan, Verify};
-use leaderboard_runner::protocol::Pair;
+use leaderboard_protocol::files::Pair;
 
 /// Environment variable with the JSON of [`Run`].
 pub const ENV_RUN: &str = "LEADERBOARD_RUN";

@@ -15,9 +15,9 @@ mod tests {
     use serde_json::Value;
 
     use super::*;
-    use crate::pod::report::{OWNER_SCHEMA, Owner, Report, ReportError, SCHEMA as REPORT_SCHEMA};
-    use crate::pod::run::{Run, SCHEMA as RUN_SCHEMA};
-    use crate::pod::verdict::{NotAVerdict, VERDICT_SCHEMA, WorkspaceReason, WorkspaceVerdict};
+    use crate::report::{OWNER_SCHEMA, Owner, Report, ReportError, SCHEMA as REPORT_SCHEMA};
+    use crate::run::{Run, SCHEMA as RUN_SCHEMA};
+    use crate::verdict::{NotAVerdict, VERDICT_SCHEMA, WorkspaceReason, WorkspaceVerdict};
     use leaderboard_api::Attempt;
 
     const REPORT_1: &str = include_str!("golden/report-1.json");

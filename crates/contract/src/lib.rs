@@ -1,0 +1,11 @@
+//! What the controller and the programs in a Pod agree on: what a Pod is given (`run`), what it reports (`report`), what `workspace`
+//! ends with (`verdict`), the names of what is stored (`keys`), and which versions of these documents are read (`schema`).
+//!
+//! Pods and controller may be of different versions, so that each document has a number. Golden files hold each version that was.
+#![cfg_attr(not(test), deny(clippy::indexing_slicing, clippy::arithmetic_side_effects))]
+
+pub mod keys;
+pub mod report;
+pub mod run;
+pub mod schema;
+pub mod verdict;
