@@ -24,38 +24,29 @@ async fn why_shows_state_cause_and_next_step() {
         (
             "in-line",
             waiting(),
-            &[
-                "in-line is Pending since 2026-11-01 10:00:00 UTC (",
-                "In line:     position 3; starts in about 20-35 min. concurrency.total is 2.",
-                "Next:        Wait, or raise the limits.",
-            ][..],
+            &["in-line is Pending", "position 3", "concurrency.total"][..],
         ),
         (
             "crashed",
             failed("Participant", "AgentCrashed"),
             &[
-                "Failure:     AgentCrashed in worker 2: participant failure, counts as an attempt.",
+                "AgentCrashed in worker 2",
                 "aws s3 cp s3://results/42/evalai/environment_log.txt -",
-                "Next:        Look at agent/agent2/leaderboard.log of the results; the participant fixes the agent",
+                "agent/agent2/leaderboard.log",
             ],
         ),
         (
             "lost",
             failed("Infrastructure", "NodeLost"),
             &[
-                "Failure:     NodeLost in worker 2: infrastructure failure, does not count as an attempt.",
+                "NodeLost in worker 2",
                 &format!("kubectl leaderboard resume lost -n {}", terminal.namespace),
             ],
         ),
         (
             "done",
             finished(),
-            &[
-                "Progress:    20/20 routes done, Driving score 43.13.",
-                "Results:     s3://results/42",
-                "EvalAI:      Published: EvalAI has the result.",
-                "Next:        Nothing.",
-            ],
+            &["20/20 routes done", "s3://results/42", "EvalAI:      Published"],
         ),
     ] {
         terminal.submission(name, &json!({}), &status).await;
@@ -76,18 +67,12 @@ async fn why_names_a_leaderboard_that_is_missing_or_paused() {
     terminal.submission("a", &json!({}), &status).await;
     for arguments in [&["why", "a"][..], &["why"]] {
         let words = terminal.run(arguments).await.well();
-        assert_has(
-            &words,
-            &["There is no Leaderboard local in this namespace: nothing new starts."],
-        );
+        assert_has(&words, &["no Leaderboard local"]);
     }
     terminal.leaderboard(&json!({"paused": true})).await;
     for arguments in [&["why", "a"][..], &["why"]] {
         let words = terminal.run(arguments).await.well();
-        assert_has(
-            &words,
-            &["Leaderboard local is paused: nothing new starts, and running submissions continue."],
-        );
+        assert_has(&words, &["Leaderboard local is paused"]);
     }
 }
 
@@ -116,10 +101,10 @@ async fn cancel_is_requested_once_and_not_after_the_end() {
     terminal.leaderboard(&json!({"deadlines": {"cancelSeconds": 77}})).await;
     terminal.submission("runs", &json!({}), &running()).await;
     let words = terminal.run(&["cancel", "runs"]).await.well();
-    assert_has(&words, &["Cancelling runs.", "After 77 s the Job is"]);
+    assert_has(&words, &["Cancelling runs.", "77 s"]);
     assert_eq!(terminal.requested("runs").await, (1, true));
     let words = terminal.run(&["cancel", "runs"]).await.well();
-    assert_has(&words, &["runs is already being cancelled."]);
+    assert_has(&words, &["already"]);
 
     for (name, status) in [
         ("done", finished()),
@@ -128,13 +113,7 @@ async fn cancel_is_requested_once_and_not_after_the_end() {
     ] {
         terminal.submission(name, &json!({}), &status).await;
         let words = terminal.run(&["cancel", name]).await.refused();
-        assert_has(
-            &words,
-            &[
-                "since 2026-11-01 10:00:00 UTC",
-                "so there is nothing to cancel. See `kubectl leaderboard why",
-            ],
-        );
+        assert_has(&words, &["since 2026-11-01 10:00:00 UTC", "nothing to cancel"]);
         assert_eq!(terminal.requested(name).await, (1, false));
     }
 }
@@ -147,16 +126,10 @@ async fn resume_raises_the_attempt_of_what_failed_or_was_cancelled() {
         .submission("failed", &json!({}), &failed("Infrastructure", "NodeLost"))
         .await;
     let words = terminal.run(&["resume", "failed"]).await.well();
-    assert_has(
-        &words,
-        &[
-            "Requested attempt 2 of failed.",
-            "continues from the results in s3://results/42",
-        ],
-    );
+    assert_has(&words, &["Requested attempt 2 of failed.", "s3://results/42"]);
     assert_eq!(terminal.requested("failed").await, (2, false));
     let words = terminal.run(&["resume", "failed"]).await.refused();
-    assert_has(&words, &["attempt 2 of failed is already requested"]);
+    assert_has(&words, &["already requested"]);
     assert_eq!(terminal.requested("failed").await, (2, false));
 
     let cancelled = end("Cancelled", "Cancelled");
@@ -173,15 +146,9 @@ async fn resume_of_anything_else_is_refused_with_the_next_step() {
     terminal.submission("runs", &json!({}), &running()).await;
     terminal.submission("done", &json!({}), &finished()).await;
     let words = terminal.run(&["resume", "runs"]).await.refused();
-    assert_has(
-        &words,
-        &[
-            "runs is Running; only Failed and Cancelled submissions can be resumed.",
-            "kubectl leaderboard resume runs",
-        ],
-    );
+    assert_has(&words, &["runs is Running", "kubectl leaderboard resume runs"]);
     let words = terminal.run(&["resume", "done"]).await.refused();
-    assert_has(&words, &["done has finished and cannot be resumed."]);
+    assert_has(&words, &["has finished"]);
     for name in ["runs", "done"] {
         assert_eq!(terminal.requested(name).await, (1, false));
     }
@@ -197,14 +164,7 @@ async fn what_the_api_server_refuses_is_done_in_evalai() {
     spec["attempt"] = json!(9999);
     terminal.submission("submission-42", &spec, &status).await;
     let words = terminal.run(&["resume", "submission-42"]).await.refused();
-    assert_has(
-        &words,
-        &[
-            "the API server refused the change: ",
-            "9999",
-            "Resume submission 42 in EvalAI (challenge 3)",
-        ],
-    );
+    assert_has(&words, &["the API server refused", "9999", "EvalAI (challenge 3)"]);
 }
 
 #[tokio::test]

@@ -28,6 +28,12 @@ pub(super) fn assert_shown(name: &str, lines: impl Fn(Frame) -> Vec<String>) {
     assert_golden(name, &text);
 }
 
+/// Compares texts with their file.
+pub(super) fn assert_texts(name: &str, texts: &[(&str, String)]) {
+    let texts = texts.iter().map(|(what, text)| format!("=== {what}\n{text}\n"));
+    assert_golden(name, &texts.collect::<String>());
+}
+
 /// No line is wider than the terminal, unless it is something to copy alone.
 pub(super) fn assert_fits(name: &str, lines: &[String], width: usize) {
     for line in lines {
