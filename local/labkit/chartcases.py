@@ -234,7 +234,8 @@ def lease(controller: str) -> list[Access]:
 
 # Of the ClusterRole, unless rbac.clusterRole is false.
 WHOLE = (
-    *may(CONTROLLER, "get list watch", "nodes", ""),
+    *may(CONTROLLER, "list watch", "nodes", ""),
+    *may_not(CONTROLLER, "get", "nodes", ""),
     *may_not(CONTROLLER, "get list watch", "coordination.k8s.io/leases", ""),
     *may_not(CONTROLLER, "list", "pods", ""),
 )
@@ -258,7 +259,8 @@ CLUSTER_WIDE = (
     *never(CONTROLLER, BRIDGE),
     *lease(CONTROLLER),
     *may(CONTROLLER, "get", "secrets", name="evalai"),
-    *may(CONTROLLER, "get list watch", "nodes", ""),
+    *may(CONTROLLER, "list watch", "nodes", ""),
+    *may_not(CONTROLLER, "get", "nodes", ""),
 )
 # ci/roles.yaml: another account, secrets in two namespaces.
 WITH_ROLES = (

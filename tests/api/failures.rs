@@ -144,7 +144,7 @@ async fn after_a_controller_that_did_not_confirm_its_requests_everybody_reads_un
 async fn a_silent_node_is_replaced_before_the_grace_and_costs_no_attempt() {
     let world = World::new().await;
     world.leaderboard("lb", 1, "Hosts").await;
-    let _controller = world.controller();
+    let _controller = world.controller_with_nodes();
     let cluster = world.cluster().on_node("silent");
     let silent = json!({
         "type": "Ready", "status": "Unknown", "reason": "NodeStatusUnknown", "lastTransitionTime": ago(100),

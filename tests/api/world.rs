@@ -127,6 +127,15 @@ impl World {
         self.installation("operator", "operator:1")
     }
 
+    /// The same, with a watch of the nodes.
+    pub(super) fn controller_with_nodes(&self) -> tokio::sync::watch::Sender<bool> {
+        let settings = Settings {
+            has_cluster_rights: true,
+            ..self.settings("operator", "operator:1")
+        };
+        self.start("operator", settings, None)
+    }
+
     /// The same with this Lease and this image.
     pub(super) fn installation(&self, lease: &str, image: &str) -> tokio::sync::watch::Sender<bool> {
         self.replica(lease, image, None)
@@ -134,24 +143,35 @@ impl World {
 
     /// A replica of it, with a page or without.
     pub(super) fn replica(&self, lease: &str, image: &str, page: Option<Page>) -> tokio::sync::watch::Sender<bool> {
+        self.start(lease, self.settings(lease, image), page)
+    }
+
+    fn settings(&self, lease: &str, image: &str) -> Settings {
+        Settings {
+            own: OwnImage {
+                image: image.into(),
+                ..OwnImage::default()
+            },
+            operator: self.lease(lease).installation(),
+            namespaces: Namespaces::of([self.namespace.clone()]),
+            has_cluster_rights: false,
+            allowed: Allowed::default(),
+            concurrency: 4,
+        }
+    }
+
+    fn lease(&self, name: &str) -> leader::Settings {
+        leader::Settings::new(&self.namespace, name, Identity::random("test"))
+    }
+
+    fn start(&self, lease: &str, settings: Settings, page: Option<Page>) -> tokio::sync::watch::Sender<bool> {
         let (sender, stop) = Stop::new();
         let clients = Clients {
             api: self.client.clone(),
             watch: self.client.clone(),
             lease: self.client.clone(),
         };
-        let lease = leader::Settings::new(&self.namespace, lease, Identity::random("test"));
-        let settings = Settings {
-            own: OwnImage {
-                image: image.into(),
-                ..OwnImage::default()
-            },
-            operator: lease.installation(),
-            namespaces: Namespaces::of([self.namespace.clone()]),
-            has_cluster_rights: false,
-            allowed: Allowed::default(),
-            concurrency: 4,
-        };
+        let lease = self.lease(lease);
         let aws = self.aws.aws.clone();
         tokio::spawn(run::run(clients, lease, settings, aws, page, Observability::new(stop)));
         sender

@@ -67,17 +67,6 @@ pub fn controller(scene: &Scene) -> Kept {
     Start::controller(scene).keep(scene)
 }
 
-/// Starts a controller that watches the cluster's nodes, and keeps it running.
-pub fn controller_with_nodes(scene: &Scene) -> Kept {
-    let mut start = Start::controller(scene);
-    let rights = start
-        .arguments
-        .iter()
-        .position(|argument| argument == "--cluster-rights");
-    "true".clone_into(&mut start.arguments[rights.unwrap() + 1]);
-    start.keep(scene)
-}
-
 /// Starts a controller that looks names up in these lines of `/etc/hosts`, and keeps it running.
 pub fn controller_with_hosts(scene: &Scene, hosts: &str) -> Kept {
     let path = scene.logs.join("hosts");
@@ -133,12 +122,10 @@ pub async fn kept(scene: &Scene, start: impl Fn(&Scene) -> Process) -> Infallibl
 impl Start {
     fn controller(scene: &Scene) -> Self {
         let (image, namespace) = (&scene.lab.image, &scene.namespace);
-        // Nodes are shared by all tests, and each is asked for by name.
         let arguments = [
             ["--image", image],
             ["--lease", LEASE],
             ["--lease-namespace", namespace],
-            ["--cluster-rights", "false"],
         ];
         Self {
             arguments: arguments.as_flattened().iter().map(|&text| text.to_owned()).collect(),

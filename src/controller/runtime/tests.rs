@@ -18,14 +18,13 @@ use crate::kubernetes::Namespaces;
 use leaderboard_base::shutdown::Stop;
 
 /// All that runs in a leader without Leaderboards, in the order of names.
-const TASKS: [&str; 19] = [
+const TASKS: [&str; 18] = [
     "events of Jobs",
     "events of Pods",
     "gauges",
     "inbox",
     "lease",
     "looks",
-    "lookups",
     "nodes",
     "policies",
     "reconciles",

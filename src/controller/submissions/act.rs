@@ -162,7 +162,6 @@ impl Actor<'_> {
         let (uses, workers, submission) = (self.uses, self.uses.workers, self.submission());
         match question {
             Question::Row(row) => workers.rows.want(&key_of(submission), *row, log_span_of(submission)),
-            Question::Node(name) => workers.lookups.want(submission, &name),
             Question::Evalai => {
                 uses.memory.asks_evalai(submission);
                 uses.external.ask(self.view);

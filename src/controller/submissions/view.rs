@@ -147,7 +147,7 @@ impl PodView {
     }
 }
 
-/// The Pod's node, which is read while the Pod runs or is being deleted.
+/// The Pod's node, while the Pod runs or is being deleted.
 #[derive(Clone, Copy, Debug, Default, PartialEq, Eq)]
 pub enum ObservedNode {
     /// There was no reason to look, or no right to.
@@ -167,8 +167,6 @@ pub struct NodeView {
     pub state: ObservedNode,
     /// The taint that announces its end.
     pub leaving: Option<String>,
-    /// A watch shows the nodes; else each has to be asked for.
-    pub is_watched: bool,
 }
 
 /// What an autoscaler has reported of a Pod that no node accepts.

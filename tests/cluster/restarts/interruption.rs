@@ -15,7 +15,7 @@ use tokio::time::Instant;
 
 use super::super::losses::{assert_finished, assert_interrupted_once, half_way};
 use super::super::matrix::Case;
-use crate::operator::controller_with_nodes;
+use crate::operator::controller;
 use crate::scene::{Scene, say, scenario};
 
 /// As Karpenter announces that it takes a node away.
@@ -29,7 +29,7 @@ const ASKED_WITHIN: Duration = Duration::from_secs(15);
 #[ignore = "it disturbs all other tests: make test runs it after them"]
 async fn a_node_that_is_about_to_be_taken_away_costs_one_route_of_each_pair_and_no_retry() {
     scenario("interrupted", async |scene: &Scene| {
-        let _controller = controller_with_nodes(scene);
+        let _controller = controller(scene);
         half_way(scene, "lost", 0).await;
         let pod = scene.pod("lost").await;
         let node = pod.spec.as_ref().and_then(|spec| spec.node_name.clone()).unwrap();

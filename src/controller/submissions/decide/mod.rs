@@ -63,7 +63,6 @@ pub fn decide(view: &View) -> Plan {
             draft.act_first(Action::SetFinalizer(true));
         }
     }
-    look_up_node(&mut draft);
     let report = reading::demand(&draft);
     draft.into_plan(report)
 }
@@ -74,19 +73,6 @@ fn decide_stage(draft: &mut PlanBuilder<'_>) {
     }
     if draft.is_finished() {
         after::decide(draft);
-    }
-}
-
-/// Where nodes are not watched, that of a Pod is asked for once it runs or is being deleted.
-fn look_up_node(draft: &mut PlanBuilder<'_>) {
-    let pod = draft
-        .view
-        .pod
-        .as_ref()
-        .filter(|pod| !draft.view.node.is_watched && pod.needs_node());
-    let node = pod.filter(|pod| pod.delete_by.is_some() || pod.agent_started.is_some());
-    if let Some(name) = node.and_then(|pod| pod.node.clone()) {
-        draft.act(Action::Ask(Question::Node(name)));
     }
 }
 

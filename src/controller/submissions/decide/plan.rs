@@ -100,8 +100,6 @@ pub enum Action {
 pub enum Question {
     /// Does another program's row of the table show a run?
     Row(Box<Row>),
-    /// Does this node report?
-    Node(String),
     /// Does EvalAI want it to run?
     Evalai,
     /// Does it still, whatever was answered before?

@@ -2,7 +2,6 @@
 
 pub mod causes;
 pub mod job;
-pub mod lookups;
 pub mod node;
 pub mod pod;
 pub mod workers;
@@ -117,14 +116,10 @@ fn children(uses: Uses<'_>, submission: &Submission) -> (ObservedJob, Option<Pod
     (ObservedJob::Ours(job), Some(pod))
 }
 
-/// The node of a Pod that has not ended, as its watch shows it, or as it was last asked for.
+/// The node of a Pod that has not ended.
 fn node(uses: Uses<'_>, pod: Option<&PodView>) -> NodeView {
     let name = pod.filter(|pod| pod.needs_node()).and_then(|pod| pod.node.as_deref());
-    let known = |name| node::watched(uses.stores, name).unwrap_or_else(|| uses.workers.lookups.node(name));
-    NodeView {
-        is_watched: node::is_watched(uses.stores),
-        ..name.map(known).unwrap_or_default()
-    }
+    name.map(|name| node::watched(uses.stores, name)).unwrap_or_default()
 }
 
 fn is_owned_by(job: &Job, submission: &Submission) -> bool {

@@ -1,18 +1,17 @@
-//! Whether a Pod's node still reports, and whether it is about to be taken away, as the watch of nodes shows it, or read where there
-//! is none. Of a Pod that is being deleted the answer decides between waiting for its kubelet and giving the Pod up; of one that
-//! runs, people learn of it before Kubernetes has given the Pod up, and its results are stored before the node is gone.
+//! The node of a Pod as the watch of nodes shows it: it reports, is silent, is about to go, or is gone. For a Pod that is being deleted
+//! this decides between waiting for its kubelet and giving the Pod up. For a running Pod, people learn of a silent node before
+//! Kubernetes has given the Pod up, and the results are stored before the node is gone.
 
 use std::collections::HashMap;
 
 use futures::StreamExt;
 use kube::runtime::reflector::ObjectRef;
-use kube::{Api, Client};
 
 use crate::controller::objects::Wake;
 use crate::controller::stores::Stores;
 use crate::controller::submissions::view::{NodeView, ObservedNode};
 use crate::kubernetes::objects::{Node, Pod};
-use crate::kubernetes::{Item, Store, WatchEvents, call};
+use crate::kubernetes::{Store, WatchEvents};
 use leaderboard_api::Submission;
 
 /// Taints with which a cluster announces that a node is about to go: Karpenter, cluster-autoscaler, and a person or a controller
@@ -25,16 +24,13 @@ const LEAVING: [&str; 3] = [
 /// What those of the AWS Node Termination Handler begin with: `spot-itn`, `scheduled-maintenance`, and others.
 const TERMINATION_HANDLER: &str = "aws-node-termination-handler/";
 
-/// Whether there is a watch that can be relied on.
-pub(super) fn is_watched(stores: &Stores) -> bool {
-    stores.nodes.as_ref().is_some_and(|nodes| nodes.synced.is_true())
-}
-
-/// What a watch shows of a node; None without a watch that can be relied on.
-pub(super) fn watched(stores: &Stores, name: &str) -> Option<NodeView> {
-    let nodes = stores.nodes.as_ref().filter(|_| is_watched(stores))?;
+/// A node as its watch shows it. It is unknown without the right to watch nodes, and while the API server does not answer the watch.
+pub(super) fn watched(stores: &Stores, name: &str) -> NodeView {
+    let Some(nodes) = stores.nodes.as_ref().filter(|nodes| nodes.synced.is_true()) else {
+        return NodeView::default();
+    };
     let found = nodes.store.get(&ObjectRef::new(name));
-    Some(found.map_or_else(gone, |node| of(&node)))
+    found.map_or_else(gone, |node| of(&node))
 }
 
 /// Wakes the submissions of a node when it falls silent, reports again, is about to go or goes. All Pods are walked then, which is
@@ -59,19 +55,6 @@ pub async fn wake(mut nodes: WatchEvents<Node>, pods: Store<Pod>, wake: Wake<Sub
     }
 }
 
-/// Reads a node. Without the right to (an operator of one namespace has none) it stays unknown.
-pub(super) async fn read(client: &Client, name: &str) -> NodeView {
-    let nodes: Api<Item<Node>> = Api::all(client.clone());
-    match call("reading the node", name, nodes.get_opt(name)).await {
-        Ok(Some(node)) => node.object.map_or_else(|_| NodeView::default(), |node| of(&node)),
-        Ok(None) => gone(),
-        Err(error) => {
-            tracing::debug!("{error}");
-            NodeView::default()
-        }
-    }
-}
-
 fn gone() -> NodeView {
     NodeView {
         state: ObservedNode::Gone,
@@ -80,7 +63,7 @@ fn gone() -> NodeView {
 }
 
 /// A node of which there is nothing to be known.
-pub(super) fn healthy() -> NodeView {
+fn healthy() -> NodeView {
     NodeView {
         state: ObservedNode::Reports,
         ..NodeView::default()

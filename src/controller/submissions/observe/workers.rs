@@ -3,7 +3,6 @@
 use kube::Client;
 use kube::runtime::reflector::ObjectRef;
 
-use super::lookups::Lookups;
 use crate::ask::{self, Asker};
 use crate::controller::objects::Wake;
 use crate::controller::submissions::archive::ArchiveWorkers;
@@ -16,7 +15,6 @@ use leaderboard_base::tasks::Tasks;
 /// Who asks them, and what was answered.
 pub struct Workers {
     pub archive: ArchiveWorkers,
-    pub lookups: Lookups,
     pub rows: Asker<Row>,
 }
 
@@ -25,7 +23,6 @@ impl Workers {
     pub fn start(aws: &Aws, client: &Client, tasks: &Tasks, wake: impl Fn() -> Wake<Submission>) -> Self {
         Self {
             archive: ArchiveWorkers::new(aws.clone(), client.clone(), tasks.clone(), wake()),
-            lookups: Lookups::start(client.clone(), tasks, wake()),
             rows: rows::start(aws, tasks, by_key(wake())),
         }
     }

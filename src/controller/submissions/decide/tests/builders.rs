@@ -114,10 +114,7 @@ impl World {
                 turn: Turn::Go,
                 job: ObservedJob::Absent { refused: None },
                 pod: None,
-                node: NodeView {
-                    is_watched: true,
-                    ..NodeView::default()
-                },
+                node: NodeView::default(),
                 // Whatever is asked for is there already; the tests of waiting set it otherwise.
                 report: ReportView {
                     stage: Some(Stage::JobEnded),

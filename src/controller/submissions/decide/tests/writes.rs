@@ -83,20 +83,3 @@ fn only_of_a_team_is_there_a_row() {
         assert_eq!(updates(&mut world), of(TableUpdate::End));
     }
 }
-
-#[test]
-fn a_node_is_asked_for_where_none_are_watched_and_only_for_a_pod_that_runs_or_goes() {
-    let asks = |world: &mut World| has(&world.pass(), |a| *a == Action::Ask(Question::Node("node-a".into())));
-    let mut world = World::local().with_pod();
-    world.view.node.is_watched = false;
-    assert!(!asks(&mut world), "it does not run yet");
-    let mut going = world.clone();
-    going.pod().delete_by = Some(at(700));
-    assert!(asks(&mut going));
-    let mut world = World::local().running();
-    assert!(!asks(&mut world), "a watch shows it");
-    world.view.node.is_watched = false;
-    assert!(asks(&mut world));
-    world.pod().run_ended = Some(at(20));
-    assert!(!asks(&mut world), "it has ended");
-}
