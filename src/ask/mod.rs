@@ -7,8 +7,7 @@
 //! ```
 //!
 //! A newer question replaces an older one. One read of an object is under way at a time: a question that comes meanwhile makes a
-//! second read. The last answer stays readable until then, with the question that it answers. A write is no question: nothing may
-//! replace one that is under way.
+//! second read. The last answer stays readable until then, with the question that it answers. Only news wakes the object.
 
 pub mod question;
 mod state;
@@ -16,6 +15,7 @@ mod state;
 mod tests;
 
 use std::sync::{Arc, Mutex};
+use std::time::Duration;
 
 use futures::StreamExt;
 use futures::stream::FuturesUnordered;
@@ -27,8 +27,19 @@ use leaderboard_base::lock::lock;
 use leaderboard_base::object_key::ObjectKey;
 use leaderboard_base::spans::LogSpan;
 use leaderboard_base::tasks::Tasks;
-use question::{Ask, Failure, Lookup};
+use question::{Answered, Ask, Failure, Lookup, Service};
 use state::{State, Work};
+
+/// What one read is about.
+#[derive(Clone, Debug)]
+pub struct Asked<Q: Ask> {
+    pub about: ObjectKey,
+    pub question: Q,
+    /// How long the question has waited.
+    pub waited: Duration,
+    /// The last answer, which may be one to an older question.
+    pub last: Option<Answered<Q>>,
+}
 
 /// Called with the object that has an answer.
 pub type Wake = Box<dyn Fn(&ObjectKey) + Send + Sync>;
@@ -43,13 +54,8 @@ struct Shared<Q: Ask> {
 }
 
 impl<Q: Ask> Asker<Q> {
-    /// Starts the task that asks. `ask` gets a question and the object that it is about.
-    pub fn start<F>(
-        name: &'static str,
-        tasks: &Tasks,
-        wake: Wake,
-        ask: impl Fn(Q, ObjectKey) -> F + Send + 'static,
-    ) -> Self
+    /// Starts the task that asks.
+    pub fn start<F>(name: &'static str, tasks: &Tasks, wake: Wake, ask: impl Fn(Asked<Q>) -> F + Send + 'static) -> Self
     where
         F: Future<Output = Result<Q::Answer, Failure>> + Send + 'static,
     {
@@ -61,8 +67,8 @@ impl<Q: Ask> Asker<Q> {
         Self(shared)
     }
 
-    /// Asks about an object, in place of what was asked about it before. The answer to the same question stays. An object that
-    /// stops asking is forgotten after ten minutes.
+    /// Asks about an object, in place of what was asked about it before. The answer to the same question stays. A question that is
+    /// not repeated for ten minutes is asked no more.
     pub fn want(&self, about: &ObjectKey, question: Q, log: LogSpan) {
         let is_new = lock(&self.0.state).want(about, question, log, Instant::now());
         if is_new {
@@ -75,20 +81,25 @@ impl<Q: Ask> Asker<Q> {
         lock(&self.0.state).get(uid, Instant::now())
     }
 
+    /// How many questions to a service have waited for an answer for longer than this.
+    pub fn waiting(&self, service: &Service, time: Duration) -> usize {
+        lock(&self.0.state).waiting(service, time, Instant::now())
+    }
+
     /// Drops the question and the answer. A read that is under way keeps its place until it ends, and wakes nobody.
     pub fn forget(&self, uid: &str) {
         lock(&self.0.state).forget(uid);
     }
 }
 
-async fn answer_all<Q: Ask, F>(shared: Arc<Shared<Q>>, wake: Wake, ask: impl Fn(Q, ObjectKey) -> F)
+async fn answer_all<Q: Ask, F>(shared: Arc<Shared<Q>>, wake: Wake, ask: impl Fn(Asked<Q>) -> F)
 where
     F: Future<Output = Result<Q::Answer, Failure>> + Send + 'static,
 {
     let mut under_way = FuturesUnordered::new();
     loop {
         while let Some(work) = begin(&shared) {
-            let reading = ask(work.question.clone(), work.about.clone());
+            let reading = ask(work.asked.clone());
             under_way.push(bounded(work, reading));
         }
         let due = lock(&shared.state).next_due(Instant::now());
@@ -98,7 +109,7 @@ where
             Some((work, result)) = under_way.next() => {
                 let is_news = lock(&shared.state).done(&work, result, Instant::now());
                 if is_news {
-                    wake(&work.about);
+                    wake(&work.asked.about);
                 }
             }
             () = shared.notify.notified() => {}

@@ -4,31 +4,46 @@ use std::fmt::{self, Debug};
 use std::sync::Arc;
 use std::time::Duration;
 
-use leaderboard_api::{Storage, Table};
+use leaderboard_api::{LogGroup, Queue, SecretsManagerKey, Storage, Table};
 
 /// One kind of question. Everything that makes an older answer useless is part of the question: the attempt, a digest, a stage.
 pub trait Ask: Clone + Debug + PartialEq + Send + 'static {
-    /// What is found.
-    type Answer: Debug + Send + Sync + 'static;
+    /// What is found. The same answer as before is no news.
+    type Answer: Debug + PartialEq + Send + Sync + 'static;
     /// Reads under way at once.
     const AT_ONCE: usize;
     /// Reads under way at once of one bucket, table or server: one that hangs leaves the rest to the others.
     const AT_ONCE_OF_A_SERVICE: usize;
     /// Time that one read may take.
     const LONGEST: Duration;
+    /// Time between the starts of two reads of one bucket, table or server.
+    const SPACING: Duration = Duration::ZERO;
 
     /// The service that a read may wait for.
     fn service(&self) -> Service;
 
-    /// After which pause the question is asked again, counted from its answer; None: the answer is good as long as anybody wants it.
-    /// `failures` counts those in a row.
-    fn again(&self, result: &Result<Self::Answer, Failure>, failures: u32) -> Option<Duration>;
+    /// The pause before the question is asked again, counted from its answer; None: the answer is good as long as anybody wants it.
+    /// `failures` counts those in a row. `waited` is the time without an answer since the question was first asked.
+    fn again(&self, result: &Result<Self::Answer, Failure>, failures: u32, waited: Duration) -> Option<Duration>;
+
+    /// Of the questions that are due, the lowest goes first.
+    fn rank(&self) -> Rank {
+        Rank::default()
+    }
+
+    /// True if what was asked by an older question is no answer any more, not even when that is asked again.
+    fn outdates(&self, _older: &Self) -> bool {
+        false
+    }
 }
 
-/// Why a question has no answer yet.
+/// The place of a question among those that are due: its class, and then a time in seconds.
+pub type Rank = (u8, i64);
+
+/// Why there is no answer of the kind that was asked for.
 #[derive(Clone, Debug, PartialEq, Eq)]
 pub struct Failure {
-    /// Waiting alone does not help: somebody has to do something.
+    /// The service has answered, and waiting alone does not help. Else it is silent.
     pub is_refused: bool,
     pub why: String,
 }
@@ -36,10 +51,22 @@ pub struct Failure {
 /// What is known of an object.
 #[derive(Clone, Debug)]
 pub struct Lookup<Q: Ask> {
+    /// The present question.
+    pub asked: Option<Q>,
     /// How long the present question has waited; None: it is answered, or there is none.
     pub waited: Option<Duration>,
-    /// The last answer, which may be one to an older question.
+    /// What came of the last read, which may answer an older question.
     pub last: Option<Answered<Q>>,
+    /// Present while the service does not answer.
+    pub silence: Option<Silence<Q>>,
+}
+
+/// A service that does not answer.
+#[derive(Clone, Debug)]
+pub struct Silence<Q: Ask> {
+    pub lasts: Duration,
+    /// The last answer before it.
+    pub before: Option<Answered<Q>>,
 }
 
 /// An answer.
@@ -64,8 +91,10 @@ impl<Q: Ask> Clone for Answered<Q> {
 impl<Q: Ask> Default for Lookup<Q> {
     fn default() -> Self {
         Self {
+            asked: None,
             waited: None,
             last: None,
+            silence: None,
         }
     }
 }
@@ -74,6 +103,14 @@ impl<Q: Ask> Lookup<Q> {
     /// The last answer, if it is one to this very question.
     pub fn answer_to(&self, question: &Q) -> Option<&Answered<Q>> {
         self.last.as_ref().filter(|last| last.question == *question)
+    }
+
+    /// The last answer before the service fell silent, or the last one.
+    pub fn known(&self) -> Option<&Answered<Q>> {
+        match &self.silence {
+            Some(silence) => silence.before.as_ref(),
+            None => self.last.as_ref(),
+        }
     }
 }
 
@@ -97,9 +134,39 @@ impl Service {
         Self::of("table", table.endpoint.as_deref(), table.region.as_deref(), &table.name)
     }
 
+    /// A queue, with its dead-letter queue.
+    pub fn queue(queue: &Queue) -> Self {
+        Self::of("queue", queue.endpoint.as_deref(), queue.region.as_deref(), &queue.url)
+    }
+
+    /// A log group.
+    pub fn log_group(group: &LogGroup) -> Self {
+        Self::of(
+            "log group",
+            group.endpoint.as_deref(),
+            group.region.as_deref(),
+            &group.name,
+        )
+    }
+
+    /// An entry of Secrets Manager.
+    pub fn secret(entry: &SecretsManagerKey) -> Self {
+        Self::of(
+            "the entry",
+            entry.endpoint.as_deref(),
+            entry.region.as_deref(),
+            &entry.id,
+        )
+    }
+
+    /// The cluster's own.
+    pub fn api_server() -> Self {
+        Self("the API server".to_owned())
+    }
+
     fn of(kind: &str, endpoint: Option<&str>, region: Option<&str>, name: &str) -> Self {
         Self(match (endpoint, region) {
-            (Some(endpoint), _) => endpoint.to_owned(),
+            (Some(endpoint), _) => format!("the server {endpoint}"),
             (None, Some(region)) => format!("{kind} {name} in {region}"),
             (None, None) => format!("{kind} {name}"),
         })

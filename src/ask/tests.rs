@@ -1,12 +1,9 @@
 //! Tests of asking, with a clock that stands still until everything waits.
 
-use std::sync::Arc;
-use std::time::Duration;
-
 use tokio::sync::{mpsc, watch};
 
-use super::question::Service;
-use super::state::KEPT;
+use super::question::Rank;
+use super::state::{KEPT, State};
 use super::*;
 use leaderboard_base::shutdown::Stop;
 
@@ -25,6 +22,8 @@ enum Outcome {
     Good,
     /// It is asked again every 30 s.
     Held,
+    /// What a question with a higher number was answered is of another run.
+    GoesOn,
     Fails,
 }
 
@@ -39,12 +38,16 @@ impl Ask for Question {
         Service::bucket(&serde_json::from_value(storage).unwrap())
     }
 
-    fn again(&self, result: &Result<u32, Failure>, failures: u32) -> Option<Duration> {
+    fn again(&self, result: &Result<u32, Failure>, failures: u32, _waited: Duration) -> Option<Duration> {
         match result {
             Err(_) => Some(3 * SECOND * 2_u32.pow(failures - 1)),
             Ok(_) if self.outcome == Outcome::Held => Some(30 * SECOND),
             Ok(_) => None,
         }
+    }
+
+    fn outdates(&self, older: &Self) -> bool {
+        self.outcome == Outcome::GoesOn && older.number > self.number
     }
 }
 
@@ -80,7 +83,7 @@ impl World {
         let (woken, wakes) = mpsc::unbounded_channel();
         let wake = Box::new(move |object: &ObjectKey| woken.send(object.name.clone()).unwrap());
         let (began, noted) = (Instant::now(), Arc::clone(&sent));
-        let ask = move |question: Question, about: ObjectKey| {
+        let ask = move |Asked { question, about, .. }: Asked<Question>| {
             let second = began.elapsed().as_secs();
             lock(&noted).push((about.uid, question.number, second));
             async move {
@@ -221,7 +224,11 @@ async fn the_last_answer_stays_readable_while_a_newer_question_waits() {
     );
     assert_eq!((world.known("u"), world.waited("u")), (Some((Some(1), 1, 2)), Some(0)));
     world.sent_until(4).await;
-    assert_eq!((world.known("u"), world.waited("u")), (Some((None, 2, 2)), None));
+    assert_eq!((world.known("u"), world.waited("u")), (Some((None, 2, 2)), Some(2)));
+    let looked = world.asker.get("u");
+    let before = looked.known().map(|before| before.question.number);
+    assert_eq!(before, Some(1), "also while the service is silent");
+    assert_eq!(looked.silence.map(|silence| silence.lasts.as_secs()), Some(1));
 }
 
 #[tokio::test(start_paused = true)]
@@ -256,7 +263,7 @@ async fn what_fails_is_asked_again_as_its_kind_decides() {
         world.sent_until(24).await,
         [0, 4, 11, 24].map(|second| sent("u", 1, second))
     );
-    assert_eq!(world.woken(), ["u"; 3], "each answer wakes it");
+    assert_eq!(world.woken(), ["u"], "only news wakes it");
     world.want("u", question(2));
     world.sent_until(26).await;
     world.want("u", fails);
@@ -321,4 +328,72 @@ async fn a_question_that_nobody_repeats_is_given_up() {
     world.sent_until(2 * kept).await;
     assert!(world.known("u").is_none());
     assert_eq!(world.sent_until(3 * kept).await, []);
+}
+
+#[tokio::test(start_paused = true)]
+async fn what_a_newer_question_outdates_is_no_answer_also_when_it_is_asked_again() {
+    let world = World::new();
+    let goes_on = |number| Question {
+        outcome: Outcome::GoesOn,
+        ..question(number)
+    };
+    world.want("u", goes_on(2));
+    world.sent_until(2).await;
+    assert_eq!(world.known("u"), Some((Some(2), 2, 2)));
+    world.want("u", goes_on(1));
+    assert!(world.known("u").is_none(), "it is dropped at once");
+    world.want("u", goes_on(2));
+    assert_eq!(world.sent_until(4).await, [sent("u", 2, 2)]);
+    // An earlier one that is under way is not taken in either.
+    let slow = Question {
+        takes: SECOND.mul_f64(1.5),
+        ..goes_on(3)
+    };
+    world.want("u", slow);
+    world.sent_until(5).await;
+    world.want("u", goes_on(1));
+    assert_eq!(world.sent_until(6).await, [sent("u", 1, 5)]);
+    assert!(world.known("u").is_none());
+    world.sent_until(7).await;
+    assert_eq!(world.known("u"), Some((Some(1), 1, 1)));
+}
+
+/// A question with a rank, to a service that is asked once a second.
+#[derive(Clone, Debug, PartialEq)]
+struct Paced(u8);
+
+impl Ask for Paced {
+    type Answer = ();
+    const AT_ONCE: usize = 9;
+    const AT_ONCE_OF_A_SERVICE: usize = 9;
+    const LONGEST: Duration = SECOND;
+    const SPACING: Duration = SECOND;
+
+    fn service(&self) -> Service {
+        question(0).service()
+    }
+
+    fn again(&self, _result: &Result<(), Failure>, _failures: u32, _waited: Duration) -> Option<Duration> {
+        None
+    }
+
+    fn rank(&self) -> Rank {
+        (self.0, 0)
+    }
+}
+
+#[test]
+fn the_first_rank_goes_first_and_starts_keep_their_distance() {
+    let (mut state, began) = (State::default(), Instant::now());
+    for (place, rank) in [1, 1, 0].into_iter().enumerate() {
+        let now = began + Duration::from_millis(place as u64);
+        state.want(&object(&place.to_string()), Paced(rank), LogSpan::default(), now);
+    }
+    let mut order = Vec::new();
+    for millis in (3..5000).step_by(100) {
+        while let Some(work) = state.next(began + Duration::from_millis(millis)) {
+            order.push((work.asked.about.uid, millis / 1000));
+        }
+    }
+    assert_eq!(order, [("2".to_owned(), 0), ("0".to_owned(), 1), ("1".to_owned(), 2)]);
 }

@@ -38,7 +38,7 @@ impl Ask for Row {
         Service::table(&self.table)
     }
 
-    fn again(&self, result: &Result<Self::Answer, Failure>, _failures: u32) -> Option<Duration> {
+    fn again(&self, result: &Result<Self::Answer, Failure>, _failures: u32, _waited: Duration) -> Option<Duration> {
         let is_free = matches!(result, Ok(None));
         (!is_free).then_some(AGAIN)
     }
@@ -64,8 +64,8 @@ mod tests {
             is_refused: true,
             why: "no".into(),
         };
-        assert_eq!(question.again(&Ok(None), 0), None);
-        assert_eq!(question.again(&Ok(Some(run)), 0), Some(AGAIN));
-        assert_eq!(question.again(&Err(unread), 9), Some(AGAIN));
+        assert_eq!(question.again(&Ok(None), 0, Duration::ZERO), None);
+        assert_eq!(question.again(&Ok(Some(run)), 0, Duration::ZERO), Some(AGAIN));
+        assert_eq!(question.again(&Err(unread), 9, Duration::ZERO), Some(AGAIN));
     }
 }

@@ -21,9 +21,9 @@ pub fn start(aws: &Aws, tasks: &Tasks, wake: Wake) -> Asker<Row> {
         aws: aws.clone(),
         known: Mutex::default(),
     });
-    Asker::start("rows", tasks, wake, move |row, _| {
+    Asker::start("rows", tasks, wake, move |asked| {
         let tables = Arc::clone(&tables);
-        async move { tables.read(&row).await }
+        async move { tables.read(&asked.question).await }
     })
 }
 

@@ -25,12 +25,12 @@ fn question(attempt: i64) -> Row {
 
 fn answer(question: Row, sent_ago: u64, result: Result<Option<ForeignRun>, Failure>) -> Lookup<Row> {
     Lookup {
-        waited: None,
         last: Some(Answered {
             question,
             sent_ago: Duration::from_secs(sent_ago),
             result: Arc::new(result),
         }),
+        ..Lookup::default()
     }
 }
 
