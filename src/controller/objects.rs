@@ -14,6 +14,11 @@ use leaderboard_base::spans::LogSpan;
 /// Puts an object into its work queue.
 pub type Wake<K> = Box<dyn Fn(ObjectRef<K>) + Send + Sync>;
 
+/// Wakes an object by its key.
+pub fn by_key<K: Resource<DynamicType = ()> + 'static>(wake: Wake<K>) -> crate::ask::Wake {
+    Box::new(move |key| wake(ObjectRef::new(&key.name).within(&key.namespace)))
+}
+
 /// The key of an object in every map of the controller: its UID, which a name does not replace.
 pub fn uid(object: &impl Resource) -> &str {
     object.meta().uid.as_deref().unwrap_or_default()

@@ -1,6 +1,6 @@
 //! The ResourceClaimTemplate of a Leaderboard whose workers claim their GPU: applied, never edited, and deleted when no Job needs it.
 //!
-//! Called by the probe. What stays of a Leaderboard that no longer claims is deleted with it.
+//! Called by `tried_pods`. What stays of a Leaderboard that no longer claims is deleted with it.
 
 use std::collections::BTreeSet;
 

@@ -1,14 +1,13 @@
 //! The reconcile of one Leaderboard: the policy of its Pods, its token and checks, its status and finalizer.
 //!
 //! Does nothing for a Leaderboard that another installation drives. Applies the policy before all else, since no Job is made without
-//! it. What its token is, and whether bucket, table and queues answer, is found by `looks`, in a task of its own that wakes this
-//! reconcile; it waits for the API server alone, and gives the way to EvalAI to `external`. `decide`, `probe::due` and `reach` are pure.
+//! it. Asks for its token, its bucket, table and queues and its Pods by `probe`, whose answers wake it. It waits for the API server alone,
+//! and gives the way to EvalAI to `external`. `decide` and `reach` are pure.
 
 pub mod claims;
 pub mod decide;
 pub mod isolated;
 pub mod isolation;
-pub mod looks;
 pub mod operator;
 mod places;
 mod pod_notes;
@@ -28,8 +27,6 @@ use std::time::Duration;
 use jiff::Timestamp;
 use kube::runtime::events::Recorder;
 use kube::runtime::reflector::ObjectRef;
-use tokio::sync::mpsc::UnboundedSender;
-use tokio::time::Instant;
 
 use super::objects::{key_of, uid_of, version, version_number};
 use super::settings::Settings;
@@ -42,9 +39,8 @@ use crate::observability::metrics::leader::{self, Gauge, Samples};
 use decide::{LeaderboardPlan, LeaderboardView, decide};
 use isolation::Policies;
 use leaderboard_api::{Leaderboard, names};
-use looks::Look;
-use probe::Probe;
-use state::{COUNTS_EVERY, LeaderboardState, Looked, RESYNC, SOONEST};
+use probe::{Asks, Looked};
+use state::{COUNTS_EVERY, LeaderboardState, RESYNC, SOONEST};
 use view::Policy;
 
 /// The first look at a spec gets so long before the status shows that it is under way: mostly it takes less, and saves a write.
@@ -59,7 +55,7 @@ pub struct Uses<'a> {
     pub settings: &'a Settings,
     pub slots: &'a Slots,
     pub external: &'a ExternalSystems,
-    pub looks: &'a UnboundedSender<Look>,
+    pub asks: &'a Asks,
 }
 
 /// What a reconcile came to.
@@ -92,26 +88,26 @@ pub async fn reconcile(leaderboard: Arc<Leaderboard>, uses: Uses<'_>) -> Result<
 
 /// One reconcile of a Leaderboard that this installation drives.
 async fn drive(leaderboard: Arc<Leaderboard>, uses: Uses<'_>) -> Result<Duration, CallError> {
-    let (uid, now) = (uid_of(leaderboard.as_ref()), Timestamp::now());
+    let now = Timestamp::now();
     let (writer, Policies { stores, state, .. }) = (uses.writer, uses.policies);
     // One that is being deleted keeps it too: its submissions may still run.
     let policy = isolation::keep(uses.policies, &leaderboard, now).await;
     let refusal = refusal::of(&uses.settings.allowed, &leaderboard);
-    let Looked { known, since } = match refusal {
+    // Where a Leaderboard names what it may not, nothing is asked.
+    let looked = match refusal {
         Some(_) => Looked::default(),
-        None => state.read(&uid, |entry| entry.looked.clone()),
+        None => uses.asks.ask(&leaderboard, is_refused(uses, &leaderboard)),
     };
     let view = LeaderboardView {
-        is_looked_at: refusal.is_some() || known.is_of(&leaderboard),
+        is_looked_at: looked.waits().is_none(),
         refusal,
-        ..observe(uses, &leaderboard, policy, &known, now)
+        ..observe(uses, &leaderboard, policy, &looked, now)
     };
     let plan = decide(&view);
     if let Some(found) = &view.measured {
         isolation::remember(state, &leaderboard, found);
     }
-    serve(uses, &view, &plan, &known);
-    let since = since.or_else(|| look(uses, &view, &known));
+    serve(uses, &view, &plan, &looked);
     let mut version = leaderboard.metadata.resource_version.clone();
     if let Some(wanted) = plan.finalizer {
         version = set_finalizer(writer, leaderboard.as_ref(), names::FINALIZER_LEADERBOARD, wanted).await?;
@@ -119,23 +115,19 @@ async fn drive(leaderboard: Arc<Leaderboard>, uses: Uses<'_>) -> Result<Duration
     if plan.finalizer == Some(false) {
         return Ok(RESYNC);
     }
-    let left = since.filter(|_| !view.is_looked_at);
-    let left = left.map(|since| FIRST_LOOK.saturating_sub(since.elapsed()));
+    let left = looked.waits().map(|waited| FIRST_LOOK.saturating_sub(waited));
     let again = match left.filter(|left| !left.is_zero()) {
         Some(left) => left,
         None => write_status(writer, state, &leaderboard, version.as_deref(), &plan, now).await?,
     };
-    // The end of a look wakes it.
-    let due = known.next(&leaderboard, is_refused(uses, &leaderboard), now);
-    let due = due.filter(|_| since.is_none());
-    let due = due.map_or(RESYNC, |at| at.duration_since(now).unsigned_abs());
+    let patience = looked.reach.patience().unwrap_or(RESYNC);
     let policy = isolation::again(&view.policy, stores.shows_policy(&view.leaderboard));
-    Ok(policy.min(due).max(SOONEST).min(again))
+    Ok(policy.min(patience).max(SOONEST).min(again))
 }
 
 /// Shows what a Leaderboard has left: its slots, the time of its token, and what lies in its queues. Nothing is shown of what is not known.
-pub fn show_limits(samples: &mut Samples, uses: Uses<'_>, leaderboard: &Leaderboard) {
-    let name = key_of(leaderboard).to_string();
+pub fn show_limits(samples: &mut Samples, uses: Uses<'_>, leaderboard: &Arc<Leaderboard>) {
+    let name = key_of(leaderboard.as_ref()).to_string();
     let mut show = |gauge: &Gauge<1>, value: Option<i64>| {
         if let Some(value) = value {
             samples.set(gauge, [&name], value);
@@ -145,17 +137,16 @@ pub fn show_limits(samples: &mut Samples, uses: Uses<'_>, leaderboard: &Leaderbo
     let rows = rows_waiting(uses, leaderboard).map(|rows| i64::try_from(rows).unwrap_or(i64::MAX));
     show(&leader::ROWS_WAITING, rows);
     if refusal::of(&uses.settings.allowed, leaderboard).is_none() {
-        let uid = uid_of(leaderboard);
-        uses.policies.state.read(&uid, |entry| entry.looked.known.show(show));
+        uses.asks.known(leaderboard).show(leaderboard, show);
     }
 }
 
 /// Hands the way to EvalAI to `external`. Of a Leaderboard that goes, or names what it may not, nothing more is sent there.
-fn serve(uses: Uses<'_>, view: &LeaderboardView, plan: &LeaderboardPlan, known: &Probe) {
+fn serve(uses: Uses<'_>, view: &LeaderboardView, plan: &LeaderboardPlan, looked: &Looked) {
     let leaderboard = &view.leaderboard;
     if view.refusal.is_some() || plan.finalizer == Some(false) {
         uses.external.retire(leaderboard);
-    } else if let Some(target) = known.target(leaderboard) {
+    } else if let Some(target) = looked.target(leaderboard) {
         uses.external.serve(leaderboard, target);
     }
 }
@@ -165,34 +156,17 @@ fn is_refused(uses: Uses<'_>, leaderboard: &Leaderboard) -> bool {
     uses.external.hub.token_refused(&key_of(leaderboard)).is_some()
 }
 
-/// Begins a look if something is due; returns when it began. Where a Leaderboard names what it may not, nothing is asked.
-fn look(uses: Uses<'_>, view: &LeaderboardView, known: &Probe) -> Option<Instant> {
-    let leaderboard = &view.leaderboard;
-    let key = key_of(leaderboard.as_ref());
-    let due = known.due(leaderboard, is_refused(uses, leaderboard), view.now);
-    if view.refusal.is_some() || due.is_nothing() {
-        return None;
-    }
-    let now = Instant::now();
-    uses.policies
-        .state
-        .change(&key.uid, |entry| entry.looked.since = Some(now));
-    // An error means that the task is gone, which ends the process.
-    let leaderboard = Arc::clone(leaderboard);
-    let _ = uses.looks.send(Look { leaderboard, due });
-    Some(now)
-}
-
 fn observe(
     uses: Uses<'_>,
     leaderboard: &Arc<Leaderboard>,
     policy: Policy,
-    probe: &Probe,
+    looked: &Looked,
     now: Timestamp,
 ) -> LeaderboardView {
     let (stores, hub) = (uses.policies.stores, &uses.external.hub);
     let key = key_of(leaderboard.as_ref());
     let submissions = stores.submissions_for(&ObjectRef::from_obj(leaderboard.as_ref()));
+    let tried = looked.pods();
     let census = Census::of(submissions.iter().map(AsRef::as_ref));
     LeaderboardView {
         now,
@@ -207,12 +181,12 @@ fn observe(
         measured: isolation::measured(uses.policies.state, leaderboard),
         refusal: None,
         is_looked_at: true,
-        invalid_pod: probe.invalid_pod(),
-        pod_notes: probe.pod_notes(),
-        claims: probe.claims.clone(),
-        unreachable: probe.reach.unreachable(now),
-        place_notes: probe.reach.notes(now),
-        evalai: standing::standing(hub, leaderboard, probe.token(leaderboard), now),
+        invalid_pod: tried.refused,
+        pod_notes: tried.notes,
+        claims: tried.claims,
+        unreachable: looked.reach.unreachable(),
+        place_notes: looked.reach.notes(),
+        evalai: standing::standing(hub, leaderboard, looked.token(leaderboard), now),
         evalai_writes_from: hub.writes_from(),
         usage: hub.usage(&key).map(standing::evalai_use),
         rows_waiting: rows_waiting(uses, leaderboard),
@@ -261,3 +235,7 @@ async fn write_status(
     state.change(&uid, |entry| entry.written = Some((now, version_number(&made))));
     Ok(RESYNC)
 }
+
+#[cfg(test)]
+#[path = "looks_tests.rs"]
+mod tests;

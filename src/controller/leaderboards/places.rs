@@ -1,14 +1,12 @@
-//! Asks AWS for a Leaderboard's bucket, table and queues: one cheap request each, all at once, each with a limit of time.
+//! Asks AWS for a Leaderboard's bucket, table and queues, by one cheap request each.
 //!
-//! Called by `probe`. When to ask, and what follows, is decided by `reach`.
+//! When to ask, and what follows, is decided by `reach`.
 
 use std::fmt::Display;
-use std::time::Duration;
+use std::sync::Arc;
 
-use futures::future::{BoxFuture, FutureExt, join_all};
-use jiff::Timestamp;
-
-use super::reach::{AwsResource, Finding, Reach};
+use super::reach::{AwsResource, Place, Seen};
+use crate::ask::question::Failure;
 use crate::controller::objects::key_of;
 use crate::services::archive::{Archive, ArchiveError};
 use crate::services::aws::Aws;
@@ -18,62 +16,11 @@ use crate::services::queue::{self, QueueError, Reading};
 use crate::services::table::{Table, TableError};
 use leaderboard_api::{self as api, Leaderboard};
 
-/// Time one answer may take.
-const LIMIT: Duration = Duration::from_secs(10);
 /// A run that nobody has: the list below it is empty, and costs nothing.
 const NO_RUN: &str = "none/";
 
-/// What was read of the queues that were asked.
-#[derive(Clone, Debug, Default, PartialEq, Eq)]
-pub(super) struct Readings {
-    pub(super) queue: Option<Reading>,
-    pub(super) dead_letters: Option<Reading>,
-}
-
-/// What has to be asked now, each with its address in words.
-pub(super) fn due(leaderboard: &Leaderboard, reach: &Reach, now: Timestamp) -> Vec<(AwsResource, String)> {
-    let generation = leaderboard.metadata.generation.unwrap_or_default();
-    let is_due = |(place, address): &(AwsResource, String)| reach.is_due(*place, address, generation, now);
-    named(leaderboard).into_iter().filter(is_due).collect()
-}
-
-/// Asks what is due.
-pub(super) async fn look(
-    aws: &Aws,
-    leaderboard: &Leaderboard,
-    reach: &mut Reach,
-    due: Vec<(AwsResource, String)>,
-    now: Timestamp,
-) -> Readings {
-    let generation = leaderboard.metadata.generation.unwrap_or_default();
-    let places: Vec<AwsResource> = named(leaderboard).iter().map(|(place, _)| *place).collect();
-    reach.retain(&places);
-    let asked = due.into_iter().map(|(place, address)| {
-        let question = ask(aws, leaderboard, place);
-        async move {
-            let answer = tokio::time::timeout(LIMIT, question).await;
-            let silent = || Finding::Silent(format!("{address} did not answer within {} s", LIMIT.as_secs()));
-            let (found, read) = answer.unwrap_or_else(|_| (silent(), None));
-            (place, address, found, read)
-        }
-    });
-    let mut readings = Readings::default();
-    for (place, address, found, read) in join_all(asked).await {
-        match place {
-            AwsResource::Queue => readings.queue = read,
-            AwsResource::DeadLetterQueue => readings.dead_letters = read,
-            AwsResource::Bucket | AwsResource::Table | AwsResource::Rows | AwsResource::LogGroup => {}
-        }
-        if let Finding::Bad(why) | Finding::Hidden(why) | Finding::Silent(why) = &found {
-            tracing::warn!(leaderboard = %key_of(leaderboard), place = address, why, "the bucket, table, queue or log group cannot be reached");
-        }
-        reach.take(place, &address, generation, found, now);
-    }
-    readings
-}
-
-/// What a Leaderboard names, each with its address in words.
-fn named(leaderboard: &Leaderboard) -> Vec<(AwsResource, String)> {
+/// The places that a Leaderboard names.
+pub(super) fn named(leaderboard: &Arc<Leaderboard>) -> Vec<Place> {
     let spec = &leaderboard.spec;
     let at = |region: &Option<String>, endpoint: &Option<String>| {
         let place = endpoint.as_ref().or(region.as_ref());
@@ -101,39 +48,40 @@ fn named(leaderboard: &Leaderboard) -> Vec<(AwsResource, String)> {
         let at = at(&group.region, &group.endpoint);
         places.push((AwsResource::LogGroup, format!("the log group {}{at}", group.name)));
     }
-    places
+    let place = |(resource, address)| Place {
+        resource,
+        address,
+        leaderboard: Arc::clone(leaderboard),
+    };
+    places.into_iter().map(place).collect()
 }
 
-fn ask<'a>(
-    aws: &'a Aws,
-    leaderboard: &'a Leaderboard,
-    place: AwsResource,
-) -> BoxFuture<'a, (Finding, Option<Reading>)> {
-    let spec = &leaderboard.spec;
-    if let (AwsResource::LogGroup, Some(group)) = (place, &spec.log_group) {
-        let days = group.retention_days.unwrap_or_default();
-        return async move { (of_log_group(log_groups::keep(aws, group, days).await), None) }.boxed();
-    }
-    match (place, &spec.table, &spec.queue) {
-        (AwsResource::Bucket, ..) => {
+/// Asks for one place.
+pub(super) async fn ask(aws: &Aws, place: &Place) -> Result<Seen, Failure> {
+    let spec = &place.leaderboard.spec;
+    let answer = match (place.resource, &spec.table, &spec.queue, &spec.log_group) {
+        (AwsResource::Table, Some(table), ..) => of_table(Table::describe(aws, table).await),
+        (AwsResource::Rows, Some(table), ..) => of_table(try_rows(aws, table).await),
+        (AwsResource::Queue, _, Some(queue), _) => of_queue(queue::check(aws, queue, &queue.url).await),
+        (AwsResource::DeadLetterQueue, _, Some(queue), _) => {
+            let url = queue.dead_letter_url.as_deref().unwrap_or_default();
+            of_queue(queue::check(aws, queue, url).await)
+        }
+        (AwsResource::LogGroup, .., Some(group)) => {
+            let days = group.retention_days.unwrap_or_default();
+            of_log_group(log_groups::keep(aws, group, days).await)
+        }
+        _ => {
             let prefix = format!("{}{NO_RUN}", spec.storage.prefix.as_deref().unwrap_or_default());
             let archive = Archive::of_storage(aws, &spec.storage).at_prefix(prefix);
-            async move { (of_bucket(archive.prefix_is_empty().await), None) }.boxed()
+            of_bucket(archive.prefix_is_empty().await)
         }
-        (AwsResource::Table, Some(table), _) => {
-            async move { (of_table(Table::describe(aws, table).await), None) }.boxed()
-        }
-        (AwsResource::Rows, Some(table), _) => async move { (of_table(try_rows(aws, table).await), None) }.boxed(),
-        (AwsResource::Queue, _, Some(queue)) => {
-            async move { of_queue(queue::check(aws, queue, &queue.url).await) }.boxed()
-        }
-        (AwsResource::DeadLetterQueue, _, Some(queue)) => {
-            let url = queue.dead_letter_url.as_deref().unwrap_or_default();
-            async move { of_queue(queue::check(aws, queue, url).await) }.boxed()
-        }
-        // It is named by nobody.
-        _ => async { (Finding::Good, None) }.boxed(),
+    };
+    if let Ok(Seen { hidden: Some(why), .. }) | Err(Failure { why, .. }) = &answer {
+        let leaderboard = key_of(place.leaderboard.as_ref());
+        tracing::warn!(%leaderboard, place = place.address, why, "the bucket, table, queue or log group cannot be reached");
     }
+    answer
 }
 
 /// Whether the table takes rows. The right to describe it does not include that.
@@ -141,34 +89,39 @@ async fn try_rows(aws: &Aws, table: &api::Table) -> Result<(), TableError> {
     Table::describe(aws, table).await?.try_write().await
 }
 
-/// What an answer means; a cause that passes is as none.
-fn finding<T, E: Display>(answer: Result<T, E>, is_passing: impl Fn(&E) -> bool) -> Finding {
-    match answer {
-        Ok(_) => Finding::Good,
-        Err(error) if is_passing(&error) => Finding::Silent(error.to_string()),
-        Err(error) => Finding::Bad(error.to_string()),
-    }
+/// What an answer means. A cause that passes is silence.
+fn seen<T, E: Display>(answer: Result<T, E>, passes: impl Fn(&E) -> bool) -> Result<Seen, Failure> {
+    answer.map(|_| Seen::default()).map_err(|error| Failure {
+        is_refused: !passes(&error),
+        why: error.to_string(),
+    })
 }
 
-fn of_bucket<T>(answer: Result<T, ArchiveError>) -> Finding {
-    finding(answer, |error| error.cause.is_transient())
+fn of_bucket<T>(answer: Result<T, ArchiveError>) -> Result<Seen, Failure> {
+    seen(answer, |error| error.cause.is_transient())
 }
 
-fn of_table<T>(answer: Result<T, TableError>) -> Finding {
-    finding(answer, |error| matches!(error, TableError::Passing { .. }))
+fn of_table<T>(answer: Result<T, TableError>) -> Result<Seen, Failure> {
+    seen(answer, |error| matches!(error, TableError::Passing { .. }))
 }
 
 /// The bridge reads the queue, with rights of its own.
-fn of_queue(answer: Result<Reading, QueueError>) -> (Finding, Option<Reading>) {
+fn of_queue(answer: Result<Reading, QueueError>) -> Result<Seen, Failure> {
     match answer {
-        Ok(reading) => (Finding::Good, Some(reading)),
-        Err(error) if error.fault == Fault::Denied => (Finding::Hidden(error.to_string()), None),
-        failed => (finding(failed, |error| error.fault.is_passing()), None),
+        Ok(reading) => Ok(Seen {
+            messages: Some((reading.visible, reading.in_flight)),
+            hidden: None,
+        }),
+        Err(error) if error.fault == Fault::Denied => Ok(Seen {
+            messages: None,
+            hidden: Some(error.to_string()),
+        }),
+        failed => seen(failed, |error| error.fault.is_passing()),
     }
 }
 
-fn of_log_group(answer: Result<(), LogGroupError>) -> Finding {
-    finding(answer, |error| error.fault.is_passing())
+fn of_log_group(answer: Result<(), LogGroupError>) -> Result<Seen, Failure> {
+    seen(answer, |error| error.fault.is_passing())
 }
 
 #[cfg(test)]
@@ -179,7 +132,6 @@ mod tests {
 
     #[test]
     fn a_refusal_of_aws_has_its_reason_and_next_step() {
-        use std::mem::discriminant;
         let archive = |cause| ArchiveError {
             op: "listing",
             object: "bucket/none/".into(),
@@ -197,11 +149,7 @@ mod tests {
             fault,
             text: "words".into(),
         };
-        let (bad, hidden, silent) = (
-            discriminant(&Finding::Bad(String::new())),
-            discriminant(&Finding::Hidden(String::new())),
-            discriminant(&Finding::Silent(String::new())),
-        );
+        let (bad, silent) = (Err(true), Err(false));
         let cases = [
             (of_bucket::<()>(Err(archive(Cause::NoBucket))), bad),
             (of_bucket::<()>(Err(archive(Cause::Denied("403".into())))), bad),
@@ -222,14 +170,15 @@ mod tests {
                 })),
                 silent,
             ),
-            (of_queue(Err(queue(Fault::Missing))).0, bad),
-            (of_queue(Err(queue(Fault::Denied))).0, hidden),
-            (of_queue(Err(queue(Fault::Throttled))).0, silent),
+            (of_queue(Err(queue(Fault::Missing))), bad),
+            (of_queue(Err(queue(Fault::Denied))), Ok(true)),
+            (of_queue(Err(queue(Fault::Throttled))), silent),
             (of_log_group(Err(group(Fault::Denied))), bad),
             (of_log_group(Err(group(Fault::Throttled))), silent),
         ];
-        for (found, kind) in cases {
-            assert_eq!(discriminant(&found), kind, "{found:?}");
+        for (found, expected) in cases {
+            let kind = found.as_ref().map(|seen| seen.hidden.is_some());
+            assert_eq!(kind.map_err(|failure| failure.is_refused), expected, "{found:?}");
         }
     }
 
@@ -243,10 +192,8 @@ mod tests {
         });
         let places = |spec: &serde_json::Value| {
             let board = Leaderboard::new("one", serde_json::from_value(spec.clone()).unwrap());
-            named(&board)
-                .into_iter()
-                .map(|(_, address)| address)
-                .collect::<Vec<_>>()
+            let named = named(&Arc::new(board)).into_iter();
+            named.map(|place| place.address).collect::<Vec<_>>()
         };
         assert_eq!(places(&spec), ["the bucket bucket"]);
         spec["table"] = json!({"name": "rows", "region": "eu-west-1"});

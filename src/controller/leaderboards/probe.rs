@@ -1,24 +1,23 @@
-//! What is known of a Leaderboard's token, its places in AWS and its Pods, when each of them has to be looked at, and the look itself.
-//!
-//! `looks` calls the look; a reconcile asks only what is known and what is due.
+//! What is asked of a Leaderboard's token, its places in AWS and its Pods. A reconcile asks and finds the answers in memory; an answer
+//! that is news wakes it.
 
+use std::collections::BTreeMap;
 use std::sync::Arc;
 use std::time::Duration;
 
-use jiff::{SignedDuration, Timestamp};
+use jiff::Timestamp;
 use k8s_openapi::api::core::v1::Secret;
-use kube::{Api, Client, ResourceExt};
+use kube::{Api, Client};
+use leaderboard_results::metrics;
 
-use super::claims;
-use super::places::{self, Readings};
-use super::priority;
-use super::reach::{AwsResource, Reach};
-use super::tried_pods::{TriedPods, try_pods};
-use crate::controller::leaderboards::token::TokenSource;
-use crate::controller::leaderboards::view::Claims;
+use super::places;
+use super::reach::{AwsResource, Place, Reach};
+use super::tried_pods::{self, Pods, TriedPods};
+use super::token::TokenSource;
+use crate::ask::question::{Ask, Failure, Lookup, Service};
+use crate::ask::{Asker, Wake};
 use crate::controller::objects::key_of;
 use crate::controller::settings::Settings;
-use crate::controller::stores::Stores;
 use crate::kubernetes::call;
 use crate::observability::metrics::leader::{self, Gauge};
 use crate::pod::carla::results_format;
@@ -26,148 +25,149 @@ use crate::services::aws::Aws;
 use crate::services::evalai::Target;
 use crate::services::token::Token;
 use leaderboard_api::{EvalaiMode, Leaderboard, Token as TokenPlace};
-use leaderboard_results::metrics;
+use leaderboard_base::spans::LogSpan;
+use leaderboard_base::tasks::Tasks;
 
 /// A token is looked at again after this long.
-const AGAIN: SignedDuration = SignedDuration::from_mins(5);
+const AGAIN: Duration = Duration::from_mins(5);
 /// A failed look is repeated sooner.
-const SOON: SignedDuration = SignedDuration::from_secs(15);
+const SOON: Duration = Duration::from_secs(15);
 /// A token that EvalAI refuses may be renewed at any moment, and runs wait for that.
-const REFUSED: SignedDuration = SignedDuration::from_secs(6);
+const REFUSED: Duration = Duration::from_secs(6);
 
-/// What a look uses.
-#[derive(Clone, Copy)]
-pub struct Uses<'a> {
-    pub client: &'a Client,
-    pub aws: &'a Aws,
-    pub stores: &'a Stores,
-    pub settings: &'a Settings,
-}
-
-/// What was last found.
-#[derive(Clone, Default)]
-pub(super) struct Probe {
-    /// Of which spec; of another one everything is due.
-    generation: Option<i64>,
-    token: Option<FoundToken>,
-    pub(super) reach: Reach,
-    /// Messages of the queue, visible and in flight, and of its dead-letter queue.
-    messages: Option<(u64, u64)>,
-    dead_letters: Option<u64>,
-    pods: TriedPods,
-    priority: priority::Problems,
-    priority_at: Option<Timestamp>,
-    pub(super) claims: Claims,
-    claims_at: Option<Timestamp>,
-}
-
-/// What a place had when it was last looked at.
-#[derive(Clone)]
-struct FoundToken {
+/// Asks for a Leaderboard's token.
+#[derive(Clone, Debug, PartialEq)]
+pub struct TokenQuestion {
     place: TokenPlace,
-    at: Timestamp,
-    token: Result<Arc<Token>, String>,
+    /// EvalAI refuses the token that is used now.
+    is_refused: bool,
 }
 
-/// What a look has to ask; of an edited Leaderboard its Pods are tried too.
-#[derive(Debug, Default, PartialEq, Eq)]
-pub struct Due {
-    priority: bool,
-    claims: bool,
-    token: bool,
-    places: Vec<(AwsResource, String)>,
-}
+impl Ask for TokenQuestion {
+    type Answer = Arc<Token>;
+    const AT_ONCE: usize = 16;
+    const AT_ONCE_OF_A_SERVICE: usize = 8;
+    const LONGEST: Duration = Duration::from_secs(30);
 
-impl Due {
-    pub(super) fn is_nothing(&self) -> bool {
-        *self == Self::default()
+    fn service(&self) -> Service {
+        let entry = self.place.secrets_manager.as_ref();
+        entry.map_or_else(Service::api_server, Service::secret)
+    }
+
+    fn again(&self, result: &Result<Arc<Token>, Failure>, _failures: u32, _waited: Duration) -> Option<Duration> {
+        Some(match result {
+            Ok(_) if self.is_refused => REFUSED,
+            Ok(_) => AGAIN,
+            Err(_) => SOON,
+        })
     }
 }
 
-impl Probe {
-    /// Whether all of the Leaderboard as it is was looked at.
-    pub(super) fn is_of(&self, leaderboard: &Leaderboard) -> bool {
-        self.generation == Some(generation_of(leaderboard))
-    }
+/// Asks for all that Leaderboards name.
+pub struct Asks {
+    token: Asker<TokenQuestion>,
+    pods: Asker<Pods>,
+    places: BTreeMap<AwsResource, Asker<Place>>,
+}
 
-    /// What has to be looked at now.
-    pub(super) fn due(&self, leaderboard: &Leaderboard, is_token_refused: bool, now: Timestamp) -> Due {
-        let is_edited = !self.is_of(leaderboard);
-        let has_classes = !self.pods.classes.is_empty();
-        let has_claims = self.claims != Claims::NotRequired;
-        Due {
-            priority: is_edited || has_classes && due(self.priority_at, self.priority.refused.is_none(), now),
-            claims: is_edited || has_claims && due(self.claims_at, self.claims == Claims::InPlace, now),
-            token: leaderboard.spec.evalai.is_some() && self.token_is_due(leaderboard, is_token_refused, now),
-            places: places::due(leaderboard, &self.reach, now),
-        }
-    }
-
-    fn token_is_due(&self, leaderboard: &Leaderboard, is_refused: bool, now: Timestamp) -> bool {
-        let Some(found) = self.token_of(leaderboard) else {
-            return true;
+impl Asks {
+    /// Starts the tasks. What `wake` makes is called with each Leaderboard of which there is news.
+    pub fn start(client: &Client, aws: &Aws, settings: &Settings, tasks: &Tasks, wake: impl Fn() -> Wake) -> Self {
+        let place = |(resource, task)| {
+            let aws = aws.clone();
+            let asker = Asker::start(task, tasks, wake(), move |asked| {
+                let aws = aws.clone();
+                async move { places::ask(&aws, &asked.question).await }
+            });
+            (resource, asker)
         };
-        let wait = if is_refused && found.token.is_ok() {
-            REFUSED
-        } else {
-            wait(found.token.is_ok())
-        };
-        has_passed(found.at, wait, now)
+        let (reader, secrets) = (client.clone(), aws.clone());
+        let token = Asker::start("ask tokens", tasks, wake(), move |asked| {
+            let (client, aws) = (reader.clone(), secrets.clone());
+            async move {
+                let TokenQuestion { place, .. } = &asked.question;
+                let read = read_token(&client, &aws, &asked.about.namespace, place).await;
+                read.map_err(|why| Failure { is_refused: true, why })
+            }
+        });
+        let (client, settings) = (client.clone(), settings.clone());
+        let pods = Asker::start("try Pods", tasks, wake(), move |asked| {
+            let (client, settings) = (client.clone(), settings.clone());
+            async move { Ok(tried_pods::try_pods(&client, &settings, &asked).await) }
+        });
+        Self {
+            token,
+            pods,
+            places: AwsResource::ALL.into_iter().map(place).collect(),
+        }
     }
 
-    /// Looks at what is due.
-    pub(super) async fn look(mut self, uses: Uses<'_>, leaderboard: &Leaderboard, due: Due, now: Timestamp) -> Self {
-        let (client, aws) = (uses.client, uses.aws);
-        let is_edited = !self.is_of(leaderboard);
-        if is_edited {
-            self.pods = try_pods(client, uses.settings, leaderboard).await;
+    /// Asks for all that a Leaderboard names.
+    pub(super) fn ask(&self, leaderboard: &Arc<Leaderboard>, is_token_refused: bool) -> Looked {
+        let (key, log) = (key_of(leaderboard.as_ref()), LogSpan::default);
+        if let Some(evalai) = &leaderboard.spec.evalai {
+            let question = TokenQuestion {
+                place: evalai.token.clone(),
+                is_refused: is_token_refused,
+            };
+            self.token.want(&key, question, log());
         }
-        if due.priority {
-            self.priority = priority::look(client, &self.pods.classes).await;
-            self.priority_at = Some(now);
-        }
-        if due.claims {
-            self.claims = claims::keep(client, leaderboard).await;
-            self.claims_at = Some(now);
-            // Right after an edit a Job of the spec before may be on its way.
-            if !is_edited
-                && self.claims == Claims::InPlace
-                && let Err(error) = claims::remove_others(client, leaderboard).await
-            {
-                tracing::warn!(leaderboard = %key_of(leaderboard), %error, "old ResourceClaimTemplates are not removed");
+        self.pods.want(&key, Pods(Arc::clone(leaderboard)), log());
+        for place in places::named(leaderboard) {
+            if let Some(asker) = self.places.get(&place.resource) {
+                asker.want(&key, place, log());
             }
         }
-        // A bucket that hangs must not keep EvalAI waiting.
-        let places = places::look(aws, leaderboard, &mut self.reach, due.places, now);
-        let token = find_token(client, aws, leaderboard, due.token.then_some(now));
-        let (readings, read) = tokio::join!(places, token);
-        self.token = read.or(self.token);
-        self.note_messages(leaderboard, &readings);
-        self.generation = Some(generation_of(leaderboard));
-        self
+        self.known(leaderboard)
     }
 
-    /// Keeps what SQS reported last of the queues that the Leaderboard still names.
-    fn note_messages(&mut self, leaderboard: &Leaderboard, readings: &Readings) {
-        let queue = leaderboard.spec.queue.as_ref();
-        let read = readings.queue.as_ref();
-        let messages = read.map(|read| (read.visible, read.in_flight)).or(self.messages);
-        self.messages = messages.filter(|_| queue.is_some());
-        let dead = readings.dead_letters.as_ref().map(|read| read.visible);
-        let has_dead = queue.is_some_and(|queue| queue.dead_letter_url.is_some());
-        self.dead_letters = dead.or(self.dead_letters).filter(|_| has_dead);
+    /// What is known of a Leaderboard.
+    pub(super) fn known(&self, leaderboard: &Arc<Leaderboard>) -> Looked {
+        let uid = key_of(leaderboard.as_ref()).uid;
+        let named = places::named(leaderboard).into_iter();
+        let known = |place: Place| Some((place.clone(), self.places.get(&place.resource)?.get(&uid)));
+        Looked {
+            token: self.token.get(&uid),
+            pods: self.pods.get(&uid),
+            reach: Reach(named.filter_map(known).collect()),
+        }
+    }
+
+    /// Drops what is known of a Leaderboard that is gone.
+    pub fn forget(&self, uid: &str) {
+        self.token.forget(uid);
+        self.pods.forget(uid);
+        self.places.values().for_each(|asker| asker.forget(uid));
+    }
+}
+
+/// What is known of all that a Leaderboard names.
+#[derive(Debug, Default)]
+pub(super) struct Looked {
+    token: Lookup<TokenQuestion>,
+    pods: Lookup<Pods>,
+    pub(super) reach: Reach,
+}
+
+impl Looked {
+    /// How long the Leaderboard as it is has been waited for; None: all of it was looked at.
+    pub(super) fn waits(&self) -> Option<Duration> {
+        let places = self.reach.0.iter().filter_map(|(_, lookup)| unanswered(lookup));
+        let others = [unanswered(&self.token), unanswered(&self.pods)];
+        places.chain(others.into_iter().flatten()).max()
     }
 
     /// Shows in metrics what is known of the token and the queues.
-    pub(super) fn show(&self, mut show: impl FnMut(&Gauge<1>, Option<i64>)) {
-        let token = self.token.as_ref().and_then(|found| found.token.as_ref().ok());
+    pub(super) fn show(&self, leaderboard: &Leaderboard, mut show: impl FnMut(&Gauge<1>, Option<i64>)) {
+        let token = self.token(leaderboard).and_then(|token| token.as_ref().ok());
         let ends = token.and_then(|token| token.expires());
         show(&leader::TOKEN_EXPIRY, ends.map(Timestamp::as_second));
-        let (visible, in_flight) = self.messages.unzip();
+        let (visible, in_flight) = self.reach.messages(AwsResource::Queue).unzip();
+        let dead = self.reach.messages(AwsResource::DeadLetterQueue);
         let messages = [
             (&leader::VISIBLE_MESSAGES, visible),
             (&leader::IN_FLIGHT_MESSAGES, in_flight),
-            (&leader::DEAD_LETTERS, self.dead_letters),
+            (&leader::DEAD_LETTERS, dead.map(|(visible, _)| visible)),
         ];
         for (gauge, count) in messages {
             show(gauge, count.map(|count| i64::try_from(count).unwrap_or(i64::MAX)));
@@ -198,81 +198,34 @@ impl Probe {
         })
     }
 
-    /// Its token, or why there is none, once it was looked for.
-    pub(super) fn token(&self, leaderboard: &Leaderboard) -> Option<&Result<Arc<Token>, String>> {
-        self.token_of(leaderboard).map(|found| &found.token)
-    }
-
     /// What was found where the Leaderboard names its token.
-    fn token_of(&self, leaderboard: &Leaderboard) -> Option<&FoundToken> {
+    pub(super) fn token(&self, leaderboard: &Leaderboard) -> Option<&Result<Arc<Token>, Failure>> {
         let place = &leaderboard.spec.evalai.as_ref()?.token;
-        self.token.as_ref().filter(|found| found.place == *place)
+        let found = self
+            .token
+            .last
+            .as_ref()
+            .filter(|found| found.question.place == *place)?;
+        Some(&found.result)
     }
 
-    pub(super) fn invalid_pod(&self) -> Option<String> {
-        self.pods.refused.clone().or_else(|| self.priority.refused.clone())
-    }
-
-    pub(super) fn pod_notes(&self) -> Vec<String> {
-        self.pods.notes.iter().chain(&self.priority.notes).cloned().collect()
-    }
-
-    /// When something has to be tried again.
-    pub(super) fn next(&self, leaderboard: &Leaderboard, is_token_refused: bool, now: Timestamp) -> Option<Timestamp> {
-        let token = self.token_of(leaderboard);
-        let missing = token.filter(|found| found.token.is_err()).map(|found| found.at);
-        let refused = token.filter(|found| is_token_refused && found.token.is_ok());
-        let refused = refused.and_then(|found| found.at.checked_add(REFUSED).ok());
-        let priority = self.priority_at.filter(|_| self.priority.refused.is_some());
-        let is_missing = matches!(self.claims, Claims::NotServed | Claims::Missing(_));
-        let claims = self.claims_at.filter(|_| is_missing);
-        let [missing, priority, claims] = [missing, priority, claims].map(|at| at?.checked_add(SOON).ok());
-        [self.reach.next(now), missing, refused, claims, priority]
-            .into_iter()
-            .flatten()
-            .min()
+    /// What was found of its Pods.
+    pub(super) fn pods(&self) -> TriedPods {
+        let found = self.pods.known().and_then(|found| found.result.as_ref().as_ref().ok());
+        found.cloned().unwrap_or_default()
     }
 }
 
-fn generation_of(leaderboard: &Leaderboard) -> i64 {
-    leaderboard.metadata.generation.unwrap_or_default()
+/// How long a question has waited for its first answer.
+fn unanswered<Q: Ask>(lookup: &Lookup<Q>) -> Option<Duration> {
+    let asked = lookup.asked.as_ref().filter(|asked| lookup.answer_to(asked).is_none());
+    asked.and(lookup.waited)
 }
 
-fn due(at: Option<Timestamp>, good: bool, now: Timestamp) -> bool {
-    at.is_none_or(|at| has_passed(at, wait(good), now))
-}
-
-fn wait(good: bool) -> SignedDuration {
-    if good { AGAIN } else { SOON }
-}
-
-/// A clock that was set back makes it due as well.
-fn has_passed(at: Timestamp, wait: SignedDuration, now: Timestamp) -> bool {
-    now.duration_since(at) >= wait || now < at
-}
-
-async fn find_token(
-    client: &Client,
-    aws: &Aws,
-    leaderboard: &Leaderboard,
-    due: Option<Timestamp>,
-) -> Option<FoundToken> {
-    let (at, evalai) = due.zip(leaderboard.spec.evalai.as_ref())?;
-    let place = evalai.token.clone();
-    let token = read_token(client, aws, leaderboard, &place).await;
-    Some(FoundToken { place, at, token })
-}
-
-async fn read_token(
-    client: &Client,
-    aws: &Aws,
-    leaderboard: &Leaderboard,
-    place: &TokenPlace,
-) -> Result<Arc<Token>, String> {
+async fn read_token(client: &Client, aws: &Aws, namespace: &str, place: &TokenPlace) -> Result<Arc<Token>, String> {
     let source = match (&place.secret_key_ref, &place.secrets_manager) {
         (Some(key), _) => {
-            let namespace = leaderboard.namespace().unwrap_or_default();
-            let api: Api<Secret> = Api::namespaced(client.clone(), &namespace);
+            let api: Api<Secret> = Api::namespaced(client.clone(), namespace);
             let secret = call("reading the token", &key.name, api.get(&key.name))
                 .await
                 .map_err(|error| format!("Secret {} cannot be read: {}", key.name, error.cause()))?;
@@ -296,6 +249,7 @@ async fn read_token(
 #[cfg(test)]
 mod tests {
     use super::*;
+    use crate::ask::question::Answered;
 
     #[test]
     fn a_token_counts_only_for_the_place_where_it_was_found() {
@@ -308,28 +262,27 @@ mod tests {
             Leaderboard::new("one", serde_json::from_value(spec).unwrap())
         };
         let (old, new) = (board("old"), board("new"));
-        let now = Timestamp::UNIX_EPOCH;
-        let probe = Probe {
-            generation: Some(generation_of(&old)),
-            token: Some(FoundToken {
-                place: old.spec.evalai.clone().unwrap().token,
-                at: now,
-                token: Ok(Arc::new(Token::parse("abc").unwrap())),
-            }),
-            ..Probe::default()
+        let token = Ok(Arc::new(Token::parse("abc").unwrap()));
+        let question = |is_refused| TokenQuestion {
+            place: old.spec.evalai.clone().unwrap().token,
+            is_refused,
         };
-        assert!(probe.target(&old).is_some() && !probe.due(&old, false, now).token);
-        assert!(
-            !probe.due(&old, true, now).token,
-            "a refused one is not read again at once"
-        );
-        let later = now.checked_add(REFUSED).unwrap();
-        assert!(probe.due(&old, true, later).token && !probe.due(&old, false, later).token);
-        assert!(
-            probe.next(&old, true, now) == Some(later),
-            "it wakes its Leaderboard for that"
-        );
-        assert_eq!(probe.next(&old, false, now), None);
-        assert!(probe.target(&new).is_none() && probe.due(&new, false, now).token);
+        let again = |is_refused| question(is_refused).again(&token, 0, Duration::ZERO);
+        assert_eq!((again(false), again(true)), (Some(AGAIN), Some(REFUSED)));
+        let last = Answered {
+            question: question(false),
+            sent_ago: Duration::ZERO,
+            result: Arc::new(token.clone()),
+        };
+        let looked = Looked {
+            token: Lookup {
+                asked: Some(question(true)),
+                last: Some(last),
+                ..Lookup::default()
+            },
+            ..Looked::default()
+        };
+        assert!(looked.target(&old).is_some(), "also while it is read again");
+        assert!(looked.target(&new).is_none());
     }
 }

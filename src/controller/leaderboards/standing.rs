@@ -7,6 +7,7 @@ use k8s_openapi::apimachinery::pkg::apis::meta::v1::Time;
 
 use super::reach::capitalized;
 use super::view::EvalaiStanding;
+use crate::ask::question::Failure;
 use crate::controller::objects::key_of;
 use crate::services::evalai::{Hub, InboxTrouble, Labels, Usage};
 use crate::services::token::Token;
@@ -17,7 +18,7 @@ use leaderboard_api::{EvalaiBacklog, EvalaiUse, Leaderboard};
 pub(super) fn standing(
     hub: &Hub,
     leaderboard: &Leaderboard,
-    token: Option<&Result<Arc<Token>, String>>,
+    token: Option<&Result<Arc<Token>, Failure>>,
     now: Timestamp,
 ) -> EvalaiStanding {
     if leaderboard.spec.evalai.is_none() {
@@ -25,7 +26,7 @@ pub(super) fn standing(
     }
     let token = match token {
         None => return EvalaiStanding::Unchecked(None),
-        Some(Err(why)) => return EvalaiStanding::NoToken(why.clone()),
+        Some(Err(failure)) => return EvalaiStanding::NoToken(failure.why.clone()),
         Some(Ok(token)) => token,
     };
     let key = &key_of(leaderboard);

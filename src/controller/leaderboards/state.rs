@@ -5,9 +5,7 @@ use std::sync::Mutex;
 use std::time::Duration;
 
 use jiff::Timestamp;
-use tokio::time::Instant;
 
-use super::probe::Probe;
 use crate::controller::leaderboards::view::Policy;
 use leaderboard_base::lock::lock;
 use leaderboard_contract::verdict::WorkspaceVerdict;
@@ -48,21 +46,12 @@ pub(super) struct Found {
     pub(super) verdict: WorkspaceVerdict,
 }
 
-/// What the looks at a Leaderboard have found.
-#[derive(Clone, Default)]
-pub(super) struct Looked {
-    pub(super) known: Probe,
-    /// Since when a look is under way.
-    pub(super) since: Option<Instant>,
-}
-
 /// One entry for each Leaderboard.
 #[derive(Default)]
 pub struct LeaderboardState(Mutex<HashMap<String, Entry>>);
 
 #[derive(Default)]
 pub(super) struct Entry {
-    pub(super) looked: Looked,
     /// When its status was written, and the version of it that the API server has made.
     pub(super) written: Option<(Timestamp, u64)>,
     pub(super) applied: Option<Applied>,
@@ -86,15 +75,6 @@ impl LeaderboardState {
 
     pub(super) fn change(&self, uid: &str, change: impl FnOnce(&mut Entry)) {
         change(lock(&self.0).entry(uid.to_owned()).or_default());
-    }
-
-    /// A look has ended. False: the Leaderboard is gone.
-    pub(super) fn end_look(&self, uid: &str, known: Probe) -> bool {
-        let mut entries = lock(&self.0);
-        let entry = entries.get_mut(uid);
-        entry
-            .map(|entry| entry.looked = Looked { known, since: None })
-            .is_some()
     }
 
     /// The cache shows the policy as it should be.

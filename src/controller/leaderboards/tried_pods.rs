@@ -1,13 +1,20 @@
-//! Whether a Leaderboard's Pods would be taken, by our own rules and by a dry run of its first track's Job, before anybody submits. Called by `probe`.
+//! Whether a Leaderboard's Pods would be taken, by our own rules and by a dry run of its first track's Job, before anybody submits.
+//! Also keeps the template of their claims.
 
-use std::collections::BTreeMap;
+use std::sync::Arc;
+use std::time::Duration;
 
 use jiff::Timestamp;
 use kube::api::{ApiResource, DynamicObject, PostParams};
 use kube::{Api, Client, ResourceExt};
 
+use super::claims;
 use super::pod_notes::{self, TrackPods, notes};
-use super::priority::{self, Asked};
+use super::priority;
+use super::view::Claims;
+use crate::ask::Asked;
+use crate::ask::question::{Ask, Failure, Service};
+use crate::controller::objects::key_of;
 use crate::controller::settings::Settings;
 use crate::controller::submissions::job_spec::{self, JobInput};
 use crate::controller::submissions::pod_overlay;
@@ -15,19 +22,74 @@ use crate::kubernetes::call;
 use crate::services::endpoints;
 use leaderboard_api::{Dns, JobNumber, Leaderboard, Submission, Track, effective};
 
+/// Classes and templates that are as they should be are looked at again after this long.
+const AGAIN: Duration = Duration::from_mins(5);
+/// What is wrong may be corrected at any moment.
+const SOON: Duration = Duration::from_secs(15);
+
+/// Asks for the Pods of a Leaderboard. An edit of the Leaderboard asks anew.
+#[derive(Clone, Debug)]
+pub(super) struct Pods(pub(super) Arc<Leaderboard>);
+
+impl PartialEq for Pods {
+    fn eq(&self, other: &Self) -> bool {
+        self.0.metadata.generation == other.0.metadata.generation
+    }
+}
+
+impl Ask for Pods {
+    type Answer = TriedPods;
+    const AT_ONCE: usize = 16;
+    const AT_ONCE_OF_A_SERVICE: usize = 16;
+    const LONGEST: Duration = Duration::from_mins(2);
+
+    fn service(&self) -> Service {
+        Service::api_server()
+    }
+
+    fn again(&self, result: &Result<TriedPods, Failure>, _failures: u32, _waited: Duration) -> Option<Duration> {
+        match result {
+            Ok(pods) if pods.refused.is_none() && pods.claims.is_good() => pods.may_change.then_some(AGAIN),
+            Ok(_) | Err(_) => Some(SOON),
+        }
+    }
+}
+
 /// What was found of a Leaderboard's Pods.
-#[derive(Clone, Default)]
+#[derive(Clone, Debug, Default, PartialEq, Eq)]
 pub(super) struct TriedPods {
     /// Why they would be refused.
     pub(super) refused: Option<String>,
     /// What their host should know all the same.
     pub(super) notes: Vec<String>,
-    /// Their PriorityClasses.
-    pub(super) classes: BTreeMap<String, Asked>,
+    /// How the template of their claims stands.
+    pub(super) claims: Claims,
+    /// They depend on objects that may change.
+    may_change: bool,
 }
 
-/// Whether Pods of this Leaderboard would be refused, by our own rules or by the API server's dry run; and what is to be noted.
-pub(super) async fn try_pods(client: &Client, settings: &Settings, leaderboard: &Leaderboard) -> TriedPods {
+/// Whether Pods of this Leaderboard would be refused, and what is to be noted. Puts the template of their claims in place.
+pub(super) async fn try_pods(client: &Client, settings: &Settings, asked: &Asked<Pods>) -> TriedPods {
+    let leaderboard = asked.question.0.as_ref();
+    let tried = try_templates(client, settings, leaderboard).await;
+    let claims = claims::keep(client, leaderboard).await;
+    // Right after an edit a Job of the spec before may be on its way.
+    let is_edited = asked.last.as_ref().is_none_or(|last| last.question != asked.question);
+    if !is_edited
+        && claims == Claims::InPlace
+        && let Err(error) = claims::remove_others(client, leaderboard).await
+    {
+        tracing::warn!(leaderboard = %key_of(leaderboard), %error, "old ResourceClaimTemplates are not removed");
+    }
+    TriedPods {
+        may_change: tried.may_change || claims != Claims::NotRequired,
+        claims,
+        ..tried
+    }
+}
+
+/// What our own rules and the API server say of its Pods.
+async fn try_templates(client: &Client, settings: &Settings, leaderboard: &Leaderboard) -> TriedPods {
     if let Err(error) = pod_overlay::validate(&leaderboard.spec) {
         return TriedPods {
             refused: Some(error.to_string()),
@@ -50,17 +112,19 @@ pub(super) async fn try_pods(client: &Client, settings: &Settings, leaderboard: 
     };
     let mut templates = jobs.iter().map(|(_, job)| template(job));
     let unclear = templates.find_map(|template| job_spec::unclear(&leaderboard.spec, &template));
+    let refused = match (unclear, jobs.first()) {
+        (Some(unclear), _) => Some(unclear),
+        (None, Some((_, job))) => refused_job(client, leaderboard, job).await,
+        (None, None) => None,
+    };
+    let asked = priority::asked(&leaderboard.spec.tracks, &pods);
+    let classes = priority::look(client, &asked).await;
+    let notes = notes(&pods).into_iter().chain(pod_notes::unnamed(&pods, hosts));
     TriedPods {
-        notes: notes(&pods)
-            .into_iter()
-            .chain(pod_notes::unnamed(&pods, hosts))
-            .collect(),
-        classes: priority::asked(&leaderboard.spec.tracks, &pods),
-        refused: match (unclear, jobs.first()) {
-            (Some(unclear), _) => Some(unclear),
-            (None, Some((_, job))) => refused_job(client, leaderboard, job).await,
-            (None, None) => None,
-        },
+        refused: refused.or(classes.refused),
+        notes: notes.chain(classes.notes).collect(),
+        claims: Claims::default(),
+        may_change: !asked.is_empty(),
     }
 }
 

@@ -15,6 +15,13 @@ pub enum Claims {
     Missing(String),
 }
 
+impl Claims {
+    /// The Pods have what they claim.
+    pub fn is_good(&self) -> bool {
+        matches!(self, Self::NotRequired | Self::InPlace)
+    }
+}
+
 /// What is shown of a Leaderboard whose places cannot all be reached.
 #[derive(Clone, Debug, PartialEq, Eq)]
 pub struct Unreachable {

@@ -4,12 +4,11 @@ use std::sync::Arc;
 
 use kube::Client;
 use kube::runtime::events::Recorder;
-use tokio::sync::mpsc::UnboundedSender;
 
+use crate::controller::leaderboards;
 use crate::controller::leaderboards::isolation::{self, Policies};
-use crate::controller::leaderboards::looks::{self, Look};
+use crate::controller::leaderboards::probe::Asks;
 use crate::controller::leaderboards::state::LeaderboardState;
-use crate::controller::leaderboards::{self, probe};
 use crate::controller::objects::Wake;
 use crate::controller::settings::Settings;
 use crate::controller::slots::Slots;
@@ -23,7 +22,6 @@ use crate::kubernetes::Writer;
 use crate::kubernetes::objects::Pod;
 use crate::observability::metrics::Metrics;
 use crate::observability::traces::Traces;
-use crate::services::aws::Aws;
 use leaderboard_api::Leaderboard;
 use leaderboard_base::object_key::ObjectKey;
 
@@ -38,9 +36,8 @@ pub struct Context {
     pub causes: Causes,
     pub slots: Arc<Slots>,
     pub leaderboards: LeaderboardState,
-    pub looks: UnboundedSender<Look>,
+    pub asks: Asks,
     pub external: ExternalSystems,
-    pub aws: Aws,
     pub recorder: Recorder,
     pub metrics: Arc<Metrics>,
     pub traces: Traces,
@@ -82,20 +79,7 @@ impl Context {
             settings: &self.settings,
             slots: &self.slots,
             external: &self.external,
-            looks: &self.looks,
-        }
-    }
-
-    pub fn for_looks(&self) -> looks::Uses<'_> {
-        looks::Uses {
-            places: probe::Uses {
-                client: &self.client,
-                aws: &self.aws,
-                stores: &self.stores,
-                settings: &self.settings,
-            },
-            state: &self.leaderboards,
-            wake: &self.wake,
+            asks: &self.asks,
         }
     }
 
@@ -121,6 +105,7 @@ impl Context {
         self.memory.forget(&key.uid);
         self.workers.forget(&key.uid);
         self.leaderboards.forget(&key.uid);
+        self.asks.forget(&key.uid);
         self.external.gone(key);
     }
 }

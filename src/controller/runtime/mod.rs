@@ -20,14 +20,16 @@ use std::time::Duration;
 use jiff::Timestamp;
 use kube::Client;
 use kube::runtime::events::Recorder;
+use kube::runtime::reflector::ObjectRef;
 use kube::runtime::watcher::Config;
 use tokio::sync::mpsc;
 use tokio::task::JoinHandle;
 use tokio::time::Instant;
 
-use super::leaderboards::looks::{self, Look};
+use super::leaderboards::probe::Asks;
 use super::leaderboards::state::LeaderboardState;
 use super::leaderboards::{isolation, operator};
+use super::objects::{Wake, by_key};
 use super::settings::Settings;
 use super::slots::Slots;
 use crate::bridge::{self, Scope, pollers};
@@ -50,6 +52,7 @@ use crate::services::table;
 use backoff::BackoffMap;
 use context::Context;
 use leader::{Leader, Leadership};
+use leaderboard_api::Leaderboard;
 use leaderboard_base::object_key::ObjectKey;
 use leaderboard_base::tasks::TaskFailed;
 use queue::{Class, urgency};
@@ -165,17 +168,13 @@ impl Parts {
         let (evalai, changed) = mpsc::unbounded_channel();
         let external = self.external(&leader.fence(), evalai, rows);
         let hub = external.hub.clone();
-        let (looks, wanted) = mpsc::unbounded_channel();
         let shared = Arc::new(Shared {
-            context: Arc::new(self.context(&leader.fence(), external, looks, &queues)),
+            context: Arc::new(self.context(&leader.fence(), external, &queues)),
             queues,
             backoff: BackoffMap::default(),
             telemetry: self.telemetry.clone(),
         });
         self.keep_policies(&shared.context);
-        let context = Arc::clone(&shared.context);
-        let look = async move { looks::carry_out(wanted, context.for_looks()).await };
-        self.telemetry.tasks.until_stop("looks", look);
         let walked = Arc::clone(&shared);
         let walk = move || gauges::walk(&walked, Timestamp::now());
         let gauges = gauges::keep(gauges::EVERY, walk, self.telemetry.clone());
@@ -239,19 +238,16 @@ impl Parts {
     }
 
     /// What all reconciles share.
-    fn context(
-        &self,
-        fence: &leader::Fence,
-        external: ExternalSystems,
-        looks: mpsc::UnboundedSender<Look>,
-        queues: &Queues,
-    ) -> Context {
+    fn context(&self, fence: &leader::Fence, external: ExternalSystems, queues: &Queues) -> Context {
         let fence = fence.clone();
         let (aws, client, tasks) = (&self.aws, &self.client, &self.telemetry.tasks);
         let submissions = &self.watches.submissions.store;
         let answered = || events::waking(&queues.submissions, submissions);
         let turned = events::waking_as(urgency::of_submission, &queues.submissions, submissions);
-        let boards = Arc::clone(&queues.leaderboards);
+        let board = || -> Wake<Leaderboard> {
+            let boards = Arc::clone(&queues.leaderboards);
+            Box::new(move |board: ObjectRef<Leaderboard>| boards.add(&board, Class::Refresh))
+        };
         let context = Context {
             client: client.clone(),
             writer: Writer::new(client.clone(), move || fence.may_write()),
@@ -262,13 +258,12 @@ impl Parts {
             causes: self.causes(queues),
             slots: Arc::new(Slots::new(self.watches.stores(), turned)),
             leaderboards: LeaderboardState::default(),
-            looks,
+            asks: Asks::start(client, aws, &self.settings, tasks, || by_key(board())),
             external,
-            aws: aws.clone(),
             recorder: events(client),
             metrics: Arc::clone(&self.telemetry.metrics),
             traces: self.telemetry.traces.clone(),
-            wake: Box::new(move |board| boards.add(&board, Class::Refresh)),
+            wake: board(),
         };
         let slots = Arc::clone(&context.slots);
         tasks.stay("slots", async move { slots.keep().await });

@@ -18,19 +18,26 @@ use crate::kubernetes::Namespaces;
 use leaderboard_base::shutdown::Stop;
 
 /// All that runs in a leader without Leaderboards, in the order of names.
-const TASKS: [&str; 18] = [
+const TASKS: [&str; 25] = [
+    "ask buckets",
+    "ask dead-letter queues",
+    "ask log groups",
+    "ask queues",
+    "ask tables",
+    "ask tables for rows",
+    "ask tokens",
     "events of Jobs",
     "events of Pods",
     "gauges",
     "inbox",
     "lease",
-    "looks",
     "nodes",
     "policies",
     "reconciles",
     "rows",
     "slots",
     "sweep",
+    "try Pods",
     "watch of jobs",
     "watch of leaderboards",
     "watch of networkpolicies",

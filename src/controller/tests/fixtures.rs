@@ -20,9 +20,9 @@ use tokio::time::Instant;
 use tower_test::mock::{Handle, pair};
 
 use crate::allowed::Allowed;
-use crate::controller::leaderboards::looks::Look;
+use crate::controller::leaderboards::probe::Asks;
 use crate::controller::leaderboards::state::LeaderboardState;
-use crate::controller::objects::Wake;
+use crate::controller::objects::{Wake, by_key};
 use crate::controller::runtime::context::Context;
 use crate::controller::settings::Settings;
 use crate::controller::slots::Slots;
@@ -79,8 +79,8 @@ pub struct Surroundings {
     pub woken: mpsc::UnboundedReceiver<String>,
     /// The Submissions that were woken with an answer of their own.
     pub answered: mpsc::UnboundedReceiver<String>,
-    /// The Leaderboards that are to be looked at.
-    pub wanted: mpsc::UnboundedReceiver<Look>,
+    /// A way to the endpoint.
+    pub aws: Aws,
     _stop: watch::Sender<bool>,
 }
 
@@ -108,7 +108,6 @@ pub async fn surroundings(cluster: Cluster, endpoint: &str) -> Surroundings {
     let tasks = Tasks::new(stopped);
     let (answering, answered) = mpsc::unbounded_channel();
     let (waking, woken) = mpsc::unbounded_channel();
-    let (looks, wanted) = mpsc::unbounded_channel();
     let stores = stores(cluster);
     let (turning, _) = mpsc::unbounded_channel();
     let context = Context {
@@ -120,21 +119,22 @@ pub async fn surroundings(cluster: Cluster, endpoint: &str) -> Surroundings {
         workers: Workers::start(&aws, &client, &tasks, || noting(&answering)),
         causes: Causes::default(),
         leaderboards: LeaderboardState::default(),
-        looks,
+        asks: Asks::start(&client, &aws, &settings(), &tasks, || {
+            by_key(noting::<Leaderboard>(&waking))
+        }),
         external: external(&aws, &tasks),
         recorder: EventRecorder::new(client.clone(), Reporter::from("test")),
         metrics: Arc::default(),
         traces: Traces::default(),
         wake: noting(&waking),
         client,
-        aws,
     };
     Surroundings {
         context,
         requests,
         woken,
         answered,
-        wanted,
+        aws,
         _stop: stop,
     }
 }
