@@ -10,7 +10,7 @@
 //! second read. The last answer stays readable until then, with the question that it answers. Only news wakes the object.
 
 pub mod question;
-mod state;
+pub(crate) mod state;
 #[cfg(test)]
 mod tests;
 

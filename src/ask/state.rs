@@ -17,7 +17,7 @@ pub(super) const KEPT: Duration = Duration::from_mins(10);
 type Uid = Arc<str>;
 
 /// All objects of one kind of question.
-pub(super) struct State<Q: Ask> {
+pub(crate) struct State<Q: Ask> {
     entries: HashMap<Uid, Entry<Q>>,
     /// When each question becomes due. A place that its entry has left is passed over.
     due: BTreeSet<(Instant, Uid)>,
@@ -61,7 +61,7 @@ struct Last<Q: Ask> {
 }
 
 /// One read to be made.
-pub(super) struct Work<Q: Ask> {
+pub(crate) struct Work<Q: Ask> {
     pub asked: Asked<Q>,
     pub service: Service,
     pub log: LogSpan,

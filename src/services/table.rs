@@ -1,12 +1,11 @@
 //! The DynamoDB table of submissions: finds out its keys, writes rows so that an older one never wins.
 //!
-//! Called through `Recorder` by the controller's leader, which alone writes. Knows no Kubernetes objects; what a
+//! Called through `Tables` by the controller's leader, which alone writes. Knows no Kubernetes objects; what a
 //! column holds is the caller's.
 
 mod keys;
-mod ledger;
 mod read;
-mod recorder;
+mod tables;
 mod trial;
 
 use std::collections::{BTreeMap, HashMap};
@@ -20,9 +19,8 @@ use aws_sdk_dynamodb::types::{AttributeValue, ReturnValuesOnConditionCheckFailur
 use thiserror::Error;
 
 use keys::Key;
-pub use ledger::{RowState, TableId};
 pub use read::ObservedRow;
-pub use recorder::Recorder;
+pub use tables::Tables;
 
 use crate::services::aws::Aws;
 use crate::services::fault::{self, Fault};

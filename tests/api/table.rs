@@ -1,15 +1,13 @@
-//! The DynamoDB recorder against the AWS stand-in.
+//! Rows of DynamoDB against the AWS stand-in.
 #![cfg(test)]
 
 use std::collections::BTreeMap;
-use std::sync::Arc;
-use std::sync::atomic::{AtomicBool, Ordering};
 
 use aws_sdk_dynamodb::types::{
     AttributeDefinition, AttributeValue, BillingMode, KeySchemaElement, KeyType, ScalarAttributeType,
 };
 use serde_json::json;
-use tokio::sync::mpsc;
+use tokio::sync::{mpsc, watch};
 
 use super::bridge::{LIMIT, StandIn};
 use crate::support::throttle::Throttle;
@@ -18,7 +16,9 @@ use leaderboard_base::object_key::ObjectKey;
 use leaderboard_base::shutdown::Stop;
 use leaderboard_base::spans::LogSpan;
 use leaderboard_base::tasks::Tasks;
-use leaderboard_operator::services::table::{Recorder, Row, Table, Written};
+use leaderboard_operator::ask::Asker;
+use leaderboard_operator::controller::submissions::records::{self, Record};
+use leaderboard_operator::services::table::{Row, Table, Written};
 
 fn client(stand_in: &StandIn) -> aws_sdk_dynamodb::Client {
     stand_in.aws.dynamodb(None, Some(&stand_in.endpoint))
@@ -372,45 +372,51 @@ async fn a_key_that_is_a_number_takes_no_name() {
     );
 }
 
-#[tokio::test]
-async fn the_recorder_writes_in_the_background_only_while_it_may() {
-    let stand_in = StandIn::start().await;
-    let (spec, _) = usual(&stand_in).await;
-    let leads = Arc::new(AtomicBool::new(true));
-    let (may_write, (wake, mut woken)) = (leads.clone(), mpsc::unbounded_channel());
-    let (stop, stopped) = Stop::new();
-    let recorder = Recorder::new(
-        stand_in.aws.clone(),
-        move || may_write.load(Ordering::SeqCst),
-        wake,
-        Tasks::new(stopped),
-    );
-    let key = |name: &str| ObjectKey {
+fn key(name: &str) -> ObjectKey {
+    ObjectKey {
         namespace: "ns".into(),
         name: name.into(),
-        uid: "u".into(),
-    };
-    recorder.record(&spec, &key("a"), row(1, "FINISHED"), true, LogSpan::default());
-    recorder.record(
-        &named(&stand_in, "nowhere"),
-        &key("b"),
-        row(1, "FINISHED"),
-        true,
-        LogSpan::default(),
-    );
+        uid: name.into(),
+    }
+}
+
+fn record(table: &api::Table, status: &str, is_end: bool) -> Record {
+    Record {
+        table: table.clone(),
+        row: row(1, status).into(),
+        is_end,
+    }
+}
+
+/// Writes in the background; the channel yields whose row has news.
+fn records(stand_in: &StandIn) -> (Asker<Record>, mpsc::UnboundedReceiver<String>, watch::Sender<bool>) {
+    let (wake, woken) = mpsc::unbounded_channel();
+    let (stop, stopped) = Stop::new();
+    let wake = Box::new(move |key: &ObjectKey| wake.send(key.name.clone()).unwrap());
+    let records = records::start(&stand_in.aws, || true, &Tasks::new(stopped), wake);
+    (records, woken, stop)
+}
+
+#[tokio::test]
+async fn rows_are_written_in_the_background() {
+    let stand_in = StandIn::start().await;
+    let (spec, _) = usual(&stand_in).await;
+    let (records, mut woken, _stop) = records(&stand_in);
+    let nowhere = named(&stand_in, "nowhere");
+    records.want(&key("a"), record(&spec, "FINISHED", true), LogSpan::default());
+    records.want(&key("b"), record(&nowhere, "FINISHED", true), LogSpan::default());
     let mut all = Vec::new();
     for _ in 0..2 {
         all.push(tokio::time::timeout(LIMIT, woken.recv()).await.unwrap().unwrap());
     }
     all.sort();
-    assert_eq!(all, [key("a"), key("b")]);
-    let view = recorder.view(&key("a")).unwrap();
-    assert_eq!((view.attempt, view.end_written, view.error), (1, true, None));
-    let view = recorder.view(&key("b")).unwrap();
+    assert_eq!(all, ["a", "b"]);
+    let view = records::seen(&records.get("a"), 1);
+    assert_eq!((view.end_written, view.error), (true, None));
+    let view = records::seen(&records.get("b"), 1);
     let missing = format!("table {} does not exist", stand_in.name("nowhere"));
     assert!(!view.end_written && view.error.unwrap().starts_with(&missing));
     assert_eq!(rows(&stand_in, &spec.name).await.len(), 1);
-    stop.send_replace(true);
 }
 
 #[tokio::test]
@@ -419,31 +425,23 @@ async fn a_row_that_dynamodb_throttles_is_written_at_last_and_an_older_state_is_
     let (mut spec, _) = usual(&stand_in).await;
     let throttle = Throttle::start(&stand_in.endpoint, "ProvisionedThroughputExceededException").await;
     spec.endpoint = Some(throttle.endpoint().to_owned());
-    let (wake, mut woken) = mpsc::unbounded_channel();
-    let (stop, stopped) = Stop::new();
-    let recorder = Recorder::new(stand_in.aws.clone(), || true, wake, Tasks::new(stopped));
-    let key = ObjectKey {
-        namespace: "ns".into(),
-        name: "a".into(),
-        uid: "u".into(),
-    };
+    let (records, mut woken, _stop) = records(&stand_in);
     // The SDK sends each call three times: so the first call fails, and part of the second.
     throttle.refuse(5);
-    recorder.record(&spec, &key, row(1, "RUNNING"), false, LogSpan::default());
+    records.want(&key("a"), record(&spec, "RUNNING", false), LogSpan::default());
     tokio::time::timeout(LIMIT, woken.recv()).await.unwrap().unwrap();
-    let view = recorder.view(&key).unwrap();
-    let why = view.error.unwrap();
+    let view = || records::seen(&records.get("a"), 1);
+    let why = view().error.unwrap();
     assert!(
         why.contains("ProvisionedThroughputExceededException") && why.contains("it is retried"),
         "{why}"
     );
-    recorder.record(&spec, &key, row(1, "FINISHED"), true, LogSpan::default());
-    while !recorder.view(&key).unwrap().end_written {
+    records.want(&key("a"), record(&spec, "FINISHED", true), LogSpan::default());
+    while !view().end_written {
         tokio::time::timeout(LIMIT, woken.recv()).await.unwrap().unwrap();
     }
-    assert_eq!(recorder.view(&key).unwrap().error, None);
+    assert_eq!(view().error, None);
     assert_eq!(throttle.refused(), 5);
     let stored = rows(&stand_in, &spec.name).await;
     assert_eq!((stored.len(), stored[0]["submission_status"].as_str()), (1, "FINISHED"));
-    stop.send_replace(true);
 }

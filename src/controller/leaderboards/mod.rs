@@ -32,8 +32,10 @@ use super::objects::{key_of, uid_of, version, version_number};
 use super::settings::Settings;
 use super::slots::Slots;
 use super::writes::{apply_status, set_finalizer};
+use crate::ask::question::Service;
 use crate::controller::census::Census;
 use crate::controller::submissions::external::ExternalSystems;
+use crate::controller::submissions::records;
 use crate::kubernetes::{CallError, Writer};
 use crate::observability::metrics::leader::{self, Gauge, Samples};
 use decide::{LeaderboardPlan, LeaderboardView, decide};
@@ -196,7 +198,8 @@ fn observe(
 /// None without a table.
 fn rows_waiting(uses: Uses<'_>, leaderboard: &Leaderboard) -> Option<usize> {
     let table = leaderboard.spec.table.as_ref()?;
-    Some(uses.external.recorder.waiting(table))
+    let (service, longer) = (Service::table(table), records::ON_ITS_WAY);
+    Some(uses.external.records.waiting(&service, longer))
 }
 
 /// Writes the status if it shows something new; returns when to look again. On top of a status that the cache does not show yet

@@ -12,8 +12,8 @@ use leaderboard_results::metrics;
 
 use super::places;
 use super::reach::{AwsResource, Place, Reach};
-use super::tried_pods::{self, Pods, TriedPods};
 use super::token::TokenSource;
+use super::tried_pods::{self, Pods, TriedPods};
 use crate::ask::question::{Ask, Failure, Lookup, Service};
 use crate::ask::{Asker, Wake};
 use crate::controller::objects::key_of;

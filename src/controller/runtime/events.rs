@@ -25,27 +25,22 @@ use crate::services::evalai::Changed;
 use leaderboard_api::{Leaderboard, Submission, conditions, names};
 use leaderboard_base::object_key::ObjectKey;
 
-/// What the services report.
-pub(super) struct Reports {
-    /// Submissions whose row in DynamoDB has news.
-    pub(super) rows: mpsc::UnboundedReceiver<ObjectKey>,
-    /// What EvalAI has news of.
-    pub(super) evalai: mpsc::UnboundedReceiver<Changed>,
-}
-
 /// Objects that something has happened to, and how urgent that is.
 pub(super) type Events<K> = BoxStream<'static, (ObjectRef<K>, Class)>;
 
 /// Every Submission that something has happened to. What concerns its Leaderboard is added to that one's queue, after it was
 /// counted.
-pub(super) fn of_submissions(watches: &Watches, reports: Reports, shared: &Arc<Shared>) -> Events<Submission> {
+pub(super) fn of_submissions(
+    watches: &Watches,
+    evalai: mpsc::UnboundedReceiver<Changed>,
+    shared: &Arc<Shared>,
+) -> Events<Submission> {
     let boards = Arc::clone(&shared.queues.leaderboards);
     let store = shared.context.stores.submissions.clone();
     let by_store = move |urgency: fn(&Submission) -> Class| {
         let store = store.clone();
         move |object| Some(ranked(&store, object, urgency))
     };
-    let of_row = by_store(urgency::of_answer);
     let of_evalai = by_store(urgency::of_evalai);
     let of_evalai = move |change| match change {
         Changed::Submission(key) => of_evalai(reference(&key)),
@@ -58,8 +53,7 @@ pub(super) fn of_submissions(watches: &Watches, reports: Reports, shared: &Arc<S
         mapped(watches.submissions.subscribe(), of_submission(Arc::clone(shared))),
         mapped(watches.jobs.subscribe(), of_job(Arc::clone(shared))),
         mapped(watches.pods.subscribe(), of_pod(Arc::clone(shared))),
-        mapped(received(reports.rows), move |key| of_row(reference(&key))),
-        mapped(received(reports.evalai), of_evalai),
+        mapped(received(evalai), of_evalai),
     ])
     .boxed()
 }

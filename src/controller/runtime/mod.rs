@@ -40,6 +40,7 @@ use crate::controller::submissions::observe::node;
 use crate::controller::submissions::observe::workers::Workers;
 use crate::controller::submissions::payloads;
 use crate::controller::submissions::phases::Phase;
+use crate::controller::submissions::records;
 use crate::kubernetes::objects::Event;
 use crate::kubernetes::preflight::{self, await_kinds};
 use crate::kubernetes::{Writer, spawn_uncached};
@@ -48,7 +49,6 @@ use crate::observability::readiness::Readiness;
 use crate::page::Page;
 use crate::services::aws::Aws;
 use crate::services::evalai::{Changed, Hub, Options, PayloadReader, SweepRow, Timeouts, Timing};
-use crate::services::table;
 use backoff::BackoffMap;
 use context::Context;
 use leader::{Leader, Leadership};
@@ -164,9 +164,8 @@ impl Parts {
             self.telemetry.metrics.submissions.phases.of([phase.as_str()]);
         }
         let queues = Queues::new(self.settings.concurrency, &self.telemetry.metrics);
-        let (rows, changed_rows) = mpsc::unbounded_channel();
         let (evalai, changed) = mpsc::unbounded_channel();
-        let external = self.external(&leader.fence(), evalai, rows);
+        let external = self.external(&leader.fence(), evalai, &queues);
         let hub = external.hub.clone();
         let shared = Arc::new(Shared {
             context: Arc::new(self.context(&leader.fence(), external, &queues)),
@@ -179,11 +178,7 @@ impl Parts {
         let walk = move || gauges::walk(&walked, Timestamp::now());
         let gauges = gauges::keep(gauges::EVERY, walk, self.telemetry.clone());
         self.telemetry.tasks.stay("gauges", gauges);
-        let reports = events::Reports {
-            rows: changed_rows,
-            evalai: changed,
-        };
-        let of_submissions = events::of_submissions(&self.watches, reports, &shared);
+        let of_submissions = events::of_submissions(&self.watches, changed, &shared);
         let of_leaderboards = events::of_leaderboards(&self.watches, &shared);
         let reconciles = reconciles::run(of_submissions, of_leaderboards, shared);
         let reconciles = self.telemetry.tasks.stay("reconciles", reconciles);
@@ -196,7 +191,7 @@ impl Parts {
         &self,
         fence: &leader::Fence,
         evalai: mpsc::UnboundedSender<Changed>,
-        rows: mpsc::UnboundedSender<ObjectKey>,
+        queues: &Queues,
     ) -> ExternalSystems {
         let telemetry = &self.telemetry;
         let payloads = payloads::reader(self.aws.clone());
@@ -204,13 +199,9 @@ impl Parts {
         let inbox = inbox::read(self.inbox(), hub.clone(), self.settings.operator.clone());
         telemetry.tasks.stay("inbox", inbox);
         let fence = fence.clone();
-        let recorder = table::Recorder::new(
-            self.aws.clone(),
-            move || fence.may_write(),
-            rows,
-            telemetry.tasks.clone(),
-        );
-        ExternalSystems::new(hub, recorder, self.settings.allowed.clone())
+        let wake = by_key(events::waking(&queues.submissions, &self.watches.submissions.store));
+        let records = records::start(&self.aws, move || fence.may_write(), &telemetry.tasks, wake);
+        ExternalSystems::new(hub, records, self.settings.allowed.clone())
     }
 
     /// Where the sweep's finds go.

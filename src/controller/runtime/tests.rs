@@ -18,7 +18,7 @@ use crate::kubernetes::Namespaces;
 use leaderboard_base::shutdown::Stop;
 
 /// All that runs in a leader without Leaderboards, in the order of names.
-const TASKS: [&str; 25] = [
+const TASKS: [&str; 29] = [
     "ask buckets",
     "ask dead-letter queues",
     "ask log groups",
@@ -28,12 +28,16 @@ const TASKS: [&str; 25] = [
     "ask tokens",
     "events of Jobs",
     "events of Pods",
+    "failure logs",
+    "fences",
     "gauges",
     "inbox",
     "lease",
     "nodes",
     "policies",
     "reconciles",
+    "records",
+    "reports",
     "rows",
     "slots",
     "sweep",

@@ -13,13 +13,12 @@ use tokio::time::Instant;
 
 use super::decide::{Action, Event, Plan, Question, StatusWrite, pinned};
 use super::external::ExternalSystems;
-use super::failure_log::LogDemand;
 use super::job_spec::{self, JobInput};
 use super::memory::Memory;
 use super::observe::workers::Workers;
 use super::phases::{self, Ended, Phase};
 use super::spans;
-use super::view::{LogPlace, View};
+use super::view::View;
 use crate::controller::objects::{key_of, log_span_of, uid};
 use crate::controller::settings::Settings;
 use crate::controller::slots::Slots;
@@ -90,8 +89,9 @@ pub async fn act(uses: Uses<'_>, view: &View, plan: Plan) -> Result<Option<Durat
     for event in &plan.events {
         actor.publish(event).await;
     }
-    let archive = &uses.workers.archive;
-    archive.demand(&view.submission, &plan.status, view.ended_at(), plan.report);
+    let ended = view.ended_at();
+    uses.workers
+        .demand_report(&view.submission, &plan.status, ended, plan.report);
     // Last comes what the API server may refuse for as long as a quota is used up: it keeps nothing else from being done.
     let (creates, others): (Vec<_>, Vec<_>) = plan
         .actions
@@ -144,10 +144,10 @@ impl Actor<'_> {
             }
             Action::JoinLine(place) => uses.slots.join(submission, place),
             Action::Ask(question) => self.ask(question, status),
-            Action::TakeOwnership => workers.archive.want_fence(submission, status),
-            Action::KeepLog { places } => workers.archive.want_log(submission, status, log_demand(places, status)),
+            Action::TakeOwnership => workers.want_fence(submission, status),
+            Action::KeepLog { places } => workers.keep_log(submission, status, places),
             Action::UpdateEvalai(update) => {
-                uses.external.update_evalai(&workers.archive, self.view, status, update);
+                uses.external.update_evalai(workers, self.view, status, update);
             }
             Action::Forget => {
                 uses.external.gone(&key_of(submission));
@@ -415,14 +415,6 @@ fn of_uid(uid: &str) -> Preconditions {
     Preconditions {
         uid: Some(uid.into()),
         resource_version: None,
-    }
-}
-
-fn log_demand(places: Vec<LogPlace>, status: &SubmissionStatus) -> LogDemand {
-    LogDemand {
-        job: status.job_number(),
-        places,
-        is_over: status.times.finished.is_some(),
     }
 }
 

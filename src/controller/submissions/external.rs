@@ -6,17 +6,18 @@ use std::sync::{Arc, Mutex};
 
 use kube::ResourceExt;
 
-use super::archive::ArchiveWorkers;
 use super::decide::{EvalaiUpdate, TableUpdate, patience};
+use super::observe::workers::Workers;
+use super::records::{self, Record};
 use super::result_texts;
 use super::view::{EvalaiEnd, EvalaiInfo, EvalaiView, RecordView, Standing, View};
 use crate::allowed::Allowed;
+use crate::ask::Asker;
 use crate::controller::objects::{key_of, log_span_of, uid};
 use crate::services::evalai::{
     self, DesiredUpdate, Ended, Hub, ImageAnswer, Outcome, Patience, Publisher, Run, Status, Subject, SubmissionState,
     Target,
 };
-use crate::services::table::Recorder;
 use leaderboard_api::{Ingested, JobNumber, Leaderboard, Submission, SubmissionStatus, names};
 use leaderboard_base::lock::lock;
 use leaderboard_base::object_key::ObjectKey;
@@ -24,16 +25,16 @@ use leaderboard_base::object_key::ObjectKey;
 /// Doors to both services, and what each Leaderboard needs to go through them.
 pub struct ExternalSystems {
     pub hub: Hub,
-    pub recorder: Recorder,
+    pub records: Asker<Record>,
     allowed: Allowed,
     targets: Mutex<HashMap<String, Arc<Target>>>,
 }
 
 impl ExternalSystems {
-    pub fn new(hub: Hub, recorder: Recorder, allowed: Allowed) -> Self {
+    pub fn new(hub: Hub, records: Asker<Record>, allowed: Allowed) -> Self {
         Self {
             hub,
-            recorder,
+            records,
             allowed,
             targets: Mutex::default(),
         }
@@ -96,15 +97,8 @@ impl ExternalSystems {
             });
         }
         let attempt = submission.status.as_ref().map(result_texts::attempt_of_run);
-        let seen = self
-            .recorder
-            .view(&key_of(submission))
-            .filter(|seen| Some(seen.attempt) == attempt);
-        Some(seen.map_or_else(RecordView::default, |s| RecordView {
-            end_written: s.end_written,
-            superseded_by: s.superseded_by,
-            error: s.error,
-        }))
+        let seen = |attempt| records::seen(&self.records.get(uid(submission)), attempt);
+        Some(attempt.map(seen).unwrap_or_default())
     }
 
     /// Asks EvalAI whether a submission wants to run, or what became of one that has ended.
@@ -123,19 +117,13 @@ impl ExternalSystems {
         log_refused(followed);
     }
 
-    /// Updates EvalAI with what the view shows. `archive` has the log of a failure.
-    pub fn update_evalai(
-        &self,
-        archive: &ArchiveWorkers,
-        view: &View,
-        status: &SubmissionStatus,
-        update: EvalaiUpdate,
-    ) {
+    /// Updates EvalAI with what the view shows. `workers` have the log of a failure.
+    pub fn update_evalai(&self, workers: &Workers, view: &View, status: &SubmissionStatus, update: EvalaiUpdate) {
         let Some(subject) = self.subject(view) else { return };
         let Some(publisher) = Publisher::of(subject) else {
             return;
         };
-        let with_end = |outcome| final_update(archive, view, status, outcome);
+        let with_end = |outcome| final_update(workers, view, status, outcome);
         let desired = match update {
             EvalaiUpdate::Queued => DesiredUpdate::Queued,
             EvalaiUpdate::Running => DesiredUpdate::Running,
@@ -158,9 +146,12 @@ impl ExternalSystems {
         };
         let submission = view.submission.as_ref();
         if let Some(row) = result_texts::row(view.report.ours().map(Arc::as_ref), status) {
-            let is_end = update != TableUpdate::Progress;
-            self.recorder
-                .record(table, &key_of(submission), row, is_end, log_span_of(submission));
+            let record = Record {
+                table: table.clone(),
+                row: row.into(),
+                is_end: update != TableUpdate::Progress,
+            };
+            records::record(&self.records, &key_of(submission), record, log_span_of(submission));
         }
     }
 
@@ -168,7 +159,7 @@ impl ExternalSystems {
     pub fn gone(&self, key: &ObjectKey) {
         lock(&self.targets).remove(&key.uid);
         self.hub.forget(key);
-        self.recorder.forget(key);
+        self.records.forget(&key.uid);
     }
 
     fn subject(&self, view: &View) -> Option<Subject> {
@@ -198,11 +189,11 @@ fn run_of(submission: &Submission) -> Run {
     }
 }
 
-fn final_update(archive: &ArchiveWorkers, view: &View, status: &SubmissionStatus, outcome: Outcome) -> DesiredUpdate {
+fn final_update(workers: &Workers, view: &View, status: &SubmissionStatus, outcome: Outcome) -> DesiredUpdate {
     let mut outline = result_texts::outline(view, status, false, patience(view, status));
     outline.stderr = result_texts::stderr(status);
     if outcome == Outcome::Failed {
-        let tail = archive.tail(&view.submission, status);
+        let tail = workers.tail(&view.submission, status);
         result_texts::add_log(&mut outline, tail, result_texts::log_readers(view));
     }
     DesiredUpdate::Final(outcome, Arc::new(outline))

@@ -172,8 +172,8 @@ async fn nothing_is_recorded_for_a_leaderboard_that_may_not_name_its_table() {
     bench.records_the_end();
     let known = &bench.around.context.external;
     let key = key_of(bench.view.submission.as_ref());
-    assert!(known.recorder.view(&key).is_none());
-    let strict = ExternalSystems::new(known.hub.clone(), known.recorder.clone(), "{}".parse().unwrap());
+    assert!(known.records.get(&key.uid).asked.is_none());
+    let strict = ExternalSystems::new(known.hub.clone(), known.records.clone(), "{}".parse().unwrap());
     let board = bench.view.leaderboard.clone().unwrap();
     let shown = strict.record_view(&board, &bench.view.submission).unwrap();
     assert!(!shown.end_written && shown.error.is_some_and(|why| why.contains("may not name")));

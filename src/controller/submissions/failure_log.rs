@@ -1,10 +1,11 @@
 //! The tail of the log that explains a failure: read while it can be had, remembered until every system has the end, and
 //! stored in S3 for people.
 //!
-//! Called by the bucket's worker in `archive`, for what `decide` asks for; `external` hands the text on to EvalAI's hosts. A log may
-//! hold private routes, so it never gets into status, events or our own log.
+//! `decide` asks for it; `external` hands the text on to EvalAI's hosts. A log may hold private routes, so it never gets into status,
+//! events or our own log.
 
 use std::pin::pin;
+use std::sync::Arc;
 use std::time::Duration;
 
 use futures::AsyncReadExt;
@@ -12,11 +13,16 @@ use k8s_openapi::api::core::v1::Pod;
 use kube::api::LogParams;
 use kube::{Api, Client};
 
-use super::view::{LogAt, LogPlace};
+use super::reports::RunFiles;
+use super::view::{LogAt, LogPlace, ObservedLog};
+use crate::ask::question::{Ask, Failure, Lookup, Service};
+use crate::ask::{Asked, Asker, Wake};
 use crate::services::archive::Archive;
+use crate::services::aws::Aws;
 use leaderboard_api::client_errors;
 use leaderboard_api::names::FAILURE_LOG_KEY;
 use leaderboard_api::{Attempt, JobNumber, names};
+use leaderboard_base::tasks::Tasks;
 
 /// Characters that are kept, as EvalAI's own worker does.
 const TAIL_CHARS: usize = 10_000;
@@ -28,14 +34,62 @@ const NODE_LINES: i64 = 200;
 const NODE_BYTES: u64 = 1 << 20;
 /// Time that reading one place, or storing, may take.
 const TRY: Duration = Duration::from_secs(5);
+/// How often one log is looked for, and the time between two tries.
+const TRIES: u32 = 3;
+const TRY_AGAIN: Duration = Duration::from_secs(3);
 
-/// Which log is to be kept.
+/// The log that is to be kept.
 #[derive(Clone, Debug, PartialEq)]
-pub struct LogDemand {
+pub struct FailureLog {
     pub job: JobNumber,
     pub places: Vec<LogPlace>,
     /// The submission has come to its end, so that its log is stored too.
     pub is_over: bool,
+    pub files: Arc<RunFiles>,
+}
+
+impl Ask for FailureLog {
+    type Answer = LogAnswer;
+    const AT_ONCE: usize = 32;
+    const AT_ONCE_OF_A_SERVICE: usize = 8;
+    const LONGEST: Duration = Duration::from_mins(1);
+
+    fn service(&self) -> Service {
+        self.files.service()
+    }
+
+    fn again(&self, _result: &Result<LogAnswer, Failure>, _failures: u32, _waited: Duration) -> Option<Duration> {
+        None
+    }
+}
+
+/// Starts the task that looks for logs and stores them.
+pub fn start(client: &Client, aws: &Aws, tasks: &Tasks, wake: Wake) -> Asker<FailureLog> {
+    let (client, aws) = (client.clone(), aws.clone());
+    Asker::start("failure logs", tasks, wake, move |asked| {
+        let (client, aws) = (client.clone(), aws.clone());
+        async move { Ok(keep(&client, &aws, &asked).await) }
+    })
+}
+
+/// What became of the log of a Job. `is_over`: of the end of the submission.
+pub fn seen(lookup: &Lookup<FailureLog>, job: JobNumber, is_over: bool) -> ObservedLog {
+    let asked = lookup.asked.as_ref();
+    let Some(asked) = asked.filter(|asked| asked.job == job && asked.is_over == is_over) else {
+        return ObservedLog::NotRequested;
+    };
+    match lookup.answer_to(asked).map(|answer| answer.result.as_ref()) {
+        None => ObservedLog::Pending(lookup.waited.unwrap_or_default()),
+        Some(Ok(answer)) if !answer.is_unclear && answer.tail.is_some() => ObservedLog::Kept,
+        Some(Ok(answer)) if !answer.is_unclear => ObservedLog::None,
+        Some(Ok(_) | Err(_)) => ObservedLog::GivenUp,
+    }
+}
+
+/// The log of a Job that was kept.
+pub fn kept(lookup: &Lookup<FailureLog>, job: JobNumber) -> Option<Tail> {
+    let known = lookup.known().filter(|known| known.question.job == job)?;
+    known.result.as_ref().as_ref().ok()?.tail.clone()
 }
 
 /// The last lines of a log.
@@ -82,31 +136,39 @@ pub struct LogAnswer {
 }
 
 /// Keeps the tail of the first log that is there. Stores it once the submission has come to its end.
-pub(super) async fn keep(
-    client: &Client,
-    archive: &Archive,
-    namespace: &str,
-    demand: &LogDemand,
-    known: Option<Tail>,
-) -> LogAnswer {
-    let (tail, is_unclear) = match known {
-        Some(tail) => (Some(tail), false),
-        None => look(client, archive, namespace, demand).await,
-    };
-    let is_stored = match &tail {
-        Some(tail) if demand.is_over => store(archive, tail).await,
-        _ => true,
-    };
-    LogAnswer {
-        tail,
-        is_unclear: is_unclear || !is_stored,
+async fn keep(client: &Client, aws: &Aws, asked: &Asked<FailureLog>) -> LogAnswer {
+    let question = &asked.question;
+    let archive = question.files.archive(aws);
+    let known = asked.last.as_ref().filter(|last| last.question.job == question.job);
+    let found = known.and_then(|last| last.result.as_ref().as_ref().ok());
+    let mut tail = found.and_then(|found| found.tail.clone());
+    let is_done = known.is_some_and(|last| last.question.is_over == question.is_over);
+    if let Some(found) = found.filter(|found| is_done && found.tail.is_some()) {
+        return found.clone();
     }
+    let mut is_unclear = true;
+    for attempt in 0..TRIES {
+        if attempt > 0 {
+            tokio::time::sleep(TRY_AGAIN).await;
+        }
+        (tail, is_unclear) = match tail {
+            Some(tail) => (Some(tail), false),
+            None => look(client, &archive, &asked.about.namespace, question).await,
+        };
+        if let Some(tail) = tail.as_ref().filter(|_| question.is_over) {
+            is_unclear |= !store(&archive, tail).await;
+        }
+        if !is_unclear {
+            break;
+        }
+    }
+    LogAnswer { tail, is_unclear }
 }
 
 /// The first log that is there, or else whether one that may have it did not answer.
-async fn look(client: &Client, archive: &Archive, namespace: &str, demand: &LogDemand) -> (Option<Tail>, bool) {
+async fn look(client: &Client, archive: &Archive, namespace: &str, question: &FailureLog) -> (Option<Tail>, bool) {
     let mut is_unclear = false;
-    for place in &demand.places {
+    for place in &question.places {
         let read = async {
             match &place.at {
                 LogAt::Node { pod, previous } => of_node(client, namespace, pod, &place.container, *previous).await,
@@ -116,7 +178,7 @@ async fn look(client: &Client, archive: &Archive, namespace: &str, demand: &LogD
         let read = tokio::time::timeout(TRY, read).await;
         match read.unwrap_or_else(|_| Err("no answer in time".into())) {
             Ok(Some(bytes)) => {
-                if let Some(found) = found(demand.job.attempt, place, &bytes) {
+                if let Some(found) = found(question.job.attempt, place, &bytes) {
                     return (Some(found), false);
                 }
             }

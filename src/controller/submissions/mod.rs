@@ -1,14 +1,14 @@
 //! The reconcile of a Submission.
 //!
-//! It observes (`observe`: caches and memory), decides (`decide`: pure) and acts (`act`). What it needs of S3 the workers of
-//! `archive` read and write next to it.
+//! It observes (`observe`: caches and memory), decides (`decide`: pure) and acts (`act`). What it needs of S3, nodes and tables is asked
+//! next to it: `reports`, `fences`, `failure_log`, `rows`, `records`.
 //! `job_spec` and `pod_overlay` build what is created in the cluster; they know no client and no clock.
 
 pub mod act;
-pub mod archive;
 pub mod decide;
 pub mod external;
 pub mod failure_log;
+pub mod fences;
 pub mod job_spec;
 pub mod memory;
 pub mod observe;
@@ -17,7 +17,9 @@ pub mod phases;
 mod pod_layout;
 pub mod pod_overlay;
 pub mod questions;
+pub mod records;
 pub mod report_digest;
+pub mod reports;
 mod result_texts;
 pub mod rows;
 pub mod spans;

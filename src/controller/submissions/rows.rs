@@ -1,15 +1,13 @@
 //! The row that another program may have written of a submission, read before anything is written of it anywhere. While it shows a run,
 //! or cannot be read, it is read again every 30 s.
 
-use std::collections::HashMap;
-use std::sync::{Arc, Mutex};
+use std::sync::Arc;
 
 use super::questions::{ForeignRun, Row};
 use crate::ask::question::Failure;
 use crate::ask::{Asker, Wake};
 use crate::services::aws::Aws;
-use crate::services::table::{ObservedRow, Table, TableError, TableId};
-use leaderboard_base::lock::lock;
+use crate::services::table::{ObservedRow, TableError, Tables};
 use leaderboard_base::tasks::Tasks;
 
 /// What the old pipeline's row shows of a run that has not ended.
@@ -17,42 +15,17 @@ const UNDER_WAY: [&str; 2] = ["SUBMITTED", "RUNNING"];
 
 /// Starts the task that reads.
 pub fn start(aws: &Aws, tasks: &Tasks, wake: Wake) -> Asker<Row> {
-    let tables = Arc::new(Tables {
-        aws: aws.clone(),
-        known: Mutex::default(),
-    });
+    let tables = Arc::new(Tables::new(aws.clone()));
     Asker::start("rows", tasks, wake, move |asked| {
         let tables = Arc::clone(&tables);
-        async move { tables.read(&asked.question).await }
+        async move { read(&tables, &asked.question).await }
     })
 }
 
-/// Tables whose keys are known.
-struct Tables {
-    aws: Aws,
-    known: Mutex<HashMap<TableId, Table>>,
-}
-
-impl Tables {
-    async fn read(&self, row: &Row) -> Result<Option<ForeignRun>, Failure> {
-        let id = TableId::from(&row.table);
-        let known = lock(&self.known).get(&id).cloned();
-        let read = async {
-            let table = match known {
-                Some(table) => table,
-                None => Table::describe(&self.aws, &row.table).await?,
-            };
-            lock(&self.known).insert(id.clone(), table.clone());
-            table.read(&row.team, row.run_id.as_str()).await
-        };
-        match read.await {
-            Ok(found) => Ok(found.and_then(foreign_run)),
-            Err(error) => {
-                // It may have been made again with other keys.
-                lock(&self.known).remove(&id);
-                failure(&error).map_or(Ok(None), Err)
-            }
-        }
+async fn read(tables: &Tables, row: &Row) -> Result<Option<ForeignRun>, Failure> {
+    match tables.read(&row.table, &row.team, row.run_id.as_str()).await {
+        Ok(found) => Ok(found.and_then(foreign_run)),
+        Err(error) => failure(&error).map_or(Ok(None), Err),
     }
 }
 

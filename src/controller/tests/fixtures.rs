@@ -32,12 +32,12 @@ use crate::controller::submissions::job_spec::OwnImage;
 use crate::controller::submissions::memory::Memory;
 use crate::controller::submissions::observe::causes::Causes;
 use crate::controller::submissions::observe::workers::Workers;
+use crate::controller::submissions::records;
 use crate::kubernetes::objects::{Job, Owner, Pod};
 use crate::kubernetes::{Namespaces, Store, Synced, Writer};
 use crate::observability::traces::Traces;
 use crate::services::aws::Aws;
 use crate::services::evalai::{Hub, Options};
-use crate::services::table::Recorder;
 use leaderboard_api::{Attempt, JobNumber, Leaderboard, State, Submission, SubmissionStatus, Times, effective, names};
 use leaderboard_base::shutdown::Stop;
 use leaderboard_base::tasks::Tasks;
@@ -180,9 +180,8 @@ pub fn stores(cluster: Cluster) -> Stores {
 /// Services that nobody listens to.
 fn external(aws: &Aws, tasks: &Tasks) -> ExternalSystems {
     let hub = Hub::new(Options::unheard(tasks, || true));
-    let rows = mpsc::unbounded_channel().0;
-    let recorder = Recorder::new(aws.clone(), || true, rows, tasks.clone());
-    ExternalSystems::new(hub, recorder, Allowed::default())
+    let records = records::start(aws, || true, tasks, Box::new(|_| {}));
+    ExternalSystems::new(hub, records, Allowed::default())
 }
 
 async fn serve(

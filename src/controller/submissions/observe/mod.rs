@@ -16,6 +16,7 @@ use super::decide::job_name;
 use super::external::ExternalSystems;
 use super::memory::Memory;
 use super::view::{EvalaiView, NodeView, ObservedJob, PodView, View};
+use super::{failure_log, fences, reports};
 use crate::controller::objects::uid;
 use crate::controller::slots::Slots;
 use crate::controller::stores::Stores;
@@ -45,18 +46,19 @@ pub fn observe(uses: Uses<'_>, submission: Arc<Submission>, is_policy_in_place: 
     let status = submission.status.as_ref();
     let is_over = status.is_some_and(SubmissionStatus::has_ended);
     let pod_uid = pod.as_ref().map(|pod| pod.uid.as_str());
-    let archive = workers.archive.observe(&submission, pod_uid, is_over);
+    let (key, number) = (uid(submission.as_ref()), status.map(SubmissionStatus::job_number));
+    let number = number.unwrap_or_default();
     View {
         now,
         // Comparing it takes longer than reading the rest.
         is_policy_in_place: may_create(&job) && leaderboard.as_deref().is_some_and(is_policy_in_place),
         not_allowed: leaderboard.as_deref().and_then(|board| uses.external.refusal(board)),
-        row: workers.rows.get(uid(submission.as_ref())),
+        row: workers.rows.get(key),
         turn: uses.slots.turn(&submission, leaderboard.as_deref()),
         node: node(uses, pod.as_ref()),
-        report: archive.report,
-        fence: archive.fence,
-        log: archive.log,
+        report: reports::seen(&workers.reports.get(key), number, pod_uid),
+        fence: fences::seen(&workers.fences.get(key), number),
+        log: failure_log::seen(&workers.logs.get(key), number, is_over),
         evalai: uses
             .external
             .evalai_view(leaderboard.as_deref(), &submission)

@@ -4,7 +4,7 @@ use std::time::Duration;
 
 use super::builders::*;
 use crate::controller::slots::turns::Turn;
-use crate::controller::submissions::decide::{Action, EvalaiUpdate, Question, StatusWrite, TableUpdate};
+use crate::controller::submissions::decide::{Action, EvalaiUpdate, StatusWrite, TableUpdate};
 
 #[test]
 fn progress_waits_since_the_last_write_and_what_matters_does_not() {

@@ -1,6 +1,7 @@
-//! A worker against a bucket of the test's own.
+//! Reads of a bucket of the test's own.
 
 use std::collections::HashMap;
+use std::sync::Mutex;
 
 use axum::extract::State as Shared;
 use axum::http::{HeaderMap, StatusCode, Uri};
@@ -11,11 +12,12 @@ use tokio::time::timeout;
 
 use super::*;
 use crate::controller::fixtures::{Cluster, Surroundings, leaderboard, surroundings, with_job};
-use crate::controller::submissions::view::{ObservedReport, Stage};
-use leaderboard_api::{Attempt, JobNumber};
+use crate::controller::submissions::observe::workers::Workers;
+use leaderboard_api::{Submission, SubmissionStatus};
+use leaderboard_base::lock::lock;
 
 /// Longer than a read takes on a busy machine.
-const LIMIT: std::time::Duration = std::time::Duration::from_mins(1);
+const LIMIT: Duration = Duration::from_mins(1);
 
 /// Objects by the end of their key.
 type Objects = Arc<Mutex<HashMap<&'static str, String>>>;
@@ -68,8 +70,8 @@ impl Bench {
         lock(&self.objects).insert(key, body.into());
     }
 
-    fn workers(&self) -> &ArchiveWorkers {
-        &self.around.context.workers.archive
+    fn workers(&self) -> &Workers {
+        &self.around.context.workers
     }
 
     fn status(&self) -> SubmissionStatus {
@@ -81,40 +83,42 @@ impl Bench {
             job: JobNumber::first(Attempt(1)),
             pod: None,
             stage,
-            period: std::time::Duration::from_secs(10),
+            period: Duration::from_secs(10),
         };
+        let status = self.status();
         self.workers()
-            .demand(&self.submission, &self.status(), None, Some(demand));
+            .demand_report(&self.submission, &status, None, Some(demand));
     }
 
     /// Waits until the submission is woken; hands back what is known then.
-    async fn answer(&mut self) -> Observed {
+    async fn answer(&mut self) -> ReportView {
         let woken = timeout(LIMIT, self.around.answered.recv()).await;
         assert_eq!(woken.expect("it is woken").unwrap(), "sub");
         self.seen()
     }
 
-    fn seen(&self) -> Observed {
-        self.workers().observe(&self.submission, None, false)
+    fn seen(&self) -> ReportView {
+        let lookup = self.workers().reports.get("uid-of-sub");
+        seen(&lookup, JobNumber::first(Attempt(1)), None)
     }
 }
 
 #[tokio::test]
 async fn a_report_is_read_in_the_background_and_wakes_its_submission() {
     let mut bench = bench().await;
-    assert_eq!(bench.seen().report.stored, ObservedReport::NotRead);
+    assert_eq!(bench.seen().stored, ObservedReport::NotRead);
     bench.demand(Stage::Live);
-    assert_eq!(bench.answer().await.report.stored, ObservedReport::Absent);
+    assert_eq!(bench.answer().await.stored, ObservedReport::Absent);
     bench.stores("logcopy/report.json", report("all is well"));
     bench.demand(Stage::RunEnded);
-    let seen = bench.answer().await.report;
+    let seen = bench.answer().await;
     assert_eq!((seen.stage, seen.ours().unwrap().done), (Some(Stage::RunEnded), 4));
     // S3 answers that it is the same.
     bench.demand(Stage::JobEnded);
-    let seen = bench.answer().await.report;
+    let seen = bench.answer().await;
     assert_eq!((seen.stage, seen.ours().unwrap().done), (Some(Stage::JobEnded), 4));
     bench.workers().forget("uid-of-sub");
-    assert_eq!(bench.seen().report.stored, ObservedReport::NotRead);
+    assert_eq!(bench.seen().stored, ObservedReport::NotRead);
 }
 
 #[tokio::test]
@@ -122,7 +126,7 @@ async fn what_is_no_report_is_unreadable_and_another_objects_is_foreign() {
     let mut bench = bench().await;
     bench.stores("logcopy/report.json", "torn");
     bench.demand(Stage::JobEnded);
-    let seen = bench.answer().await.report;
+    let seen = bench.answer().await;
     assert!(matches!(seen.stored, ObservedReport::Unreadable(why) if why.contains("not one of ours")));
     bench.stores(
         "logcopy/report.json",
@@ -130,7 +134,7 @@ async fn what_is_no_report_is_unreadable_and_another_objects_is_foreign() {
     );
     bench.workers().forget("uid-of-sub");
     bench.demand(Stage::JobEnded);
-    assert_eq!(bench.answer().await.report.stored, ObservedReport::Foreign);
+    assert_eq!(bench.answer().await.stored, ObservedReport::Foreign);
 }
 
 #[tokio::test]
@@ -140,7 +144,7 @@ async fn a_report_of_before_a_restore_may_be_of_a_later_attempt() {
     let former = |text: &str| text.replace("uid-of-sub", "uid-before");
     bench.stores("logcopy/report.json", later.as_str());
     bench.demand(Stage::JobEnded);
-    let seen = bench.answer().await.report;
+    let seen = bench.answer().await;
     assert_eq!(seen.stored, ObservedReport::Foreign, "its own Pods are of its attempt");
     let status = bench.submission.status.as_mut().unwrap();
     status.plan.as_mut().unwrap().submission_uid = Some("uid-before".into());
@@ -148,43 +152,7 @@ async fn a_report_of_before_a_restore_may_be_of_a_later_attempt() {
         bench.workers().forget("uid-of-sub");
         bench.stores("logcopy/report.json", stored);
         bench.demand(Stage::JobEnded);
-        let seen = bench.answer().await.report;
+        let seen = bench.answer().await;
         assert_eq!(seen.ours().unwrap().attempt, Attempt(attempt));
-    }
-}
-
-#[tokio::test]
-async fn leaderboards_that_keep_their_objects_differently_share_a_bucket_and_no_worker() {
-    let bench = bench().await;
-    let mut other = bench.status();
-    let key = "arn:aws:kms:eu-west-1:123456789012:key/1".to_owned();
-    other.plan.as_mut().unwrap().storage.kms_key_arn = Some(key.clone());
-    let workers = bench.workers();
-    for status in [&bench.status(), &other, &other] {
-        workers.want_fence(&bench.submission, status);
-    }
-    let buckets = lock(&workers.0.buckets);
-    let keys: Vec<_> = buckets
-        .iter()
-        .map(|bucket| bucket.storage.kms_key_arn.clone())
-        .collect();
-    assert_eq!(keys, [None, Some(key)]);
-}
-
-#[tokio::test(start_paused = true)]
-async fn a_worker_ends_when_nobody_uses_its_bucket_and_begins_anew_with_the_next() {
-    let around = surroundings(Cluster::default(), "http://127.0.0.1:9").await;
-    let (submission, _) = with_job("sub", &leaderboard("one", "http://127.0.0.1:9"));
-    let (workers, status) = (&around.context.workers.archive, submission.status.clone().unwrap());
-    let runs = || workers.0.tasks.names().contains(&"archive one-bucket".to_owned());
-    for _ in 0..2 {
-        workers.want_fence(&submission, &status);
-        tokio::time::sleep(2 * LINGERS).await;
-        assert!(runs(), "its mark is needed");
-        workers.forget("uid-of-sub");
-        tokio::time::sleep(LINGERS / 2).await;
-        assert!(runs(), "the next submission may come");
-        tokio::time::sleep(2 * LINGERS).await;
-        assert!(!runs() && lock(&workers.0.buckets).is_empty());
     }
 }
