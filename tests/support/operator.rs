@@ -122,11 +122,7 @@ pub async fn kept(scene: &Scene, start: impl Fn(&Scene) -> Process) -> Infallibl
 impl Start {
     fn controller(scene: &Scene) -> Self {
         let (image, namespace) = (&scene.lab.image, &scene.namespace);
-        let arguments = [
-            ["--image", image],
-            ["--lease", LEASE],
-            ["--lease-namespace", namespace],
-        ];
+        let arguments = [["--image", image], ["--lease", LEASE], ["--lease-namespace", namespace]];
         Self {
             arguments: arguments.as_flattened().iter().map(|&text| text.to_owned()).collect(),
             ..Self::of(scene, "controller")

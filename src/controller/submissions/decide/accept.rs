@@ -7,9 +7,9 @@ use k8s_openapi::apimachinery::pkg::apis::meta::v1::Time;
 use super::failure::{self, infrastructure};
 use super::isolation::Missing;
 use super::plan::{Action, Question};
-use super::plan_builder::{PlanBuilder, Terms};
+use super::status::{PlanBuilder, Terms};
 use super::waits::Wait;
-use super::{end, foreign, image, isolation, pin};
+use super::{end, gates, image, isolation, pin};
 use crate::controller::submissions::view::{EvalaiInfo, Standing};
 use crate::services::evalai::Status;
 use leaderboard_api::conditions::{self, Truth};
@@ -49,7 +49,7 @@ pub(super) fn decide(draft: &mut PlanBuilder<'_>) -> bool {
         info,
     };
     // Before anything that could end it comes the look for another program: an end is written over what that one writes.
-    if foreign::waits(draft, terms) || waits_for_phase(draft, info) {
+    if gates::waits(draft, terms) || waits_for_phase(draft, info) {
         return false;
     }
     decide_run(draft, terms)

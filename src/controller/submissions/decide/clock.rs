@@ -7,7 +7,7 @@
 use jiff::Timestamp;
 use k8s_openapi::apimachinery::pkg::apis::meta::v1::Time;
 
-use super::plan_builder::PlanBuilder;
+use super::status::PlanBuilder;
 use crate::controller::submissions::view::PodView;
 use leaderboard_api::conditions;
 

@@ -11,7 +11,7 @@ use leaderboard_protocol::files::{Member, Pair, Side};
 use super::blame::{self, Crash};
 use super::failure::{infrastructure, participant};
 use super::next_steps::{Steps, for_both, in_the_log_of, of_participant, smaller};
-use super::plan_builder::PlanBuilder;
+use super::status::PlanBuilder;
 use super::waits::Wait;
 use crate::controller::submissions::report_digest::{ReportDigest, clamp};
 use crate::controller::submissions::view::{ContainerView, PodView};

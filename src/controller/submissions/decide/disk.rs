@@ -7,7 +7,7 @@
 use serde_json::Value;
 
 use super::failure::{charged, infrastructure};
-use super::plan_builder::PlanBuilder;
+use super::status::PlanBuilder;
 use crate::controller::submissions::pod_layout::{LOGS_VOLUME, SHM_VOLUME};
 use leaderboard_api::text::sentence;
 use leaderboard_api::{Failure, LeaderboardSpec, names, reasons};

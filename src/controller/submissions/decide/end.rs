@@ -2,9 +2,9 @@
 
 use k8s_openapi::apimachinery::pkg::apis::meta::v1::Time;
 
-use super::plan_builder::PlanBuilder;
+use super::status::PlanBuilder;
 use super::waits::{Wait, after};
-use super::{clock, crashes, disk, failure, interruption, provoked, reading, reported};
+use super::{clock, crashes, disk, failure, interruption, provoked, reported, run};
 use crate::controller::submissions::report_digest::ReportDigest;
 use crate::controller::submissions::view::{JobEnd, ObservedReport, Stage};
 use leaderboard_api::conditions::{self, Truth};
@@ -21,13 +21,13 @@ const OF_NODES: [&str; 2] = [reasons::NO_GPU, reasons::NODE_CANNOT_START];
 pub(super) fn decide(draft: &mut PlanBuilder<'_>, job_end: Option<&JobEnd>) {
     let view = draft.view;
     // A mark that comes late would stop the next Pod.
-    if let Some(left) = reading::requested_fence_left(draft) {
+    if let Some(left) = run::requested_fence_left(draft) {
         return draft.requeue_in(left);
     }
     // Without a plan nobody knows where a report would be.
-    let is_read = reading::is_of(draft, Stage::JobEnded) && view.report.stored != ObservedReport::NotRead;
+    let is_read = run::is_of(draft, Stage::JobEnded) && view.report.stored != ObservedReport::NotRead;
     if draft.status.plan.is_some() && !is_read {
-        if let Some(left) = reading::answer_left(draft) {
+        if let Some(left) = run::answer_left(draft) {
             return draft.requeue_in(left);
         }
         if wait_for_bucket(draft, NO_ANSWER) {
@@ -74,7 +74,7 @@ pub(super) fn of_complete_run(draft: &mut PlanBuilder<'_>) -> bool {
     let Some(pod) = view.pod.as_ref().filter(|pod| pod.run_ended.is_some()) else {
         return false;
     };
-    if !reading::is_of(draft, Stage::RunEnded) {
+    if !run::is_of(draft, Stage::RunEnded) {
         return false;
     }
     let report = view.report.ours().filter(|r| r.pod_uid == pod.uid);

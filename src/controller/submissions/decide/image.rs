@@ -1,7 +1,7 @@
 //! Which images run: the Leaderboard's patterns decide before a Job is made, and the first agent that starts pins the digest.
 
 use super::failure::charged;
-use super::plan_builder::PlanBuilder;
+use super::status::PlanBuilder;
 use crate::controller::submissions::view::{ContainerView, PodView};
 use leaderboard_api::{
     Failure, ImagePattern, ImageReference, LeaderboardSpec, PinnedImage, Repository, SubmissionStatus, image_pattern,

@@ -7,7 +7,7 @@
 use k8s_openapi::apimachinery::pkg::apis::meta::v1::Time;
 
 use super::failure::infrastructure;
-use super::plan_builder::PlanBuilder;
+use super::status::PlanBuilder;
 use crate::controller::submissions::view::PodView;
 use leaderboard_api::{Failure, Interruptions, MAX_INTERRUPTED_NODES, SubmissionStatus, reasons};
 

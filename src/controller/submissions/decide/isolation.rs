@@ -1,6 +1,6 @@
 //! No Job without the NetworkPolicy of its Leaderboard, as the Leaderboard's present spec asks for it.
 
-use super::plan_builder::PlanBuilder;
+use super::status::PlanBuilder;
 use leaderboard_api::PolicySource;
 use leaderboard_api::conditions;
 use leaderboard_api::text::sentence;

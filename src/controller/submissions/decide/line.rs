@@ -1,7 +1,7 @@
 //! In line for a slot: joins it, and shows the place. Who is next is decided by `slots`.
 
 use super::plan::Action;
-use super::plan_builder::PlanBuilder;
+use super::status::PlanBuilder;
 use crate::controller::slots::check_team;
 use crate::controller::slots::turns::{InLine, Turn};
 use leaderboard_api::{Eta, ResourceExt, Waiting, reasons};

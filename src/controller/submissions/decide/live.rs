@@ -3,11 +3,11 @@
 use std::sync::Arc;
 
 use super::plan::{Action, EvalaiUpdate, Question, TableUpdate};
-use super::plan_builder::PlanBuilder;
+use super::status::PlanBuilder;
 use super::waits::{Wait, after};
 use super::{
-    accept, clock, crashes, disk, end, failure, foreign, image, interruption, isolation, line, reading, record,
-    reported, start, stop,
+    accept, clock, crashes, disk, end, failure, gates, image, interruption, isolation, line, record, reported, run,
+    start, stop,
 };
 use crate::controller::submissions::job_spec;
 use crate::controller::submissions::report_digest::ReportDigest;
@@ -148,11 +148,11 @@ fn note_gpus(draft: &mut PlanBuilder<'_>) {
 /// The Job was made, or was about to be, and is not there: we ended it, somebody deleted it, or we crashed in between.
 fn without_its_job(draft: &mut PlanBuilder<'_>) {
     // What the run has stored last decides whether it is made again.
-    let is_read = reading::is_of(draft, Stage::JobEnded);
+    let is_read = run::is_of(draft, Stage::JobEnded);
     if !draft.is_to_stop()
         && (draft.was_job_seen() || draft.is_first_job())
         && !is_read
-        && let Some(left) = reading::answer_left(draft)
+        && let Some(left) = run::answer_left(draft)
     {
         return draft.requeue_in(left);
     }
@@ -169,7 +169,7 @@ fn without_its_job(draft: &mut PlanBuilder<'_>) {
     if is_held_up(draft) {
         return;
     }
-    if let Some(left) = reading::requested_fence_left(draft) {
+    if let Some(left) = run::requested_fence_left(draft) {
         return draft.requeue_in(left);
     }
     if draft.was_job_seen() {
@@ -217,7 +217,7 @@ fn has_expired(draft: &PlanBuilder<'_>) -> bool {
 }
 
 fn with_job(draft: &mut PlanBuilder<'_>, job: &JobView) {
-    if foreign::holds(draft, job) {
+    if gates::holds(draft, job) {
         return;
     }
     draft.status.job_name = Some(job.name.clone());

@@ -1,13 +1,13 @@
 //! Which log explains a failure: the places where its tail may be had, the best first. Pure.
 //!
-//! Called by `stop`, while the Pod is still there, and by `after`. An agent's log is in S3, where logcopy stores it; the
+//! Called by `stop`, while the Pod is still there, and by `publish`. An agent's log is in S3, where logcopy stores it; the
 //! others are on the node alone, and only as long as their Pod lives.
 
 use std::time::Duration;
 
+use super::cause;
 use super::plan::Action;
-use super::plan_builder::PlanBuilder;
-use super::trouble;
+use super::status::PlanBuilder;
 use super::waits::Wait;
 use crate::controller::submissions::view::{LogAt, LogPlace, ObservedLog, PodView};
 use leaderboard_api::{FailureClass, SubmissionStatus, conditions, names, reasons};
@@ -81,7 +81,7 @@ fn places(status: &SubmissionStatus, pod: Option<&PodView>) -> Vec<LogPlace> {
     let on_node = |container: &str| pod.and_then(|pod| on_node(pod, container));
     let found = match failure.reason.as_str() {
         reasons::SIMULATION_CRASHED => vec![on_node(&host), Some(stored(&host, console(pair)))],
-        reasons::START_DEADLINE => vec![pod.and_then(trouble::failing_before_agents).and_then(on_node)],
+        reasons::START_DEADLINE => vec![pod.and_then(cause::failing_before_agents).and_then(on_node)],
         reasons::RESULTS_NOT_STORED | reasons::JOB_FAILED => vec![
             on_node(names::CONTAINER_LOGCOPY),
             Some(stored(

@@ -1,61 +1,61 @@
 //! What is to be done for one submission: a pure function from a `View` to a `Plan`.
 //!
 //! Owns the state machine of docs/states.md. Called by the reconciler, once a reconcile. Knows no client, no clock but the
-//! one in the view, and no `async`. One file a stage of life: `accept`, `line`, `live`, `start`, `stop`, `end`, `after`; `interruption` is a
+//! one in the view, and no `async`. One file a stage of life: `accept`, `line`, `live`, `start`, `stop`, `end`, `publish`; `interruption` is a
 //! node that is taken away, `pulls` bounds a start, `blame` decides whose fault a crash was,
-//! `crashes` counts them, `clock` how long a run has gone on, `pin` pins the plan, `reported` takes reports in, `provoked` bounds failures that an agent can cause, `retention` deletes what
-//! has ended long ago, `significance` decides when a changed status is worth a write, `failure` names the causes of an end and `next_steps` what to do about them, `trouble` the causes of a wait,
+//! `crashes` counts them, `clock` how long a run has gone on, `pin` pins the plan, `reported` takes reports in, `provoked` bounds failures that an agent can cause, `leave` deletes what
+//! has ended long ago, `write` decides when a changed status is worth a write, `failure` names the causes of an end and `next_steps` what to do about them, `cause` the causes of a wait,
 //! `words` whose fault a start is by what Kubernetes writes of it, `disk` whose disk was full.
 
 mod accept;
-mod after;
 mod blame;
+mod cause;
 mod clock;
 mod crashes;
 mod disk;
 mod end;
 mod failure;
-mod foreign;
+mod gates;
 mod image;
 mod interruption;
 mod isolation;
+mod leave;
 mod line;
 mod live;
 mod log;
 mod next_steps;
 mod pin;
 mod plan;
-mod plan_builder;
 mod provoked;
+mod publish;
 mod pulls;
-mod reading;
 mod record;
 mod reported;
-mod retention;
-mod significance;
+mod run;
 mod start;
+mod status;
 mod stop;
 #[cfg(test)]
 mod tests;
-mod trouble;
 mod waits;
 mod words;
+mod write;
 
 use std::time::Duration;
 
 use super::view::View;
-pub use after::previous_controller;
 pub(super) use image::pinned;
 pub use plan::{Action, EvalaiUpdate, Event, Plan, Question, SlotUse, StatusWrite, TableUpdate, job_name};
-use plan_builder::PlanBuilder;
-pub use reading::{awaits_publication, patience};
+pub use publish::previous_controller;
+pub use run::{awaits_publication, patience};
+use status::PlanBuilder;
 
 /// Decides one reconcile.
 pub fn decide(view: &View) -> Plan {
     let mut draft = PlanBuilder::new(view);
     if draft.begin_attempt() {
         // What was observed is of another attempt.
-        after::leave_job(&mut draft);
+        publish::leave_job(&mut draft);
         draft.requeue_in(Duration::ZERO);
     } else {
         decide_stage(&mut draft);
@@ -63,7 +63,7 @@ pub fn decide(view: &View) -> Plan {
             draft.act_first(Action::SetFinalizer(true));
         }
     }
-    let report = reading::demand(&draft);
+    let report = run::demand(&draft);
     draft.into_plan(report)
 }
 
@@ -72,7 +72,7 @@ fn decide_stage(draft: &mut PlanBuilder<'_>) {
         live::decide(draft);
     }
     if draft.is_finished() {
-        after::decide(draft);
+        publish::decide(draft);
     }
 }
 

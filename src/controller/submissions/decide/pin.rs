@@ -1,6 +1,6 @@
 //! Pins the plan of a submission: what is run stays as it was accepted, however its Leaderboard is edited.
 
-use super::plan_builder::{PlanBuilder, Terms};
+use super::status::{PlanBuilder, Terms};
 use crate::controller::submissions::view::{EvalaiInfo, Standing};
 use leaderboard_api::{Attempt, LeaderboardSpec, RunPlan, effective};
 

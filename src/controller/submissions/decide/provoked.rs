@@ -4,7 +4,7 @@
 //! Called by `end`. An attempt alone decides, and no earlier one: the first such failure gets another Job, on another node where there is
 //! one. After a further one a Job follows only if the Job before it has finished a unit of work.
 
-use super::plan_builder::PlanBuilder;
+use super::status::PlanBuilder;
 use crate::controller::submissions::report_digest::clamp;
 use leaderboard_api::{Failure, FailureClass, reasons};
 

@@ -1,10 +1,10 @@
 //! The row of an end in the table, which follows EvalAI's word.
 
-use super::after::{Delivery, cannot_be_read, without_leaderboard};
-use super::foreign;
+use super::gates;
 use super::plan::{Action, TableUpdate};
-use super::plan_builder::PlanBuilder;
-use super::reading::{self, Reading};
+use super::publish::{Delivery, cannot_be_read, without_leaderboard};
+use super::run::{self, Reading};
+use super::status::PlanBuilder;
 use leaderboard_api::conditions::{self, Truth};
 use leaderboard_api::reasons;
 use leaderboard_api::text::sentence;
@@ -61,8 +61,8 @@ pub(super) fn decide(draft: &mut PlanBuilder<'_>, is_shown: bool) -> Delivery {
 fn why_without_row(draft: &PlanBuilder<'_>) -> Option<String> {
     if draft.view.record.is_none() {
         Some(String::new())
-    } else if foreign::is_held(draft) {
-        Some(foreign::NOT_WRITTEN.to_owned())
+    } else if gates::is_held(draft) {
+        Some(gates::NOT_WRITTEN.to_owned())
     } else if draft.status.plan.is_none() {
         Some("The submission was never accepted, so the table has no row for it.".to_owned())
     } else if !has_row(draft) {
@@ -88,7 +88,7 @@ pub(super) fn record_end(draft: &mut PlanBuilder<'_>) {
 /// Whether all that the row shows is there: only that of a finished submission has metrics.
 fn row_of_end(draft: &mut PlanBuilder<'_>) -> Reading {
     if draft.is_successful() {
-        reading::report_of_end(draft)
+        run::report_of_end(draft)
     } else {
         Reading::Done
     }

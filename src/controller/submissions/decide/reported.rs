@@ -1,6 +1,6 @@
 //! What a report shows of a run: progress, score, workers, and what its host should know of scores and logs.
 
-use super::plan_builder::PlanBuilder;
+use super::status::PlanBuilder;
 use crate::controller::submissions::report_digest::{ReportDigest, clamp};
 use leaderboard_api::conditions::{self, Truth};
 use leaderboard_api::text::sentence;

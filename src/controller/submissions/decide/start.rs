@@ -4,11 +4,11 @@
 
 use jiff::Timestamp;
 
+use super::cause::{self, Trouble};
 use super::failure::{self, infrastructure, participant};
 use super::next_steps::for_both;
-use super::plan_builder::PlanBuilder;
 use super::pulls::{self, Limit};
-use super::trouble::{self, Trouble};
+use super::status::PlanBuilder;
 use super::waits::{Wait, after};
 use super::words::Cause;
 use crate::controller::submissions::view::{JobView, ObservedNode, PodView, ScaleUp};
@@ -45,7 +45,7 @@ pub(super) fn watch(draft: &mut PlanBuilder<'_>, job: &JobView) {
         return unschedulable(draft, job, words, pod.scale_up.as_ref());
     }
     let since = pod.scheduled.or(job.created).unwrap_or(draft.now());
-    let found = trouble::of_pod(pod);
+    let found = cause::of_pod(pod);
     let stalled = found
         .as_ref()
         .map(|found| draft.blocked_since(found.reason).unwrap_or(draft.now()));

@@ -6,9 +6,9 @@ use jiff::Timestamp;
 use k8s_openapi::apimachinery::pkg::apis::meta::v1::Time;
 
 use super::plan::Action;
-use super::plan_builder::PlanBuilder;
+use super::status::PlanBuilder;
 use super::waits::{Wait, after};
-use super::{failure, interruption, log, reading, start};
+use super::{failure, interruption, log, run, start};
 use crate::controller::submissions::view::{JobView, ObservedNode, PodView};
 use leaderboard_api::reasons;
 use leaderboard_contract::run::Stop;
@@ -130,7 +130,7 @@ pub(super) fn delete(job: &JobView, grace_seconds: i64) -> Action {
 /// Removes a Pod that we can't reach. The fence goes first: what it still writes counts for nobody. Returns whether it did.
 fn force(draft: &mut PlanBuilder<'_>, pod: &PodView) -> bool {
     draft.act(Action::TakeOwnership);
-    if let Some(left) = reading::fence_left(draft) {
+    if let Some(left) = run::fence_left(draft) {
         draft.requeue_in(left);
         return false;
     }

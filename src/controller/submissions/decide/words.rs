@@ -1,7 +1,7 @@
 //! The cause of a start that fails, by the words of the kubelet, the container engine, the GPU toolkit, runc and the registries: one
 //! table. Pure.
 //!
-//! Called by `trouble` and `blame`. An image is the cause only where the words prove it. A node without disk, driver or memory must charge
+//! Called by `cause` and `blame`. An image is the cause only where the words prove it. A node without disk, driver or memory must charge
 //! nobody, and its words are endless; so what the table does not know is the node's, or the registry's.
 
 use leaderboard_contract::run::TOOLS;

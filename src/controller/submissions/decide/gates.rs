@@ -3,7 +3,7 @@
 
 use super::clock;
 use super::plan::{Action, Question};
-use super::plan_builder::{PlanBuilder, Terms};
+use super::status::{PlanBuilder, Terms};
 use super::stop;
 use super::waits::Wait;
 use crate::ask::question::{Answered, Failure};

@@ -6,8 +6,8 @@ use jiff::Timestamp;
 use k8s_openapi::apimachinery::pkg::apis::meta::v1::Time;
 
 use super::plan::{Action, Event, Plan, StatusWrite, job_name};
-use super::significance::{self, Change};
 use super::waits::Wait;
+use super::write::{self, Change};
 use crate::controller::submissions::view::{EvalaiInfo, ObservedJob, ReportDemand, View};
 use leaderboard_api::conditions::{self, Truth};
 use leaderboard_api::{
@@ -434,11 +434,11 @@ impl<'a> PlanBuilder<'a> {
     fn status_write(&mut self) -> StatusWrite {
         let nothing = SubmissionStatus::default();
         let old = self.submission().status.as_ref().unwrap_or(&nothing);
-        match significance::change(old, &self.status) {
+        match write::change(old, &self.status) {
             Change::Nothing => StatusWrite::NotNow,
-            Change::Place(position) if position > significance::FIRST_PLACES => StatusWrite::InTurn,
+            Change::Place(position) if position > write::FIRST_PLACES => StatusWrite::InTurn,
             Change::Progress => {
-                let patience = significance::patience(self.period());
+                let patience = write::patience(self.period());
                 let left = self.view.written_ago.and_then(|ago| patience.checked_sub(ago));
                 if let Some(left) = left {
                     self.requeue_in(left);

@@ -6,11 +6,11 @@ use jiff::Timestamp;
 use k8s_openapi::apimachinery::pkg::apis::meta::v1::Time;
 
 use super::plan::{Action, EvalaiUpdate};
-use super::plan_builder::{PlanBuilder, seconds};
-use super::reading::{self, Reading};
 use super::record::{self, record_end, superseded};
+use super::run::{self, Reading};
+use super::status::{PlanBuilder, seconds};
 use super::waits::{Wait, after};
-use super::{accept, foreign, log, retention, stop};
+use super::{accept, gates, leave, log, stop};
 use crate::controller::submissions::view::{EvalaiEnd, EvalaiView, ObservedJob};
 use crate::services::evalai::Status;
 use leaderboard_api::conditions::{self, Truth};
@@ -52,7 +52,7 @@ pub(super) fn decide(draft: &mut PlanBuilder<'_>) {
     let complete = is_published && recorded && log_left.is_none();
     if complete {
         draft.act(Action::Forget);
-        retention::decide(draft);
+        leave::decide(draft);
     } else {
         draft.look_again(Wait::DELIVERY);
     }
@@ -164,9 +164,9 @@ fn publish(draft: &mut PlanBuilder<'_>, log_left: Option<Duration>) -> Delivery 
     let is_overtaken = is_evalais && is_overtaken(draft);
     // One that was deleted before its end is ended there all the same: EvalAI counts it against its team until then.
     let is_ours = draft.spec().evalai.is_some() && (is_overtaken || !is_of_another_phase(draft));
-    let is_held = is_ours && foreign::is_held(draft);
+    let is_held = is_ours && gates::is_held(draft);
     if !is_ours || is_held || (is_evalais && !is_overtaken) || draft.observes() {
-        let message = if is_held { foreign::NOT_WRITTEN } else { "" };
+        let message = if is_held { gates::NOT_WRITTEN } else { "" };
         draft.condition(conditions::PUBLISHED, Truth::False, reasons::NOT_REQUIRED, message);
         return Delivery::Done;
     }
@@ -211,7 +211,7 @@ fn note_late_cancel(draft: &mut PlanBuilder<'_>) {
 
 /// Sends the end with all that belongs to it, once that is there. Returns why it cannot be read.
 fn send_result(draft: &mut PlanBuilder<'_>, log_left: Option<Duration>) -> Option<String> {
-    match reading::report_of_end(draft) {
+    match run::report_of_end(draft) {
         Reading::Waits(why) => return why,
         Reading::Done if log_left.is_some() => {}
         Reading::Done => draft.act(Action::UpdateEvalai(match draft.status.state_of_conditions() {

@@ -1,12 +1,12 @@
 //! When a Submission that has ended is deleted: `retention.finishedSeconds` after its end, once every system has that end.
 //!
-//! Called by `after`. Pure. An end is deleted only as it is stored: the deletion names the version of the object that was decided
+//! Called by `publish`. Pure. An end is deleted only as it is stored: the deletion names the version of the object that was decided
 //! on, and a reconcile that still has something to store deletes nothing.
 
 use jiff::Timestamp;
 
 use super::plan::Action;
-use super::plan_builder::PlanBuilder;
+use super::status::PlanBuilder;
 use super::waits::{Wait, after};
 use crate::controller::submissions::view::ObservedJob;
 use leaderboard_api::conditions;

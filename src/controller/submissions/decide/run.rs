@@ -8,7 +8,7 @@ use std::time::Duration;
 use jiff::Timestamp;
 
 use super::plan::Action;
-use super::plan_builder::PlanBuilder;
+use super::status::PlanBuilder;
 use super::waits::{Wait, after};
 use crate::controller::submissions::view::{ObservedFence, ObservedJob, ObservedReport, ReportDemand, Stage, View};
 use crate::services::evalai::Patience;
