@@ -1,115 +1,84 @@
-//! Acceptance: a Leaderboard, a track, an image, and EvalAI's word that the submission wants to run. Then the plan is pinned.
+//! Acceptance: a Leaderboard, EvalAI's word, a team, a track and an image. Then the plan is pinned: what is run stays as it was accepted,
+//! however the Leaderboard is edited.
 
 use std::time::Duration;
 
 use k8s_openapi::apimachinery::pkg::apis::meta::v1::Time;
 
-use super::failure::{self, infrastructure};
-use super::isolation::Missing;
+use super::end;
+use super::failure::{self, charged};
+use super::gates::{self, Gate};
 use super::plan::{Action, Question};
-use super::status::{PlanBuilder, Terms};
+use super::status::PlanBuilder;
 use super::waits::Wait;
-use super::{end, gates, image, isolation, pin};
-use crate::controller::submissions::view::{EvalaiInfo, Standing};
+use crate::controller::submissions::view::Standing;
 use crate::services::evalai::Status;
 use leaderboard_api::conditions::{self, Truth};
 use leaderboard_api::text::{LONGEST_NAME, one_line, sentence};
-use leaderboard_api::{Failure, ImageReference, LeaderboardSpec, Team, TeamStatus, Track, reasons};
+use leaderboard_api::{
+    Attempt, Failure, ImagePattern, ImageReference, LeaderboardSpec, Repository, RunPlan, Team, TeamStatus, Track,
+    effective, image_pattern, reasons,
+};
 
-/// Whether the submission may go on to its turn. Otherwise the draft shows why not. EvalAI's own end goes before all that it may
-/// wait for.
+/// Whether the plan is pinned, and the submission may go on to its turn. Otherwise the draft shows why not. EvalAI's own end goes before all
+/// that it may wait for, and the look for another program before anything that could end it: an end is written over what that one writes.
 pub(super) fn decide(draft: &mut PlanBuilder<'_>) -> bool {
     let Some(leaderboard) = draft.leaderboard() else {
-        let message = no_leaderboard(draft);
-        return refuse(draft, reasons::LEADERBOARD_NOT_FOUND, &message);
+        let message = draft.no_leaderboard();
+        draft.refuse(reasons::LEADERBOARD_NOT_FOUND, &message);
+        return false;
     };
     // Before anything of it is looked at: the bucket and the table may be somebody else's.
     if let Some(why) = &draft.view.not_allowed {
-        let message = leaderboard_not_ready(draft, reasons::NOT_ALLOWED, why);
-        return refuse(draft, reasons::LEADERBOARD_NOT_READY, &message);
+        let message = gates::leaderboard_not_ready(draft, reasons::NOT_ALLOWED, why);
+        draft.refuse(reasons::LEADERBOARD_NOT_READY, &message);
+        return false;
     }
-    let info = match ask_evalai(draft) {
-        Answer::NotNeeded => None,
-        Answer::Waiting => return false,
-        Answer::Ended(status) => {
-            end::cancelled(draft, reasons::ENDED_IN_EVALAI, &ended_in_evalai(status));
-            return false;
-        }
-        Answer::Wanted(info) => Some(info),
-    };
-    take_team(draft, info);
+    if !is_wanted(draft) {
+        return false;
+    }
+    take_team(draft);
     let Some(track) = find_track(draft, leaderboard) else {
         let message = missing_track(draft, leaderboard);
-        return refuse(draft, reasons::TRACK_NOT_FOUND, &message);
+        draft.refuse(reasons::TRACK_NOT_FOUND, &message);
+        return false;
     };
     draft.status.track = Some(track.name.clone());
-    let terms = Terms {
-        leaderboard,
-        track,
-        info,
-    };
-    // Before anything that could end it comes the look for another program: an end is written over what that one writes.
-    if gates::waits(draft, terms) || waits_for_phase(draft, info) {
+    if gates::closed(draft, &[Gate::OtherProgram, Gate::Phase]).is_some() {
         return false;
     }
-    decide_run(draft, terms)
-}
-
-/// Whether a submission that is wanted, and that nobody else runs, may go on to its turn.
-fn decide_run(draft: &mut PlanBuilder<'_>, terms: Terms<'_>) -> bool {
-    let Some(image) = allowed_image(draft, terms) else {
+    let Some(image) = allowed_image(draft, leaderboard, track) else {
         return false;
     };
-    if let Some(message) = not_ready(draft) {
-        return refuse(draft, reasons::LEADERBOARD_NOT_READY, &message);
+    if gates::closed(draft, &[Gate::Leaderboard, Gate::Policy]).is_some() {
+        return false;
     }
-    if let Some(missing) = isolation::missing(draft) {
-        return wait_for_policy(draft, &missing);
-    }
-    pin::pin(draft, terms, image);
+    pin(draft, leaderboard, track, image);
     draft.condition(conditions::ACCEPTED, Truth::True, reasons::ACCEPTED, "");
     true
 }
 
-/// The image, if one is named that the Leaderboard allows. Otherwise the draft shows why not.
-fn allowed_image(draft: &mut PlanBuilder<'_>, terms: Terms<'_>) -> Option<String> {
-    let (image, fault) = match named_image(draft, terms.info) {
+/// The image, if one is named that the Leaderboard allows. Otherwise the draft shows why not. One that can never run ends the submission: the
+/// plan makes it a row of the table, as any other failure.
+fn allowed_image(draft: &mut PlanBuilder<'_>, leaderboard: &LeaderboardSpec, track: &Track) -> Option<String> {
+    let (image, fault) = match named_image(draft) {
         Image::Named(image) => {
-            let fault = image::not_allowed(draft, terms.leaderboard, &image);
+            let fault = image_not_allowed(draft, leaderboard, &image);
             (image, fault)
         }
         Image::Invalid { image, what } => (image, Some(failure::image_invalid(&what))),
         Image::Unknown => {
             let message = image_unread(draft);
             draft.stall_with(reasons::IMAGE_MISSING, &message);
-            refuse(draft, reasons::IMAGE_MISSING, &message);
+            draft.refuse(reasons::IMAGE_MISSING, &message);
             return None;
         }
     };
-    if let Some(found) = fault {
-        refuse_image(draft, terms, image, found);
-        return None;
-    }
-    Some(image)
-}
-
-/// Ends a submission whose image can never run. The plan makes it a row of the table, as any other failure.
-fn refuse_image(draft: &mut PlanBuilder<'_>, terms: Terms<'_>, image: String, found: Failure) -> bool {
-    pin::pin(draft, terms, image);
+    let Some(found) = fault else { return Some(image) };
+    pin(draft, leaderboard, track, image);
     draft.condition(conditions::ACCEPTED, Truth::False, &found.reason, &found.message);
     end::failed(draft, found);
-    false
-}
-
-/// A Leaderboard and its first submission may come together: that the policy takes a moment then is no news.
-fn wait_for_policy(draft: &mut PlanBuilder<'_>, missing: &Missing) -> bool {
-    let created = draft.submission().metadata.creation_timestamp.as_ref();
-    let until = Wait::POLICY.shown_at(created.map_or(draft.now(), |time| time.0));
-    if draft.now() < until && !missing.is_refused {
-        draft.requeue_at(until);
-        return refuse(draft, reasons::PREPARING, &missing.message);
-    }
-    refuse(draft, reasons::NOT_ISOLATED, &missing.message)
+    None
 }
 
 /// What is shown of a row that has come to its end without us. EvalAI resumes only what has failed, re-runs all but what was deleted,
@@ -130,34 +99,6 @@ fn ended_in_evalai(status: Status) -> String {
     format!("EvalAI shows {status}: nothing is run and {done}. {next}")
 }
 
-/// What is shown while the Leaderboard does not exist.
-pub(super) fn no_leaderboard(draft: &PlanBuilder<'_>) -> String {
-    let name = &draft.spec().leaderboard_name;
-    format!("There is no Leaderboard {name} in this namespace. Apply it, and the submission goes on.")
-}
-
-/// Faults of the Leaderboard with which no Job can be made, or none may. The others speak for themselves where they hurt.
-fn not_ready(draft: &PlanBuilder<'_>) -> Option<String> {
-    let ready = draft.view.leaderboard.as_ref()?.condition(conditions::READY);
-    let ready = ready.filter(|c| c.status == "False")?;
-    let blocks = [
-        reasons::CLAIMS_NOT_SERVED,
-        reasons::CLAIM_TEMPLATE_MISSING,
-        reasons::INVALID_POD,
-        reasons::PREFIX_CONFLICT,
-    ]
-    .contains(&ready.reason.as_str());
-    blocks.then(|| leaderboard_not_ready(draft, &ready.reason, &ready.message))
-}
-
-fn leaderboard_not_ready(draft: &PlanBuilder<'_>, reason: &str, why: &str) -> String {
-    format!(
-        "Leaderboard {} is not ready ({reason}): {} Fix it, and the submission goes on.",
-        draft.spec().leaderboard_name,
-        sentence(why)
-    )
-}
-
 /// What is known of the participant's image.
 enum Image {
     Named(String),
@@ -171,7 +112,8 @@ enum Image {
 }
 
 /// The image that was pinned, else the object's, else that of the file in EvalAI.
-fn named_image(draft: &PlanBuilder<'_>, info: Option<&EvalaiInfo>) -> Image {
+fn named_image(draft: &PlanBuilder<'_>) -> Image {
+    let info = draft.evalai_info();
     let pinned = draft.status.plan.as_ref().map(|plan| plan.image.clone());
     let named = pinned
         .filter(|image| !image.is_empty())
@@ -203,70 +145,30 @@ fn image_unread(draft: &PlanBuilder<'_>) -> String {
     )
 }
 
-/// What is shown of a row that belongs to another phase than the Submission: its run would count for neither.
-fn foreign_phase(draft: &PlanBuilder<'_>, info: Option<&EvalaiInfo>) -> Option<String> {
-    let evalai = draft.spec().evalai?;
-    let (pk, ours) = (evalai.submission, evalai.phase);
-    let theirs = info?.phase.filter(|theirs| *theirs != ours)?;
-    Some(format!(
-        "In EvalAI submission {pk} belongs to phase {theirs}, not to phase {ours} of this Submission, so it is not run."
-    ))
-}
-
-/// Whether the row is of another phase, and has to be of ours again. The object may have been applied with a wrong phase, so nothing
-/// is reported at once; but the participant's submission does not wait for an end without limit.
-fn waits_for_phase(draft: &mut PlanBuilder<'_>, info: Option<&EvalaiInfo>) -> bool {
-    let Some(what) = foreign_phase(draft, info) else {
-        return false;
-    };
-    let message = format!(
-        "{what} Set phase {} back in EvalAI, or delete this Submission and apply it with the right phase; after {} min it \
-         fails, uncharged.",
-        draft.spec().evalai.map_or(0, |evalai| evalai.phase),
-        Wait::PHASE.longest / 60
-    );
-    let message = draft.stall(reasons::PHASE_DIFFERS, &message);
-    let since = draft.blocked_since(reasons::PHASE_DIFFERS).unwrap_or(draft.now());
-    let until = Wait::PHASE.over_at(since);
-    if draft.now() >= until {
-        end::failed(draft, infrastructure(reasons::PHASE_DIFFERS, &what));
-    } else {
-        draft.requeue_at(until);
-        refuse(draft, reasons::PHASE_DIFFERS, &message);
-    }
-    true
-}
-
-enum Answer<'a> {
-    NotNeeded,
-    Waiting,
-    Ended(Status),
-    Wanted(&'a EvalaiInfo),
-}
-
-fn ask_evalai<'a>(draft: &mut PlanBuilder<'a>) -> Answer<'a> {
+/// Whether EvalAI wants the submission to run, or need not be asked.
+fn is_wanted(draft: &mut PlanBuilder<'_>) -> bool {
     if draft.spec().evalai.is_none() {
-        return Answer::NotNeeded;
+        return true;
     }
-    match draft.evalai_info() {
-        Some(info) if info.standing == Standing::Ended => Answer::Ended(info.status),
-        Some(info) => Answer::Wanted(info),
-        None => {
-            draft.act(Action::Ask(Question::Evalai));
-            let view = draft.view.evalai.as_ref();
-            if draft.waits_quietly(Wait::EVALAI, view.map_or(Duration::ZERO, |evalai| evalai.waited)) {
-                return Answer::Waiting;
-            }
-            draft.look_again(Wait::EVALAI);
-            let message = match view.and_then(|view| view.error.as_deref()) {
-                Some(error) => draft.stall(reasons::ASKING_EVALAI, &asking(Some(error))),
-                None => asking(None),
-            };
-            draft.show(reasons::ASKING_EVALAI, message);
-            draft.condition(conditions::ACCEPTED, Truth::Unknown, reasons::ASKING_EVALAI, "");
-            Answer::Waiting
+    if let Some(info) = draft.evalai_info() {
+        if info.standing == Standing::Ended {
+            end::close_as(draft, reasons::ENDED_IN_EVALAI, &ended_in_evalai(info.status));
         }
+        return info.standing != Standing::Ended;
     }
+    draft.act(Action::Ask(Question::Evalai));
+    let view = draft.view.evalai.as_ref();
+    if draft.waits_quietly(Wait::EVALAI, view.map_or(Duration::ZERO, |evalai| evalai.waited)) {
+        return false;
+    }
+    draft.look_again(Wait::EVALAI);
+    let message = match view.and_then(|view| view.error.as_deref()) {
+        Some(error) => draft.stall(reasons::ASKING_EVALAI, &asking(Some(error))),
+        None => asking(None),
+    };
+    draft.show(reasons::ASKING_EVALAI, message);
+    draft.condition(conditions::ACCEPTED, Truth::Unknown, reasons::ASKING_EVALAI, "");
+    false
 }
 
 fn asking(error: Option<&str>) -> String {
@@ -307,7 +209,8 @@ fn shown(team: &Team) -> Team {
     }
 }
 
-fn take_team(draft: &mut PlanBuilder<'_>, info: Option<&EvalaiInfo>) {
+fn take_team(draft: &mut PlanBuilder<'_>) {
+    let info = draft.evalai_info();
     let given = draft.spec().team.as_ref().map(shown);
     let is_pinned = draft.status.plan.is_some() && draft.status.team.is_some();
     if is_pinned {
@@ -326,8 +229,91 @@ fn take_team(draft: &mut PlanBuilder<'_>, info: Option<&EvalaiInfo>) {
     }
 }
 
-fn refuse(draft: &mut PlanBuilder<'_>, reason: &str, message: &str) -> bool {
-    draft.condition(conditions::ACCEPTED, Truth::False, reason, message);
-    draft.show(reason, message);
-    false
+/// Why the Leaderboard does not allow the image.
+fn image_not_allowed(draft: &PlanBuilder<'_>, leaderboard: &LeaderboardSpec, image: &str) -> Option<Failure> {
+    let reference = ImageReference::parse(image).ok().filter(|_| !draft.status.has_run())?;
+    let repository = Repository::of(&reference);
+    let own = leaderboard.host_images();
+    let is_hosts = own
+        .into_iter()
+        .any(|own| ImageReference::parse(own).is_ok_and(|own| Repository::of(&own).is_same(&repository)));
+    let team = draft.status.team.as_ref().and_then(|team| team.id.as_deref());
+    let patterns = image_patterns(draft, leaderboard);
+    let is_allowed = patterns
+        .as_ref()
+        .is_none_or(|all| all.iter().any(|p| p.allows(&repository, team)))
+        || is_check_image(draft, leaderboard, &repository);
+    if is_allowed && !is_hosts {
+        return None;
+    }
+    let what = "The submitted image is not one that your team may submit to this leaderboard.";
+    Some(charged(reasons::IMAGE_NOT_ALLOWED, what))
+}
+
+/// Whether a check runs what its Leaderboard names for that.
+fn is_check_image(draft: &PlanBuilder<'_>, leaderboard: &LeaderboardSpec, repository: &Repository<'_>) -> bool {
+    let named = leaderboard.check.as_ref().filter(|_| draft.spec().check);
+    let named = named.and_then(|check| ImageReference::parse(&check.image).ok());
+    named.is_some_and(|named| Repository::of(&named).is_same(repository))
+}
+
+/// What may be submitted; none: everything.
+fn image_patterns(draft: &PlanBuilder<'_>, leaderboard: &LeaderboardSpec) -> Option<Vec<ImagePattern>> {
+    match &leaderboard.agent.images {
+        Some(images) if images.is_empty() => None,
+        Some(images) => Some(images.clone()),
+        None => {
+            let of_evalai = || vec![ImagePattern(image_pattern::OF_EVALAI.to_owned())];
+            draft.spec().evalai.is_some().then(of_evalai)
+        }
+    }
+}
+
+fn pin(draft: &mut PlanBuilder<'_>, leaderboard: &LeaderboardSpec, track: &Track, image: String) {
+    let info = draft.evalai_info();
+    let resumed = info.is_some_and(|i| i.standing == Standing::Resumed);
+    let plan = if let Some(pinned) = draft.status.plan.take() {
+        again(draft, leaderboard, pinned, image)
+    } else {
+        let resume = resumed || draft.spec().attempt > Attempt::FIRST || draft.is_adopted();
+        let plan = effective::plan(leaderboard, track, draft.submission().run_id(), image, resume);
+        let plan = if draft.spec().check { plan.of_check() } else { plan };
+        RunPlan {
+            earlier_attempts: attempts_before(draft),
+            submission_uid: draft.submission().metadata.uid.clone(),
+            ..plan
+        }
+    };
+    draft.status.results_url = Some(effective::results_url(&plan.storage, &plan.run_id));
+    draft.status.plan = Some(plan);
+    if draft.status.times.accepted.is_none() {
+        draft.status.times.accepted = Some(draft.time());
+    }
+}
+
+/// The plan of a submission that has one. A person who hands it over has it take up what is stored.
+fn again(draft: &PlanBuilder<'_>, leaderboard: &LeaderboardSpec, pinned: RunPlan, image: String) -> RunPlan {
+    let pinned = RunPlan {
+        resume: pinned.resume || draft.is_adopted(),
+        ..pinned
+    };
+    if draft.status.retry > 0 || draft.status.job_name.is_some() {
+        return pinned;
+    }
+    // The host's images belong to the attempt and follow the Leaderboard until its first Job is made; all else belongs to the submission.
+    RunPlan {
+        // The same, unless an earlier attempt had none.
+        image,
+        ..pinned.renewed(leaderboard)
+    }
+}
+
+/// How many attempts the table's row counts before those of an object that was made anew, as EvalAI's row names their Jobs: the table takes
+/// no attempt that is not above its own. An object with a history asks the table alone, since participants can edit EvalAI's row.
+fn attempts_before(draft: &PlanBuilder<'_>) -> i64 {
+    let is_new = draft.spec().attempt == Attempt::FIRST;
+    let resumed = draft
+        .evalai_info()
+        .filter(|info| is_new && info.standing == Standing::Resumed);
+    resumed.and_then(|info| info.last_attempt).map_or(0, |last| last.0)
 }

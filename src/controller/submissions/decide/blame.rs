@@ -5,16 +5,23 @@
 //! Both ends are matched by their round. Where the host's end of a round is missing, it is waited for, and then the agent is the
 //! cause.
 
-use jiff::Timestamp;
+use std::collections::BTreeSet;
 
+use jiff::Timestamp;
+use k8s_openapi::apimachinery::pkg::apis::meta::v1::Time;
+
+use super::status::PlanBuilder;
 use super::waits::Wait;
-use super::words;
-use crate::controller::submissions::view::{ContainerView, EndView};
-use leaderboard_api::EndReason;
+use super::{cause, failure};
+use crate::controller::submissions::report_digest::clamp;
+use crate::controller::submissions::view::{ContainerView, EndView, PodView};
+use leaderboard_api::{EndReason, Failure, LastEnd, SubmissionStatus, WorkerState, WorkerStatus};
+use leaderboard_protocol::files::{Member, Pair, Side};
 use leaderboard_protocol::verdict::{CODE_NO_PROCESS, CODE_NODE_REFUSED, What};
 
 /// Exit codes of a container that was ended with all others of its Pod, as by a sandbox that is made anew: killed, or lost from sight.
 const FROM_OUTSIDE: [i32; 2] = [137, 255];
+
 /// The kubelet's and the runtime's words where a container cannot be started for want of processes. A Pod has a number of them, and its
 /// agents can use it up.
 const OF_PROCESSES: [&str; 3] = [
@@ -87,7 +94,7 @@ fn from_outside(host: Option<&ContainerView>, agent: Option<&ContainerView>) -> 
 
 /// Whether the kubelet could not start a host's container again that has run in this Pod, for want of processes. That is no failure of its own:
 /// it is waited for, and an agent that ends meanwhile is the cause.
-pub(super) fn lacked_processes(container: &ContainerView, end: &EndView) -> bool {
+fn lacked_processes(container: &ContainerView, end: &EndView) -> bool {
     !is_of_first_life(container) && is_start_without_process(end)
 }
 
@@ -127,7 +134,7 @@ fn is_false_claim(host: Option<&ContainerView>, agent: &ContainerView, end: &End
 }
 
 /// Whether a crash was a failure of the host's container itself, which it was not if its Pod was being ended.
-pub(super) fn is_hosts_own(host: Option<&ContainerView>, crash: &Crash) -> bool {
+fn is_hosts_own(host: Option<&ContainerView>, crash: &Crash) -> bool {
     let was_ended = host.and_then(|container| what(container.last.as_ref()?)) == Some(What::Stopped);
     let is_its = matches!(
         crash.cause,
@@ -274,9 +281,135 @@ fn of_agent(container: &ContainerView, end: &EndView) -> EndReason {
 }
 
 fn of_start_error(end: &EndView) -> EndReason {
-    if words::of_start(end.why.as_deref().unwrap_or_default()).is_images() {
+    if cause::of_start(end.why.as_deref().unwrap_or_default()).is_images() {
         EndReason::StartError
     } else {
         EndReason::NodeCannotStart
     }
+}
+
+/// Counts the crashes of each worker and remembers the last one: its Pod may be gone when the cause is looked for.
+pub(super) fn note_crashes(status: &mut SubmissionStatus, pod: &PodView, now: Timestamp) {
+    let ids: BTreeSet<i32> = pod.containers.iter().filter_map(|c| pair_of(&c.name)).collect();
+    for id in ids {
+        let its = pod.containers.iter().filter(|c| pair_of(&c.name) == Some(id));
+        let counted = its.map(count_crashes).max().unwrap_or(0);
+        let crash = last_crash_of(pod, id, now);
+        if counted > 0 || crash.is_some() {
+            let host = pair_with(id).and_then(|pair| container(pod, pair.host()));
+            let worker = worker_entry(status, id);
+            worker.environment_failed |= crash.is_some_and(|crash| is_hosts_own(host, &crash));
+            take_crash(worker, counted, crash);
+        }
+    }
+}
+
+/// Takes in what was seen of a pair: how often its containers ended, by whatever, and the last crash.
+fn take_crash(worker: &mut WorkerStatus, counted: i32, crash: Option<Crash>) {
+    if let Some(crash) = crash {
+        let last = LastEnd {
+            reason: crash.cause,
+            exit_code: Some(crash.exit_code),
+            time: crash.at.map(Time),
+        };
+        // The same end is seen in each reconcile. One side's may have been counted as a crash before the other's was seen.
+        if crash.cause == EndReason::EndedFromOutside && worker.last.as_deref() != Some(&last) {
+            worker.ended_from_outside = worker.ended_from_outside.saturating_add(1);
+            worker.crashes = worker.crashes.saturating_sub(1).max(0);
+        }
+        worker.last = Some(Box::new(last));
+    }
+    worker.crashes = worker.crashes.max(counted.saturating_sub(worker.ended_from_outside));
+}
+
+/// Ends of a container that were crashes. One that has ended counts at once, not only when it is started again. The kubelet also counts
+/// how often it could not start a host's container, whose runner knows its rounds.
+fn count_crashes(container: &ContainerView) -> i32 {
+    let Some(last) = container.last.as_ref() else {
+        return container.restarts;
+    };
+    let is_host = Member::parse(&container.name).is_some_and(|member| member.side == Side::Host);
+    if is_host && lacked_processes(container, last) {
+        return 0;
+    }
+    let is_crash = is_crash(last);
+    let ends = container
+        .restarts
+        .saturating_add(i32::from(is_crash && !container.has_next_life()));
+    let round = last.verdict.as_ref().and_then(|verdict| verdict.round);
+    match round.filter(|_| is_host) {
+        Some(round) => ends.min(clamp(round).saturating_add(i32::from(is_crash))),
+        None => ends,
+    }
+}
+
+fn last_crash_of(pod: &PodView, id: i32, now: Timestamp) -> Option<Crash> {
+    let pair = pair_with(id)?;
+    last_crash(container(pod, pair.host()), container(pod, pair.agent()), now)
+}
+
+fn pair_with(id: i32) -> Option<Pair> {
+    u16::try_from(id).ok().and_then(Pair::new)
+}
+
+fn container(pod: &PodView, member: Member) -> Option<&ContainerView> {
+    let name = member.to_string();
+    pod.containers.iter().find(|container| container.name == name)
+}
+
+fn pair_of(container: &str) -> Option<i32> {
+    Some(Member::parse(container)?.pair.get().into())
+}
+
+fn worker_entry(status: &mut SubmissionStatus, id: i32) -> &mut WorkerStatus {
+    if let Some(at) = status.workers.iter().position(|p| p.id == id) {
+        return &mut status.workers[at];
+    }
+    let fresh = WorkerStatus {
+        id,
+        done: 0,
+        total: status.plan.as_ref().map_or(0, |plan| plan.total_of(id)),
+        crashes: 0,
+        state: WorkerState::Waiting,
+        last: None,
+        ended_from_outside: 0,
+        environment_failed: false,
+    };
+    let at = status.workers.partition_point(|p| p.id < id);
+    status.workers.insert(at, fresh);
+    &mut status.workers[at]
+}
+
+/// The failure of a pair that has crashed as often as it may, or cannot start at all. It waits until the cause is settled.
+pub(super) fn too_many(draft: &mut PlanBuilder<'_>) -> Option<Failure> {
+    let limit = draft.retries().per_worker.saturating_add(1);
+    let is_too_many = |worker: &&WorkerStatus| {
+        worker.crashes >= limit || (worker.crashes > 0 && failure::cause_of(worker).is_some_and(is_hopeless))
+    };
+    let node = draft.status.node_name.as_deref();
+    let mut awaited = None;
+    for worker in draft.status.workers.iter().filter(is_too_many) {
+        let Some(cause) = failure::cause_of(worker) else {
+            continue;
+        };
+        let pod = draft.view.pod.as_ref();
+        let crash = pod.and_then(|pod| last_crash_of(pod, worker.id, draft.now()));
+        // Who goes on to fail while the other side's word is waited for puts its end off no further.
+        match crash.filter(|crash| !crash.is_settled && worker.crashes <= limit) {
+            None => return Some(failure::of_worker(worker, cause, node)),
+            Some(crash) => awaited = awaited.or(crash.at),
+        }
+    }
+    if let Some(at) = awaited {
+        draft.requeue_at(Wait::PEER.over_at(at));
+    }
+    None
+}
+
+/// Whether another round in the same Pod would end in the same way.
+fn is_hopeless(cause: EndReason) -> bool {
+    matches!(
+        cause,
+        EndReason::CannotStart | EndReason::StartError | EndReason::NoGPU | EndReason::GraphicsDriverMissing
+    )
 }

@@ -1,11 +1,14 @@
 //! The end of an attempt: which outcome it has, or whether an infrastructure failure gives it another Job.
+//!
+//! Some infrastructure failures an agent can provoke. The first of an attempt gets another Job, on another node where there is one; after a
+//! further one a Job follows only if the Job before it has finished a route.
 
 use k8s_openapi::apimachinery::pkg::apis::meta::v1::Time;
 
 use super::status::PlanBuilder;
 use super::waits::{Wait, after};
-use super::{clock, crashes, disk, failure, interruption, provoked, reported, run};
-use crate::controller::submissions::report_digest::ReportDigest;
+use super::{cause, failure, run, stop};
+use crate::controller::submissions::report_digest::{ReportDigest, clamp};
 use crate::controller::submissions::view::{JobEnd, ObservedReport, Stage};
 use leaderboard_api::conditions::{self, Truth};
 use leaderboard_api::text::sentence;
@@ -21,7 +24,7 @@ const OF_NODES: [&str; 2] = [reasons::NO_GPU, reasons::NODE_CANNOT_START];
 pub(super) fn decide(draft: &mut PlanBuilder<'_>, job_end: Option<&JobEnd>) {
     let view = draft.view;
     // A mark that comes late would stop the next Pod.
-    if let Some(left) = run::requested_fence_left(draft) {
+    if let Some(left) = stop::requested_fence_left(draft) {
         return draft.requeue_in(left);
     }
     // Without a plan nobody knows where a report would be.
@@ -44,26 +47,20 @@ pub(super) fn decide(draft: &mut PlanBuilder<'_>, job_end: Option<&JobEnd>) {
     }
     // A cancel is then the higher attempt's, and what else has ended it is forgiven.
     if draft.is_followed() {
-        clock::count_use(draft, view.ended_at().unwrap_or(draft.now()));
+        run::count_use(draft, view.ended_at().unwrap_or(draft.now()));
         return draft.restart();
     }
-    let report = report.filter(|r| reported::is_of_present_job(draft, r));
+    let report = report.filter(|r| run::is_of_present_job(draft, r));
     if draft.is_cancelled() {
-        let reason = cancel_reason(draft);
-        let message = if reason == reasons::ENDED_IN_EVALAI {
-            "EvalAI ended the submission; what it had reached is kept."
-        } else {
-            "The submission was cancelled; what it had reached is kept."
-        };
-        return cancelled(draft, reason, message);
+        return cancelled(draft, "; what it had reached is kept");
     }
     let recorded = draft.status.failure.clone();
-    let recorded = recorded.filter(|found| !report.is_some_and(|r| crashes::is_refusal(&draft.status, found, r)));
+    let recorded = recorded.filter(|found| !report.is_some_and(|r| failure::is_refusal(&draft.status, found, r)));
     let found = recorded.map_or_else(|| cause(draft, report, job_end), |found| *found);
     if found.class == FailureClass::Infrastructure && may_retry(draft, &found) {
         return retry(draft, &found);
     }
-    let found = provoked::explained(draft, found);
+    let found = explained(draft, found);
     failed(draft, found);
 }
 
@@ -108,14 +105,25 @@ fn wait_for_bucket(draft: &mut PlanBuilder<'_>, why: &str) -> bool {
     true
 }
 
-/// Ends as Cancelled; nothing needs to be stopped any more.
-pub(super) fn cancelled(draft: &mut PlanBuilder<'_>, reason: &str, message: &str) {
+/// Ends as Cancelled; nothing needs to be stopped any more. `when` goes on with the sentence.
+pub(super) fn cancelled(draft: &mut PlanBuilder<'_>, when: &str) {
+    let reason = cancel_reason(draft);
+    let what = if reason == reasons::ENDED_IN_EVALAI {
+        "EvalAI ended the submission"
+    } else {
+        "The submission was cancelled"
+    };
+    close_as(draft, reason, &format!("{what}{when}."));
+}
+
+/// Ends without a failure.
+pub(super) fn close_as(draft: &mut PlanBuilder<'_>, reason: &str, message: &str) {
     draft.status.failure = None;
     close(draft, reason, message);
 }
 
 /// Why a cancelled submission was cancelled.
-pub(super) fn cancel_reason(draft: &PlanBuilder<'_>) -> &'static str {
+fn cancel_reason(draft: &PlanBuilder<'_>) -> &'static str {
     if draft.spec().cancel {
         reasons::CANCELLED
     } else if draft.is_deleting() {
@@ -144,7 +152,7 @@ fn cause(draft: &PlanBuilder<'_>, report: Option<&ReportDigest>, job_end: Option
 
 /// The failure of a Job that ended without final results.
 fn of_job(draft: &PlanBuilder<'_>, end: &JobEnd) -> Failure {
-    if let Some(found) = disk::full(draft) {
+    if let Some(found) = cause::disk_full(draft) {
         return found;
     }
     match end {
@@ -156,7 +164,7 @@ fn of_job(draft: &PlanBuilder<'_>, end: &JobEnd) -> Failure {
                 "The Pod reached its time limit; finished routes are kept.",
             )
         }
-        JobEnd::Failed { reason, message, .. } => crashes::worst(&draft.status).unwrap_or_else(|| {
+        JobEnd::Failed { reason, message, .. } => failure::worst(&draft.status).unwrap_or_else(|| {
             let what = format!("The Job failed with {reason}: {}", sentence(message));
             failure::infrastructure(reasons::JOB_FAILED, &what)
         }),
@@ -172,15 +180,14 @@ fn may_retry(draft: &PlanBuilder<'_>, found: &Failure) -> bool {
         reasons::SCHEDULE_DEADLINE,
     ];
     let can_recover = !FINAL.contains(&found.reason.as_str());
-    let is_left = interruption::is_one(found)
-        || (provoked::leaves_a_job(draft, found)
-            && interruption::other_failures(&draft.status) < draft.retries().infrastructure);
+    let is_left = stop::is_interruption(found)
+        || (leaves_a_job(draft, found) && stop::other_failures(&draft.status) < draft.retries().infrastructure);
     can_recover && is_left
 }
 
 fn retry(draft: &mut PlanBuilder<'_>, found: &Failure) {
-    let failures = interruption::other_failures(&draft.status);
-    let (delay, next) = if interruption::is_one(found) {
+    let failures = stop::other_failures(&draft.status);
+    let (delay, next) = if stop::is_interruption(found) {
         let next = "A new Job resumes from the results in S3; this costs neither an attempt nor a retry.";
         (0, next.to_owned())
     } else {
@@ -191,22 +198,22 @@ fn retry(draft: &mut PlanBuilder<'_>, found: &Failure) {
         )
     };
     let at = after(draft.now(), delay);
-    clock::count_use(draft, draft.view.ended_at().unwrap_or(draft.now()));
-    if interruption::is_one(found) {
-        interruption::note(draft);
+    run::count_use(draft, draft.view.ended_at().unwrap_or(draft.now()));
+    if stop::is_interruption(found) {
+        stop::note_interruption(draft);
     }
-    provoked::note(draft, found);
+    note_provoked(draft, found);
     draft.status.retry += 1;
     draft.status.job_name = None;
     let is_of_node = OF_NODES.contains(&found.reason.as_str());
     let node = draft.status.node_name.take();
-    if let Some(node) = node.filter(|_| is_of_node || provoked::is_one(found)) {
+    if let Some(node) = node.filter(|_| is_of_node || is_provoked(found)) {
         note_failed_node(&mut draft.status.failed_nodes, node, i32::from(is_of_node));
     }
     draft.status.failure = None;
     draft.status.recreated = 0;
     draft.status.next_retry_time = Some(Time(at));
-    clock::restart(draft);
+    run::restart_clock(draft);
     draft.status.times.stopping = None;
     for worker in &mut draft.status.workers {
         worker.crashes = 0;
@@ -235,12 +242,11 @@ pub(super) fn note_failed_node(nodes: &mut Vec<FailedNode>, node_name: String, j
 
 fn finished(draft: &mut PlanBuilder<'_>, report: &ReportDigest) {
     // Without its Job nobody has taken it in yet.
-    reported::take(draft, report);
-    draft.status.failure = None;
+    run::take_report(draft, report);
     let score = draft.status.score.as_ref();
     let score = score.map_or_else(String::new, |score| format!(", {} {}", score.name, score.text));
     let message = format!("{} of {} {}{score}.", report.done, report.total, report.unit);
-    close(draft, reasons::FINISHED, &message);
+    close_as(draft, reasons::FINISHED, &message);
 }
 
 /// Ends as Failed; nothing needs to be stopped any more.
@@ -252,11 +258,11 @@ pub(super) fn failed(draft: &mut PlanBuilder<'_>, found: Failure) {
 }
 
 fn close(draft: &mut PlanBuilder<'_>, reason: &str, message: &str) {
-    reported::count_attempts(draft);
+    run::count_attempts(draft);
     let ended = draft.view.ended_at().unwrap_or(draft.now());
     let ended = ended.min(draft.now());
     if !draft.is_finished() {
-        clock::count_use(draft, ended);
+        run::count_use(draft, ended);
     }
     draft.status.times.finished = Some(Time(ended));
     let started = draft.status.times.started.as_ref();
@@ -291,4 +297,62 @@ fn duration(seconds: i64) -> String {
         (0, hours, minutes) => format!("{hours}h{minutes}m"),
         (days, hours, _) => format!("{days}d{hours}h"),
     }
+}
+
+/// An announced end of a node is `NodeInterrupted`, which no agent can provoke.
+const REASONS: [&str; 8] = [
+    reasons::SIMULATION_CRASHED,
+    reasons::RESULTS_NOT_STORED,
+    reasons::JOB_FAILED,
+    reasons::CANNOT_START,
+    reasons::NODE_CANNOT_START,
+    reasons::NODE_LOST,
+    reasons::DISK_FULL,
+    reasons::IMAGE_PULL,
+];
+
+/// Added to the words of a failure that gets no further Job because of the rule.
+const NO_ROUTE: &str =
+    "The attempt had such an end before, and this Job has finished no route, so no further Job follows.";
+
+/// Whether an agent can have provoked a failure.
+fn is_provoked(found: &Failure) -> bool {
+    // A pull of the hosts' own images belongs to no worker.
+    let is_of_hosts = found.reason == reasons::IMAGE_PULL && found.worker.is_none();
+    found.class == FailureClass::Infrastructure && !is_of_hosts && REASONS.contains(&found.reason.as_str())
+}
+
+/// Whether the rule leaves another Job: `before` has the units that were stored when the failed Job was due, None for the attempt's first
+/// such failure; `stored` those that are stored by now.
+pub(super) fn may_go_on(found: &Failure, before: Option<i32>, stored: i32) -> bool {
+    !is_provoked(found) || before.is_none_or(|before| stored > before)
+}
+
+/// The same for the present Job.
+fn leaves_a_job(draft: &PlanBuilder<'_>, found: &Failure) -> bool {
+    may_go_on(found, draft.status.done_before, stored_routes(draft))
+}
+
+/// Notes what the next Job begins with.
+fn note_provoked(draft: &mut PlanBuilder<'_>, found: &Failure) {
+    if is_provoked(found) || draft.status.done_before.is_some() {
+        draft.status.done_before = Some(stored_routes(draft));
+    }
+}
+
+/// A failure that ends its attempt, with the rule if that is why.
+fn explained(draft: &PlanBuilder<'_>, found: Failure) -> Failure {
+    if leaves_a_job(draft, &found) {
+        return found;
+    }
+    Failure {
+        message: format!("{} {NO_ROUTE}", found.message),
+        ..found
+    }
+}
+
+/// Units of the attempt that are stored. What an earlier attempt has reached counts among them.
+fn stored_routes(draft: &PlanBuilder<'_>) -> i32 {
+    let reached = draft.status.progress.as_ref().map_or(0, |progress| progress.done);
+    draft.view.report.ours().map_or(reached, |report| clamp(report.done))
 }

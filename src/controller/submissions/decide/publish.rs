@@ -1,46 +1,42 @@
-//! After the end: EvalAI, then DynamoDB, then the Job's time to live, then the finalizer or the object's own time.
+//! What other systems get of an end: EvalAI first, then the table's row.
+//!
+//! The cancel race: EvalAI's own end wins until our result is answered (`amend`), and stands after it (`note_late_cancel`).
 
 use std::time::Duration;
 
 use jiff::Timestamp;
 use k8s_openapi::apimachinery::pkg::apis::meta::v1::Time;
 
-use super::plan::{Action, EvalaiUpdate};
-use super::record::{self, record_end, superseded};
+use super::plan::{Action, EvalaiUpdate, TableUpdate};
 use super::run::{self, Reading};
-use super::status::{PlanBuilder, seconds};
+use super::status::PlanBuilder;
 use super::waits::{Wait, after};
-use super::{accept, gates, leave, log, stop};
-use crate::controller::submissions::view::{EvalaiEnd, EvalaiView, ObservedJob};
+use super::{failure, gates, leave, stop};
+use crate::controller::submissions::view::{EvalaiEnd, EvalaiView, ObservedLog};
 use crate::services::evalai::Status;
 use leaderboard_api::conditions::{self, Truth};
 use leaderboard_api::text::sentence;
-use leaderboard_api::{Ingested, JOB_SECONDS, State, reasons};
+use leaderboard_api::{State, SubmissionStatus, reasons};
 
-/// Why an attempt does not begin.
-const NO_MESSAGE: &str = "no queue message announced it, and participants can edit the status there. Raise spec.attempt if it is to \
-                          run; otherwise set the status back in EvalAI.";
-const HAS_FINISHED: &str = "the submission has finished, which is final. Nothing to do if an old message was only sent again. Otherwise \
-                            re-run it in EvalAI, which makes a new submission, or set its status back there.";
 const SENT_AGAIN: &str = "EvalAI may have lost its own end of this submission: one of our requests may have overwritten it, or \
                            the submission was deleted before its end. EvalAI is read again, and `cancelled` is written if \
                            needed.";
 
 /// Decides for a submission in a terminal state.
 pub(super) fn decide(draft: &mut PlanBuilder<'_>) {
-    leave_job(draft);
-    show_refused_attempt(draft);
+    leave::leave_job(draft);
+    leave::show_refused_attempt(draft);
     // Before EvalAI has the end, since its hosts read it there.
-    let log_left = log::keep_at_end(draft);
+    let log_left = keep_at_end(draft);
     let published = publish(draft, log_left);
     // The row follows EvalAI's word, which may still turn the end into Cancelled; a refusal is a word too.
     let recorded = match published {
         Delivery::Waiting => {
-            record::follow_evalai(draft);
+            follow_evalai(draft);
             false
         }
-        Delivery::Answered(at) => record::decide(draft, draft.now() >= shown_by(at)) == Delivery::Done,
-        Delivery::Done | Delivery::Refused => record::decide(draft, true) == Delivery::Done,
+        Delivery::Answered(at) => record(draft, draft.now() >= shown_by(at)) == Delivery::Done,
+        Delivery::Done | Delivery::Refused => record(draft, true) == Delivery::Done,
     };
     if let Delivery::Answered(at) = published {
         show_published(draft, at, recorded);
@@ -52,36 +48,14 @@ pub(super) fn decide(draft: &mut PlanBuilder<'_>) {
     let complete = is_published && recorded && log_left.is_none();
     if complete {
         draft.act(Action::Forget);
-        leave::decide(draft);
+        leave::delete_in_time(draft);
     } else {
         draft.look_again(Wait::DELIVERY);
     }
     if complete {
-        remove_job_in_time(draft);
+        leave::remove_job_in_time(draft);
     }
-    release(draft, complete);
-}
-
-/// Shows once that EvalAI's row asks for another attempt which does not begin.
-fn show_refused_attempt(draft: &mut PlanBuilder<'_>) {
-    let refused = Ingested::of(draft.submission()).and_then(|record| record.refused);
-    let Some(refused) = refused.filter(|refused| refused.attempt == draft.spec().attempt.next()) else {
-        return;
-    };
-    let has_finished = draft.status.state_of_conditions() == State::Finished;
-    let (reason, why) = if has_finished {
-        (reasons::ATTEMPT_AFTER_FINISH, HAS_FINISHED)
-    } else {
-        (reasons::ATTEMPT_WITHOUT_MESSAGE, NO_MESSAGE)
-    };
-    let (attempt, since) = (refused.attempt, seconds(refused.at));
-    let message =
-        format!("Attempt {attempt} does not begin: EvalAI's status or queue asks for it since {since}, but {why}");
-    let is_new = draft.blocked_since(reason).is_none();
-    draft.stall_with(reason, &message);
-    if is_new {
-        draft.event(true, reason, message);
-    }
+    leave::release(draft, complete);
 }
 
 /// How far another system is with the end.
@@ -111,45 +85,17 @@ fn shown_by(at: Timestamp) -> Timestamp {
     Wait::TOGETHER.shown_at(at)
 }
 
-/// What becomes of the Job of an attempt that has ended: it is kept for its time, and one that shows up late is ended.
-pub(super) fn leave_job(draft: &mut PlanBuilder<'_>) {
-    let ObservedJob::Ours(job) = &draft.view.job else {
-        return;
-    };
-    if job.end.is_some() {
-        return;
-    }
-    if let Some(until) = farewell(draft) {
-        return draft.requeue_at(until);
-    }
-    if job.deleting {
-        stop::remove_overdue_pod(draft);
-    } else {
-        draft.act(stop::delete(job, Wait::DELETION.longest));
-    }
-    draft.look_again(Wait::DELIVERY);
-}
-
-/// Until when a Pod whose run has ended may take to say its farewell; None if nothing is to be waited for.
-fn farewell(draft: &PlanBuilder<'_>) -> Option<Timestamp> {
-    let pod = draft.view.pod.as_ref().filter(|pod| pod.delete_by.is_none())?;
-    pod.run_ended?;
-    let end = draft.status.end()?;
-    let until = Wait::FAREWELL.over_at(end.last_transition_time.0);
-    (draft.now() < until).then_some(until)
-}
-
 fn is_not_wanted(draft: &PlanBuilder<'_>, type_: &str) -> bool {
     let known = draft.status.condition(type_);
     known.is_some_and(|c| c.reason == reasons::NOT_REQUIRED)
 }
 
 /// A Leaderboard that is gone can't show what is wanted: what was decided before stands, and what never ran needs nothing.
-pub(super) fn without_leaderboard(draft: &mut PlanBuilder<'_>, type_: &str) -> Delivery {
+fn without_leaderboard(draft: &mut PlanBuilder<'_>, type_: &str) -> Delivery {
     if is_not_wanted(draft, type_) {
         return Delivery::Done;
     }
-    let message = accept::no_leaderboard(draft);
+    let message = draft.no_leaderboard();
     draft.condition(type_, Truth::False, reasons::LEADERBOARD_NOT_FOUND, &message);
     if draft.status.plan.is_none() {
         Delivery::Done
@@ -164,7 +110,7 @@ fn publish(draft: &mut PlanBuilder<'_>, log_left: Option<Duration>) -> Delivery 
     let is_overtaken = is_evalais && is_overtaken(draft);
     // One that was deleted before its end is ended there all the same: EvalAI counts it against its team until then.
     let is_ours = draft.spec().evalai.is_some() && (is_overtaken || !is_of_another_phase(draft));
-    let is_held = is_ours && gates::is_held(draft);
+    let is_held = is_ours && draft.is_held();
     if !is_ours || is_held || (is_evalais && !is_overtaken) || draft.observes() {
         let message = if is_held { gates::NOT_WRITTEN } else { "" };
         draft.condition(conditions::PUBLISHED, Truth::False, reasons::NOT_REQUIRED, message);
@@ -284,7 +230,7 @@ pub fn previous_controller(until: Timestamp) -> String {
 }
 
 /// What keeps an end from being published. The first text stands: another one for the same would be a write each time.
-pub(super) fn cannot_be_read(draft: &PlanBuilder<'_>, type_: &str, why: &str) -> String {
+fn cannot_be_read(draft: &PlanBuilder<'_>, type_: &str, why: &str) -> String {
     const BEGINS: &str = "The stored result cannot be read:";
     let known = draft.status.condition(type_).map(|c| c.message.to_string());
     let known = known.filter(|message| message.starts_with(BEGINS));
@@ -349,49 +295,130 @@ fn keep_evalais_end(draft: &mut PlanBuilder<'_>, status: Status) {
     }
 }
 
-/// Removes a Job whose host wants it gone before Kubernetes removes it: that is late enough for every end to be read first.
-fn remove_job_in_time(draft: &mut PlanBuilder<'_>) {
-    let ended = draft.view.job.ours().filter(|job| !job.deleting);
-    let Some((job, end)) = ended.and_then(|job| job.end.as_ref().map(|end| (job, end))) else {
-        return;
-    };
-    let seconds = draft
-        .leaderboard()
-        .map_or(JOB_SECONDS, |l| l.ttl_seconds_after_finished);
-    if seconds >= JOB_SECONDS {
-        return;
+/// Requests the log of a run that has failed, until EvalAI's answer to the end is known: its hosts read it there. Returns how
+/// long EvalAI waits for it.
+fn keep_at_end(draft: &mut PlanBuilder<'_>) -> Option<Duration> {
+    let before = draft.view.submission.status.as_ref();
+    let has_just_ended = !before.is_some_and(SubmissionStatus::has_ended);
+    let is_published = before.is_some_and(|s| s.is_delivered(conditions::PUBLISHED));
+    let is_answered = draft.view.evalai.as_ref().is_some_and(|e| e.end.is_some());
+    let is_awaited = draft.spec().evalai.is_some() && !is_published && !is_answered;
+    if is_awaited || (has_just_ended && !is_answered) {
+        let places = failure::log_places(&draft.status, draft.view.pod.as_ref());
+        if !places.is_empty() {
+            draft.act(Action::KeepLog { places });
+            // What is known is of the time before the end.
+            let log = if has_just_ended {
+                ObservedLog::NotRequested
+            } else {
+                draft.view.log
+            };
+            return stop::log_left(log, Wait::LOG.left(Duration::ZERO));
+        }
     }
-    let finished = draft.status.times.finished.as_ref().map(|time| time.0);
-    let until = after(end.at().or(finished).unwrap_or(draft.now()), seconds.into());
-    if draft.now() < until {
-        draft.requeue_at(until);
+    stop::log_left(draft.view.log, None).filter(|_| !has_just_ended)
+}
+
+/// How the message begins of an end that is settled without a row: another try would be refused again.
+const SUPERSEDED: &str = "The table keeps another row of this run";
+
+/// Shown while the row may still turn out otherwise.
+const FOLLOWS_EVALAI: &str = "The table's row is written when EvalAI has answered, since EvalAI may still have cancelled the submission. The \
+                              condition Published shows what EvalAI is waited for.";
+
+/// Shown while the row is on its way.
+const IN_LINE: &str = "The row waits for the table, which takes one row after the other.";
+
+/// Writes the row of an end on which EvalAI has had its word. `is_shown`: the status shows that word. Until then its text about the row stays,
+/// which saves a write.
+fn record(draft: &mut PlanBuilder<'_>, is_shown: bool) -> Delivery {
+    if draft.status.is_true(conditions::RECORDED) {
+        return Delivery::Done;
+    }
+    if draft.leaderboard().is_none() {
+        return without_leaderboard(draft, conditions::RECORDED);
+    }
+    if let Some(message) = why_without_row(draft) {
+        draft.condition(conditions::RECORDED, Truth::False, reasons::NOT_REQUIRED, &message);
+        return Delivery::Done;
+    }
+    let view = draft.view.record.clone().unwrap_or_default();
+    if view.end_written {
+        draft.condition(conditions::RECORDED, Truth::True, reasons::RECORDED, "");
+        return Delivery::Done;
+    }
+    let mut unread = None;
+    match row_of_end(draft) {
+        Reading::Waits(why) => unread = why.map(|why| cannot_be_read(draft, conditions::RECORDED, &why)),
+        Reading::Done => record_end(draft),
+    }
+    let (reason, message) = match view.error {
+        Some(error) => (
+            reasons::REFUSED,
+            format!(
+                "The last write failed: {} It is tried again; look at the table and the operator's rights.",
+                sentence(&error)
+            ),
+        ),
+        None => (
+            reasons::WAITING,
+            unread.unwrap_or_else(|| (if is_shown { IN_LINE } else { FOLLOWS_EVALAI }).to_owned()),
+        ),
+    };
+    draft.condition(conditions::RECORDED, Truth::False, reason, &message);
+    Delivery::Waiting
+}
+
+/// Why the end has no row of its own; none if it has one, or will.
+fn why_without_row(draft: &PlanBuilder<'_>) -> Option<String> {
+    if draft.view.record.is_none() {
+        Some(String::new())
+    } else if draft.is_held() {
+        Some(gates::NOT_WRITTEN.to_owned())
+    } else if draft.status.plan.is_none() {
+        Some("The submission was never accepted, so the table has no row for it.".to_owned())
+    } else if !draft.has_row() {
+        Some(
+            "The row needs a team: give spec.team.id to a submission that is not EvalAI's. A check has none."
+                .to_owned(),
+        )
     } else {
-        draft.act(stop::delete(job, Wait::DELETION.longest));
-        draft.look_again(Wait::DELIVERY);
+        superseded(draft)
     }
 }
 
-fn release(draft: &mut PlanBuilder<'_>, complete: bool) {
-    let Some(deleted) = draft.submission().metadata.deletion_timestamp.clone() else {
-        return;
-    };
-    if !draft.has_finalizer() {
-        return;
-    }
-    if complete {
-        return draft.act(Action::SetFinalizer(false));
-    }
-    let patience = draft.leaderboard().map_or(900, |l| l.deadlines.finalize_seconds);
-    let until = after(deleted.0, patience);
-    if draft.now() >= until {
-        draft.event(
-            true,
-            reasons::RELEASED_UNPUBLISHED,
-            "The submission was deleted, and its end was not published within deadlines.finalizeSeconds: the finalizer is removed.",
-        );
-        draft.act(Action::Forget);
-        draft.act(Action::SetFinalizer(false));
+fn record_end(draft: &mut PlanBuilder<'_>) {
+    draft.act(Action::Record(TableUpdate::End));
+}
+
+/// Whether all that the row shows is there: only that of a finished submission has metrics.
+fn row_of_end(draft: &mut PlanBuilder<'_>) -> Reading {
+    if draft.is_successful() {
+        run::report_of_end(draft)
     } else {
-        draft.requeue_at(until);
+        Reading::Done
     }
+}
+
+/// Shows that the row waits for EvalAI, where there will be one.
+fn follow_evalai(draft: &mut PlanBuilder<'_>) {
+    let known = draft.status.condition(conditions::RECORDED);
+    let is_waiting = known.is_some_and(|known| known.reason == reasons::WAITING);
+    if is_waiting && draft.leaderboard().is_some() && why_without_row(draft).is_none() {
+        draft.condition(conditions::RECORDED, Truth::False, reasons::WAITING, FOLLOWS_EVALAI);
+    }
+}
+
+/// Shows that the table keeps another row than that of this end: the recorder knows until it has forgotten the end, then the status.
+fn superseded(draft: &PlanBuilder<'_>) -> Option<String> {
+    if let Some(kept) = draft.view.record.as_ref().and_then(|row| row.superseded_by) {
+        let next = kept.saturating_add(1);
+        return Some(format!(
+            "{SUPERSEDED}, of attempt {kept}, and this end was not written there. Raise spec.attempt to {next} if the submission is to \
+             go on. Correct the row by hand if this end is the one that counts."
+        ));
+    }
+    let shown = draft.status.condition(conditions::RECORDED)?;
+    let is_shown = shown.reason == reasons::NOT_REQUIRED && shown.message.starts_with(SUPERSEDED);
+    is_shown.then(|| shown.message.to_string())
 }

@@ -1,28 +1,81 @@
 //! From the Job's creation to its running agents: what its Pod waits for, and when that has taken too long.
 //!
-//! Also of a Pod that replaces a lost one: then the submission keeps its state, with the reason `Replacing`.
+//! Also of a Pod that replaces a lost one: the submission then keeps its state, with the reason `Replacing`. Pulls of images have a deadline
+//! apart from all the rest. The kubelet's events are not watched, and no condition covers images, so a pull is known by its containers: the
+//! kubelet starts them in order, and one that was never started, has no error and is next is waiting for its image.
 
 use jiff::Timestamp;
 
-use super::cause::{self, Trouble};
-use super::failure::{self, infrastructure, participant};
-use super::next_steps::for_both;
-use super::pulls::{self, Limit};
+use super::cause::{self, Cause, Trouble};
+use super::failure::{self, infrastructure};
+use super::plan::Action;
+use super::run;
 use super::status::PlanBuilder;
 use super::waits::{Wait, after};
-use super::words::Cause;
-use crate::controller::submissions::view::{JobView, ObservedNode, PodView, ScaleUp};
+use crate::controller::submissions::job_spec;
+use crate::controller::submissions::view::{ContainerView, JobView, ObservedJob, ObservedNode, PodView, ScaleUp};
 use leaderboard_api::conditions::{self, Truth};
 use leaderboard_api::text::sentence;
-use leaderboard_api::{Failure, names, reasons};
+use leaderboard_api::{Deadlines, Failure, names, reasons};
+use leaderboard_protocol::files::Member;
 
 /// The message for a Pod that starts as it should.
-pub(super) const PREPARED: &str = "The Pod is being prepared.";
+const PREPARED: &str = "The Pod is being prepared.";
+
 /// The kubelet's reason where a device plugin does not give the devices on which the scheduler counted.
 const NOT_ADMITTED: &str = "UnexpectedAdmissionError";
+
 const LOST: &str = "The Pod was lost. A new Pod will resume from the results in S3.";
+
 /// The minutes of silence that are reported: a count of every one would be a write each.
 const REPORTED_MINUTES: [i64; 6] = [2, 5, 10, 20, 30, 60];
+
+pub(super) fn start_job(draft: &mut PlanBuilder<'_>) {
+    let view = draft.view;
+    let name = draft.job_name();
+    draft.status.waiting = None;
+    draft.status.next_retry_time = None;
+    draft.status.job_name = Some(name);
+    note_gpus(draft);
+    draft.act(Action::CreateJob(draft.status.job_number()));
+    if let ObservedJob::Absent { refused: Some(words) } = &view.job {
+        job_refused(draft, words);
+    } else if draft.is_running() {
+        draft.waits(reasons::PREPARING);
+        let message = "The Job was deleted by somebody else. A new Job will resume from the results in S3.";
+        draft.replacing(message);
+    } else {
+        draft.waits(reasons::PREPARING);
+        draft.condition(conditions::RUNNING, Truth::False, reasons::PREPARING, "");
+        draft.show(reasons::PREPARING, PREPARED);
+    }
+    run::update_evalai(draft);
+    run::record_progress(draft);
+    draft.look_again(Wait::JOB);
+}
+
+/// How many GPUs the next Job has: the Leaderboard may be another one when it ends.
+fn note_gpus(draft: &mut PlanBuilder<'_>) {
+    let (Some(spec), Some(plan)) = (draft.leaderboard(), draft.status.plan.as_ref()) else {
+        return;
+    };
+    let track = spec.tracks.iter().find(|track| track.name == plan.track);
+    let gpus = job_spec::gpus(spec, track, plan);
+    if gpus > 0 || draft.status.usage.is_some() {
+        draft.status.usage.get_or_insert_default().gpus = gpus;
+    }
+}
+
+/// An older object of the same name still has the Job.
+pub(super) fn name_taken(draft: &mut PlanBuilder<'_>) {
+    let message = format!(
+        "The Job {} belongs to an older object of this name and is going away. If it stays, delete it.",
+        draft.job_name()
+    );
+    let message = draft.stall(reasons::JOB_NAME_TAKEN, &message);
+    draft.show(reasons::JOB_NAME_TAKEN, message);
+    draft.look_again(Wait::JOB_NAME);
+}
 
 /// Reports how far a Job's Pod is, and fails the attempt when a start has taken too long.
 pub(super) fn watch(draft: &mut PlanBuilder<'_>, job: &JobView) {
@@ -35,31 +88,31 @@ pub(super) fn watch(draft: &mut PlanBuilder<'_>, job: &JobView) {
     }
     if pod.delete_by.is_some() {
         draft.moves();
-        return replacing(draft, LOST);
+        return draft.replacing(LOST);
     }
     if let Some(message) = left_by_node(draft, pod) {
         draft.moves();
-        return replacing(draft, &message);
+        return draft.replacing(&message);
     }
     if let Some(words) = &pod.unschedulable {
         return unschedulable(draft, job, words, pod.scale_up.as_ref());
     }
     let since = pod.scheduled.or(job.created).unwrap_or(draft.now());
-    let found = cause::of_pod(pod);
+    let found = cause::trouble_of(pod);
     let stalled = found
         .as_ref()
         .map(|found| draft.blocked_since(found.reason).unwrap_or(draft.now()));
     // Until the scheduler has spoken there is no node that could be late.
-    let limit = pulls::limit(pod, &draft.deadlines(), stalled);
+    let limit = limit(pod, &draft.deadlines(), stalled);
     let over = limit.filter(|limit| draft.now() >= limit.at);
     let lasted = found.as_ref().and_then(|found| lasts(draft, found));
     let has_started = pod.agent_started.is_some();
     match (found, over) {
-        (Some(found), _) if found.is_hopeless => draft.fail(failure_of(&found, pod, 0)),
-        (Some(found), Some(over)) if found.is_start => draft.fail(failure_of(&found, pod, over.seconds)),
+        (Some(found), _) if found.is_hopeless => draft.fail(cause::failure_of(&found, pod, 0)),
+        (Some(found), Some(over)) if found.is_start => draft.fail(cause::failure_of(&found, pod, over.seconds)),
         (Some(found), _) => {
             if let Some(seconds) = lasted {
-                return draft.fail(failure_of(&found, pod, seconds));
+                return draft.fail(cause::failure_of(&found, pod, seconds));
             }
             show_trouble(draft, &found, has_started);
             if let Some(limit) = limit.filter(|_| found.is_start) {
@@ -80,7 +133,7 @@ pub(super) fn watch(draft: &mut PlanBuilder<'_>, job: &JobView) {
 /// The kubelet ended the Pod as a whole. The Job makes another, unless the node has not even admitted this one: it would not admit the
 /// next one either, and looks free to the scheduler.
 fn ended_by_node(draft: &mut PlanBuilder<'_>, pod: &PodView, reason: &str, words: &str) {
-    let node = node_of(pod);
+    let node = cause::node_of(pod);
     if reason == NOT_ADMITTED {
         let what = sentence(&format!(
             "On {node} the kubelet did not admit the Pod ({reason}): {words}"
@@ -89,13 +142,7 @@ fn ended_by_node(draft: &mut PlanBuilder<'_>, pod: &PodView, reason: &str, words
     }
     let what = sentence(&format!("On {node} the kubelet ended the Pod ({reason}): {words}"));
     draft.moves();
-    replacing(draft, &format!("{what} A new Pod will resume from the results in S3."));
-}
-
-fn node_of(pod: &PodView) -> String {
-    pod.node
-        .as_deref()
-        .map_or_else(|| "its node".to_owned(), |node| format!("node {node}"))
+    draft.replacing(&format!("{what} A new Pod will resume from the results in S3."));
 }
 
 /// For how many seconds a node has not started a container again in mid-run, if that is too long: such a container has no end that would
@@ -125,14 +172,6 @@ fn left_by_node(draft: &PlanBuilder<'_>, pod: &PodView) -> Option<String> {
     }
 }
 
-/// Shows a live submission whose agents are gone and come back.
-pub(super) fn replacing(draft: &mut PlanBuilder<'_>, message: &str) {
-    if draft.is_running() {
-        draft.condition(conditions::RUNNING, Truth::False, reasons::REPLACING, "");
-    }
-    draft.show(reasons::REPLACING, message);
-}
-
 fn show_running(draft: &mut PlanBuilder<'_>) {
     let reason = if draft.status.is_resumed() {
         reasons::RESUMED
@@ -151,7 +190,7 @@ fn show_running(draft: &mut PlanBuilder<'_>) {
 /// Shows what a Pod waits for whose agents have not started.
 fn show_wait(draft: &mut PlanBuilder<'_>, reason: &str, message: &str) {
     if draft.is_running() {
-        replacing(draft, &format!("The Pod was lost, and the new one waits. {message}"));
+        draft.replacing(&format!("The Pod was lost, and the new one waits. {message}"));
     } else {
         draft.show(reason, message);
     }
@@ -184,7 +223,7 @@ fn show_preparing(draft: &mut PlanBuilder<'_>, pod: &PodView, since: Timestamp) 
         format!("The Pod is being prepared{node}: {}{long}.", stage(pod))
     };
     if draft.is_running() {
-        replacing(draft, &format!("The Pod was lost. {message}"));
+        draft.replacing(&format!("The Pod was lost. {message}"));
     } else {
         draft.show(reasons::PREPARING, message);
     }
@@ -222,7 +261,7 @@ fn without_pod(draft: &mut PlanBuilder<'_>, job: &JobView) {
             show_wait(draft, reason, &message);
         }
     } else if had_pod {
-        replacing(draft, LOST);
+        draft.replacing(LOST);
     } else if let Some(at) = job.created.map(|at| Wait::POD.shown_at(at)) {
         if draft.now() < at {
             return draft.requeue_at(at);
@@ -235,11 +274,11 @@ fn without_pod(draft: &mut PlanBuilder<'_>, job: &JobView) {
 }
 
 /// Shows why the API server does not make the Job; each next try asks it again.
-pub(super) fn job_refused(draft: &mut PlanBuilder<'_>, words: &str) {
+fn job_refused(draft: &mut PlanBuilder<'_>, words: &str) {
     let (reason, message) = refused("Job", words);
     draft.stall_with(reason, &message);
     if draft.is_running() {
-        replacing(draft, &message);
+        draft.replacing(&message);
     } else {
         draft.condition(conditions::RUNNING, Truth::False, reason, "");
         draft.show(reason, message);
@@ -310,66 +349,11 @@ fn is_late(draft: &mut PlanBuilder<'_>, job: &JobView, reason: &str, message: &s
     false
 }
 
-/// The failure of a start that was tried for so many seconds, or that no further try would change.
-fn failure_of(found: &Trouble, pod: &PodView, seconds: i64) -> Failure {
-    let message = &found.message;
-    let tried = format!("{message} It was tried for {seconds} s on {}.", node_of(pod));
-    let failure = match found.cause {
-        Cause::ImageName => failure::image_invalid(message),
-        Cause::ImageUser => of_image(
-            reasons::IMAGE_INVALID,
-            message,
-            "The submitted image runs as root, or names its user, and this challenge runs agents as another user.",
-            "Set USER of the image to a number other than 0, and submit again.",
-        ),
-        Cause::ImageProgram => {
-            let next = for_both("Push the image again and check that it runs on linux/amd64.");
-            participant(reasons::CANNOT_START, &tried, &next)
-        }
-        Cause::ImageMissing => of_image(
-            reasons::IMAGE_NOT_FOUND,
-            &tried,
-            "The submitted image is not in its registry.",
-            "Push the image under the name that is submitted, and submit again.",
-        ),
-        Cause::ImagePlatform => of_image(
-            reasons::IMAGE_PLATFORM,
-            &tried,
-            "The submitted image is not for linux/amd64.",
-            "Build the image for linux/amd64, and submit again.",
-        ),
-        Cause::ImageKind => of_image(
-            reasons::IMAGE_INVALID,
-            &tried,
-            "The submitted image is of a kind that cannot be run.",
-            "Build the image with a present version of its tool, and submit again.",
-        ),
-        Cause::Registry | Cause::Node | Cause::Host => match found.reason {
-            reasons::NOT_ISOLATED => infrastructure(found.reason, message),
-            reasons::PREPARING => infrastructure(reasons::START_DEADLINE, &tried),
-            reason => infrastructure(reason, &tried),
-        },
-    };
-    Failure {
-        worker: found.worker,
-        ..failure
-    }
-}
-
-/// A failure of the image, of which hosts read all. The words of a registry or of a node would show a participant what the nodes can
-/// reach.
-fn of_image(reason: &str, what: &str, for_participants: &str, step: &str) -> Failure {
-    Failure {
-        participant_message: Some(format!("{for_participants} {step}")),
-        ..participant(reason, what, &for_both(step))
-    }
-}
-
 fn start_deadline(pod: &PodView, over: Limit) -> Failure {
     let node = pod.node.as_deref().unwrap_or("the node");
     let seconds = over.seconds;
     let what = if over.is_of_pulls {
-        let names = pulls::waiting(pod).join(", ");
+        let names = waiting(pod).join(", ");
         format!("The images of the Pod were not pulled within {seconds} s on {node}; these containers wait: {names}.")
     } else {
         format!(
@@ -378,4 +362,88 @@ fn start_deadline(pod: &PodView, over: Limit) -> Failure {
         )
     };
     failure::infrastructure(reasons::START_DEADLINE, &what)
+}
+
+/// How a container waits that the kubelet has not come to yet.
+const NOT_BEGUN: [&str; 3] = ["", "ContainerCreating", "PodInitializing"];
+
+/// When a start has taken too long.
+#[derive(Clone, Copy, Debug, PartialEq, Eq)]
+pub(super) struct Limit {
+    pub(super) at: Timestamp,
+    /// The deadline that is over then.
+    pub(super) seconds: i64,
+    pub(super) is_of_pulls: bool,
+}
+
+/// The limit of a start; none before the Pod has a node. `stalled` is since when a container of it does not start, and that is known.
+pub(super) fn limit(pod: &PodView, deadlines: &Deadlines, stalled: Option<Timestamp>) -> Option<Limit> {
+    let scheduled = pod.scheduled?;
+    let pulled_by = after(after(scheduled, run_seconds(pod)), deadlines.pull_seconds);
+    if stalled.is_none() && !waiting(pod).is_empty() {
+        return Some(Limit {
+            at: pulled_by,
+            seconds: deadlines.pull_seconds,
+            is_of_pulls: true,
+        });
+    }
+    let since = stalled.or_else(|| last_begun(pod)).unwrap_or(scheduled);
+    // Causes that take turns put the end off no further.
+    let latest = after(pulled_by, deadlines.start_seconds);
+    Some(Limit {
+        at: after(since.max(scheduled), deadlines.start_seconds).min(latest),
+        seconds: deadlines.start_seconds,
+        is_of_pulls: false,
+    })
+}
+
+/// The containers that wait for an image, if the Pod is at a pull.
+pub(super) fn waiting(pod: &PodView) -> Vec<&str> {
+    // Ours before the agents go one by one. Those of an overlay hold them up, wherever they stand.
+    let mut before = pod.containers.iter().filter(|container| container.is_before_agents());
+    match before.find(|container| !is_through(container)) {
+        Some(next) if is_before_its_pull(next) => vec![&next.name],
+        Some(_) => Vec::new(),
+        None => {
+            let of_workers = pod
+                .containers
+                .iter()
+                .filter(|container| Member::parse(&container.name).is_some());
+            let waiting = of_workers.filter(|container| is_before_its_pull(container));
+            waiting.map(|container| container.name.as_str()).collect()
+        }
+    }
+}
+
+/// Seconds in which containers before the agents have run: no pull was under way then.
+fn run_seconds(pod: &PodView) -> i64 {
+    let before = pod.containers.iter().filter(|container| container.is_before_agents());
+    before
+        .filter_map(|container| {
+            let end = container.last.as_ref().filter(|end| end.exit_code == 0)?;
+            Some(end.at?.duration_since(end.began?).as_secs().max(0))
+        })
+        .fold(0, i64::saturating_add)
+}
+
+/// When the kubelet came to a container last. A restart is none of its pulls.
+fn last_begun(pod: &PodView) -> Option<Timestamp> {
+    let first_lives = pod.containers.iter().filter(|container| container.restarts == 0);
+    let begun = first_lives.filter_map(|container| container.began.or_else(|| container.last.as_ref()?.began));
+    begun.max()
+}
+
+/// Whether the kubelet goes on to the next one.
+fn is_through(container: &ContainerView) -> bool {
+    let has_ended_well = container.last.as_ref().is_some_and(|end| end.exit_code == 0);
+    let stays = container.running && container.name == names::CONTAINER_LOGCOPY;
+    stays || (has_ended_well && !container.running)
+}
+
+fn is_before_its_pull(container: &ContainerView) -> bool {
+    let waits = container
+        .waiting
+        .as_ref()
+        .is_some_and(|(reason, _)| NOT_BEGUN.contains(&reason.as_str()));
+    waits && container.restarts == 0 && container.last.is_none()
 }

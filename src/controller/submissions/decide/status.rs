@@ -1,4 +1,4 @@
-//! The plan while it is being made: the new status, and what is to be done. It knows no stage of life.
+//! The status and the plan while they are being made. It knows no stage of life.
 
 use std::time::Duration;
 
@@ -12,7 +12,7 @@ use crate::controller::submissions::view::{EvalaiInfo, ObservedJob, ReportDemand
 use leaderboard_api::conditions::{self, Truth};
 use leaderboard_api::{
     Attempt, BlockedSince, Deadlines, Failure, Ingested, LeaderboardSpec, Retries, RunPlan, Score, State, Submission,
-    SubmissionSpec, SubmissionStatus, Track, effective, names, reasons,
+    SubmissionSpec, SubmissionStatus, effective, names, reasons,
 };
 
 /// What Kubernetes' own events and the status show anyway: a write for each would cost every submission the same again.
@@ -22,15 +22,6 @@ const WITHOUT_EVENT: [&str; 4] = [
     reasons::RUNNING,
     reasons::RESUMED,
 ];
-
-/// What a submission is run by.
-#[derive(Clone, Copy)]
-pub(super) struct Terms<'a> {
-    pub(super) leaderboard: &'a LeaderboardSpec,
-    pub(super) track: &'a Track,
-    /// What EvalAI shows of it; none of a submission that is not EvalAI's.
-    pub(super) info: Option<&'a EvalaiInfo>,
-}
 
 /// A plan in the making.
 pub(super) struct PlanBuilder<'a> {
@@ -162,6 +153,18 @@ impl<'a> PlanBuilder<'a> {
     /// Its results count.
     pub(super) fn is_successful(&self) -> bool {
         self.status.state_of_conditions() == State::Finished
+    }
+
+    /// It is held back, or was when it ended here: its row in EvalAI and in the table may be another program's.
+    pub(super) fn is_held(&self) -> bool {
+        let accepted = self.status.condition(conditions::ACCEPTED);
+        accepted.is_some_and(|c| c.status == "False" && c.reason == reasons::FOREIGN)
+    }
+
+    /// The table has a row for it: without a team's id, as a check has none, there is no key.
+    pub(super) fn has_row(&self) -> bool {
+        let team = self.status.team.as_ref();
+        self.view.record.is_some() && team.is_some_and(|team| team.id.is_some())
     }
 
     /// How often the report of a live run is read.
@@ -345,6 +348,26 @@ impl<'a> PlanBuilder<'a> {
         let message = message.into();
         self.status.reason = Some(reason.into());
         self.status.message = (!message.is_empty()).then(|| message.into());
+    }
+
+    /// Shows why it is not accepted.
+    pub(super) fn refuse(&mut self, reason: &str, message: &str) {
+        self.condition(conditions::ACCEPTED, Truth::False, reason, message);
+        self.show(reason, message);
+    }
+
+    /// Shows a live submission whose agents are gone and come back.
+    pub(super) fn replacing(&mut self, message: &str) {
+        if self.is_running() {
+            self.condition(conditions::RUNNING, Truth::False, reasons::REPLACING, "");
+        }
+        self.show(reasons::REPLACING, message);
+    }
+
+    /// What is shown while the Leaderboard does not exist.
+    pub(super) fn no_leaderboard(&self) -> String {
+        let name = &self.spec().leaderboard_name;
+        format!("There is no Leaderboard {name} in this namespace. Apply it, and the submission goes on.")
     }
 
     /// Shows that nothing moves. The first message is kept while the reason stays, so that a changing detail of an error

@@ -10,6 +10,7 @@ use leaderboard_api::{SharedText, SubmissionStatus, WorkerState};
 
 /// Places in line that are written without waiting for their turn.
 pub(super) const FIRST_PLACES: i32 = 20;
+
 /// Periods that progress waits for, where that is shorter.
 const PERIODS: u32 = 3;
 

@@ -1,8 +1,8 @@
 //! Sentences: each failure has its own, with a next step that a retry leaves out.
 
 use super::builders::*;
+use crate::controller::submissions::decide::failure::for_both;
 use crate::controller::submissions::decide::failure::{at_the_end, infrastructure, invalid_results, participant};
-use crate::controller::submissions::decide::next_steps::for_both;
 use leaderboard_api::text::sentence;
 use leaderboard_api::{Failure, FailureClass, reasons};
 

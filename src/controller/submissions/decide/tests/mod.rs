@@ -24,6 +24,7 @@ mod observe;
 mod phases;
 mod properties;
 mod provoked;
+mod pulls;
 mod reading;
 mod record;
 mod restart;

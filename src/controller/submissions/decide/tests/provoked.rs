@@ -1,9 +1,9 @@
 //! Which infrastructure failures that an agent can provoke get another Job.
 
 use super::builders::*;
+use crate::controller::submissions::decide::end::may_go_on;
+use crate::controller::submissions::decide::failure::for_both;
 use crate::controller::submissions::decide::failure::{infrastructure, participant};
-use crate::controller::submissions::decide::next_steps::for_both;
-use crate::controller::submissions::decide::provoked::may_go_on;
 use leaderboard_api::FailureClass::Infrastructure;
 use leaderboard_api::State::{Failed, Pending, Running};
 use leaderboard_api::{Attempt, FailedNode, Failure, reasons};

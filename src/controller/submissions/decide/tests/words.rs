@@ -1,10 +1,10 @@
 //! The cause of a failed start: a row for each of the words that kubelets, container engines, GPU toolkits, shims, runc and registries
 //! use.
 
-use crate::controller::submissions::decide::words::Cause::{
+use crate::controller::submissions::decide::cause::Cause::{
     self, Host, ImageKind, ImageMissing, ImagePlatform, ImageProgram, ImageUser, Node, Registry,
 };
-use crate::controller::submissions::decide::words::{of_config, of_pull, of_start};
+use crate::controller::submissions::decide::cause::{of_config, of_pull, of_start};
 
 const TASK: &str =
     "failed to create containerd task: failed to create shim task: OCI runtime create failed: runc create failed: ";
