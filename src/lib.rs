@@ -2,7 +2,6 @@
 //!
 //! The modules and what each may import are drawn in docs/architecture.md.
 
-pub mod allowed;
 pub mod ask;
 pub mod bridge;
 pub mod cli;
@@ -11,5 +10,3 @@ pub mod crds;
 pub mod kubernetes;
 pub mod observability;
 pub mod page;
-pub mod pod;
-pub mod services;

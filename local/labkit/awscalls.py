@@ -9,8 +9,14 @@ from collections.abc import Iterator, Mapping
 from dataclasses import dataclass, field
 from pathlib import Path
 
-# Program -> the folder whose code it alone runs.
-PROGRAMS = {"controller": "src/controller", "bridge": "src/bridge", "submission-worker": "src/pod"}
+# Program -> the folders whose code it alone runs.
+PROGRAMS: Mapping[str, tuple[str, ...]] = {
+    "controller": ("src/controller", "crates/evalai"),
+    "bridge": ("src/bridge",),
+    "submission-worker": ("crates/pod",),
+}
+# The crate with a module for each service.
+SERVICES_FOLDER = "crates/aws/src"
 # Operation, as a client's method -> the actions that IAM checks. The names of two in three differ.
 ACTIONS: Mapping[str, tuple[str, ...]] = {
     "get_object": ("s3:GetObject",),
@@ -75,7 +81,8 @@ class Source:
     texts: dict[str, str] = field(default_factory=dict)
 
     def __post_init__(self) -> None:
-        for file in sorted((self.repository / "src").rglob("*.rs")):
+        sources = [*(self.repository / "src").rglob("*.rs"), *(self.repository / "crates").glob("*/src/**/*.rs")]
+        for file in sorted(sources):
             if "tests" not in file.stem and "tests" not in file.parts:
                 name = str(file.relative_to(self.repository))
                 self.texts[name] = TESTS.sub("", file.read_text())
@@ -88,14 +95,15 @@ class Source:
         return frozenset(self.operations & set(METHOD.findall(text)))
 
     def services(self) -> dict[str, frozenset[str]]:
-        """Module of src/services -> its operations; those without any are left out."""
-        names = {Path(name).parts[2].removesuffix(".rs") for name in self.texts if name.startswith("src/services/")}
-        found = {name: self.operations_of(self.below(f"src/services/{name}")) for name in names}
+        """Module of the services' crate -> its operations; those without any are left out."""
+        own = [name.removeprefix(f"{SERVICES_FOLDER}/") for name in self.texts if name.startswith(f"{SERVICES_FOLDER}/")]
+        names = {Path(name).parts[0].removesuffix(".rs") for name in own}
+        found = {name: self.operations_of(self.below(f"{SERVICES_FOLDER}/{name}")) for name in names}
         return {name: operations for name, operations in found.items() if operations}
 
     def archive(self) -> dict[str, Calls]:
         """Method of `Archive` -> what it does itself."""
-        text = self.below("src/services/archive")
+        text = self.below(f"{SERVICES_FOLDER}/archive")
         starts = [(match.start(), match[1]) for match in FUNCTION.finditer(text)]
         ends = [start for start, _ in starts[1:]] + [len(text)]
         parts = {name: text[start:end] for (start, name), end in zip(starts, ends, strict=True)}
@@ -105,10 +113,10 @@ class Source:
 
     def of_program(self, program: str) -> frozenset[str]:
         """The operations that a program can ask for."""
-        text = self.below(PROGRAMS[program])
+        text = "\n".join(self.below(folder) for folder in PROGRAMS[program])
         found = set(self.operations_of(text))
         for service, operations in self.services().items():
-            uses = re.search(rf"\bservices::(?:\{{[^}}]*\b)?{service}\b", text)
+            uses = re.search(rf"\bleaderboard_aws::(?:\{{[^}}]*\b)?{service}\b", text)
             if uses and service != "archive":
                 found |= operations
         return frozenset(found | closure(self.archive(), set(ARCHIVE_METHOD.findall(text))))

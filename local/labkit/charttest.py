@@ -37,7 +37,7 @@ from .kube import Kube
 from .settings import Settings
 
 # The Jobs that the operator's tests hold its own against.
-JOBS = "src/controller/submissions/job_spec/golden"
+JOBS = "crates/pod-spec/src/job/golden"
 CRDS = ("leaderboards.leaderboard.carla.org", "submissions.leaderboard.carla.org")
 
 

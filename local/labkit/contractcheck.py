@@ -12,7 +12,7 @@ from typing import Any
 
 from .errors import LabError
 
-GOLDEN = "src/controller/submissions/job_spec/golden"
+GOLDEN = "crates/pod-spec/src/job/golden"
 NAMES = "crates/results/src/names.rs"
 CELL = re.compile(r"`([^`]+)`")
 METRIC = re.compile(r"metric\(\s*\"([^\"]+)\"")

@@ -176,7 +176,8 @@ class Policies(unittest.TestCase):
             self.assertNotIn('"*"', [a for a, _ in awscalls.actions(file)])
 
     def test_the_controller_writes_two_objects_of_a_run(self) -> None:
-        keys = "".join((REPOSITORY / name).read_text() for name in ("crates/contract/src/report.rs", "crates/api/src/names.rs"))
+        files = ("crates/contract/src/report.rs", "crates/api/src/names.rs")
+        keys = "".join((REPOSITORY / name).read_text() for name in files)
         wanted = set(re.findall(r'(?:OWNER_KEY|FAILURE_LOG_KEY): &str = "(.+)"', keys))
         self.assertEqual(len(wanted), 2)
         put = [
@@ -187,7 +188,7 @@ class Policies(unittest.TestCase):
         self.assertEqual({resource.split("/", 2)[2] for resource in put[0]}, wanted)
 
     def test_a_session_of_a_pod_has_the_rights_of_its_role(self) -> None:
-        code = awscalls.TESTS.sub("", (REPOSITORY / "src/pod/identity.rs").read_text())
+        code = awscalls.TESTS.sub("", (REPOSITORY / "crates/pod/src/identity.rs").read_text())
         names = ("submission-worker", "kms")
         role = {action for name in names for action, _ in awscalls.actions(POLICIES / f"{name}.json")}
         # The last one is a condition.
@@ -219,10 +220,10 @@ class Policies(unittest.TestCase):
             operations = frozenset({"get_object", "list_buckets", "receive_message", "put_object"})
             small = awscalls.Source(Path(folder), operations)
             small.texts = {
-                "src/services/archive.rs": "pub async fn get(&self) { x.get_object() }\nfn put(&self) { x.put_object() }",
+                "crates/aws/src/archive.rs": "pub async fn get(&self) { x.get_object() }\nfn put(&self) { x.put_object() }",
                 "src/controller/a.rs": "archive.get(key); client.list_buckets()",
                 "src/bridge/a.rs": "client.receive_message()",
-                "src/pod/a.rs": "use aws_sigv4::sign;",
+                "crates/pod/a.rs": "use aws_sigv4::sign;",
             }
             found = "\n".join(awscalls.faults(small, Path(folder)))
         for part in (
@@ -230,7 +231,7 @@ class Policies(unittest.TestCase):
             "put_object: no program that awscalls.py knows calls it",
             "controller is allowed s3:DeleteObject and never calls it",
             "submission-worker is allowed s3:PutObject and never calls it",
-            "src/pod/a.rs signs requests",
+            "crates/pod/a.rs signs requests",
         ):
             self.assertIn(part, found)
 

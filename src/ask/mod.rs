@@ -9,7 +9,6 @@
 //! A newer question replaces an older one. One read of an object is under way at a time: a question that comes meanwhile makes a
 //! second read. The last answer stays readable until then, with the question that it answers. Only news wakes the object.
 
-pub mod question;
 pub(crate) mod state;
 #[cfg(test)]
 mod tests;
@@ -27,7 +26,7 @@ use leaderboard_base::lock::lock;
 use leaderboard_base::object_key::ObjectKey;
 use leaderboard_base::spans::LogSpan;
 use leaderboard_base::tasks::Tasks;
-use question::{Answered, Ask, Failure, Lookup, Service};
+use leaderboard_policy::ask::{Answered, Ask, Failure, Lookup, Service};
 use state::{State, Work};
 
 /// What one read is about.

@@ -7,9 +7,9 @@ use std::time::Duration;
 use tokio::time::Instant;
 
 use super::Asked;
-use super::question::{Answered, Ask, Failure, Lookup, Rank, Service, Silence};
 use leaderboard_base::object_key::ObjectKey;
 use leaderboard_base::spans::LogSpan;
+use leaderboard_policy::ask::{Answered, Ask, Failure, Lookup, Rank, Service, Silence};
 
 /// Time after which a question that no caller repeats is asked no more.
 pub(super) const KEPT: Duration = Duration::from_mins(10);

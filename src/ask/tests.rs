@@ -2,10 +2,10 @@
 
 use tokio::sync::{mpsc, watch};
 
-use super::question::Rank;
 use super::state::{KEPT, State};
 use super::*;
 use leaderboard_base::shutdown::Stop;
+use leaderboard_policy::ask::Rank;
 
 const SECOND: Duration = Duration::from_secs(1);
 

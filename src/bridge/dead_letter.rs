@@ -2,8 +2,8 @@
 
 use serde_json::{Map, Value, json};
 
-use super::route::DeadReason;
 use super::source::Received;
+use leaderboard_policy::intake::route::DeadReason;
 
 /// Longest text of an attribute, in characters.
 const LONGEST: usize = 1024;

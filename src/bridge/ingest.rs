@@ -13,15 +13,15 @@ use serde_json::{Value, json};
 use thiserror::Error;
 use tracing::Span;
 
-use super::message::Message;
-use super::route::{NotIngested, Outcome};
 use crate::kubernetes::{CallError, call_within};
-use crate::services::evalai::Swept;
 use leaderboard_api::ingested::SWEEP;
 use leaderboard_api::{
     Attempt, EvalaiRef, Ingested, RefusedAttempt, State, Submission, SubmissionSpec, SubmissionStatus, names,
 };
 use leaderboard_base::spans as about;
+use leaderboard_evalai::Swept;
+use leaderboard_policy::intake::message::Message;
+use leaderboard_policy::intake::route::{NotIngested, Outcome};
 
 /// Age below which the sweep leaves a row alone, in milliseconds: its message may be on the way.
 const SWEEP_AGE_MS: i64 = 120_000;

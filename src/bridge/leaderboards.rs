@@ -6,9 +6,9 @@ use kube::Client;
 use kube::api::ListParams;
 
 use super::Scope;
-use crate::allowed::Allowed;
 use crate::kubernetes::Watch;
 use leaderboard_api::Leaderboard;
+use leaderboard_policy::allowed::Allowed;
 
 /// The Leaderboards at one moment.
 #[derive(Clone, Debug)]

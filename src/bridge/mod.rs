@@ -8,11 +8,9 @@ pub mod ages;
 mod dead_letter;
 pub mod ingest;
 mod leaderboards;
-pub mod message;
 mod poller;
 pub mod pollers;
 pub mod queue;
-pub mod route;
 pub mod source;
 mod sqs;
 
@@ -22,12 +20,13 @@ use kube::Client;
 use kube::runtime::events::{Recorder, Reporter};
 use kube::runtime::watcher::Config;
 
-use crate::allowed::Allowed;
 use crate::kubernetes::{Clients, Namespaces, Shape, spawn_watch};
 use crate::observability::Observability;
-use crate::services::aws::Aws;
 use leaderboard_api::Leaderboard;
+use leaderboard_aws::clients::Aws;
 use leaderboard_base::tasks::TaskFailed;
+use leaderboard_policy::allowed::Allowed;
+use leaderboard_policy::intake::route;
 use pollers::{Problems, Shared, follow};
 use sqs::{Connection, Pulse, SqsQueue, desired};
 

@@ -16,14 +16,14 @@ use tracing::Instrument;
 use super::ages::Ages;
 use super::ingest::{self, Incoming, IngestError};
 use super::leaderboards::Leaderboards;
-use super::message;
 use super::pollers::Shared;
-use super::route::{self, DeadReason, Envelope, Later, MessageOutcome, Outcome, Rules};
 use super::source::{Received, Source, named};
 use crate::kubernetes::call_within;
 use leaderboard_api::text::one_line;
 use leaderboard_api::{Leaderboard, reasons};
 use leaderboard_base::backoff::Backoff;
+use leaderboard_policy::intake::message;
+use leaderboard_policy::intake::route::{self, DeadReason, Envelope, Later, MessageOutcome, Outcome, Rules};
 
 /// Longest time that one message may take; half of it is over when its visibility is extended.
 const MESSAGE_LIMIT: Duration = Duration::from_secs(20);

@@ -15,11 +15,11 @@ use aws_sdk_sqs::types::{
 use thiserror::Error;
 
 use super::dead_letter::{self, DeadLetter};
-use super::route::DeadReason;
 use super::source::Received;
-use crate::services::fault::{self, Fault};
-use crate::services::metered::Metered;
+use leaderboard_aws::fault::{self, Fault};
+use leaderboard_aws::metered::Metered;
 use leaderboard_base::meter::Meter;
+use leaderboard_policy::intake::route::DeadReason;
 
 /// How long a receive waits for a message, in seconds: the longest that SQS allows.
 const LONG_POLL: i32 = 20;
@@ -266,7 +266,7 @@ mod tests {
     use tokio::net::TcpListener;
 
     use super::*;
-    use crate::services::aws::Aws;
+    use leaderboard_aws::clients::Aws;
     use leaderboard_base::lock::lock;
 
     /// The messages that a queue was sent, and how many of the next ones it finds too large.

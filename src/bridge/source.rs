@@ -3,8 +3,8 @@
 use std::sync::Arc;
 use std::time::Duration;
 
-use super::route::{DeadReason, Hindrance, Rules};
 use leaderboard_api::Leaderboard;
+use leaderboard_policy::intake::route::{DeadReason, Hindrance, Rules};
 
 /// A message that was received and is ours until its visibility lapses.
 #[derive(Clone, Debug)]

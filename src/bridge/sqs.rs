@@ -10,13 +10,13 @@ use kube::api::ListParams;
 use tokio::time::Instant;
 
 use super::queue::{Reader, batch_size};
-use super::route::{self, DeadReason, Rules};
 use super::source::{Received, SetAside, Source, named};
 use crate::kubernetes::{Namespaces, call_within};
 use crate::observability::liveness::Liveness;
 use leaderboard_api::{Leaderboard, reasons};
 use leaderboard_base::lock::lock;
 use leaderboard_base::meter::Meter;
+use leaderboard_policy::intake::route::{self, DeadReason, Rules};
 
 /// How often the queue's attributes are read anew.
 const REOPEN: Duration = Duration::from_mins(10);

@@ -15,11 +15,11 @@ use std::sync::LazyLock;
 
 use clap::{Args, Parser, Subcommand};
 
-use crate::allowed::Allowed;
 use crate::controller::runtime::leader::{self, Identity};
 use crate::observability::REVISION;
 use crate::observability::logging::Format;
-use crate::services::aws;
+use leaderboard_aws::clients as aws;
+use leaderboard_policy::allowed::Allowed;
 
 /// The port that `--dashboard` alone stands for.
 const PAGE_PORT: &str = "8081";

@@ -13,7 +13,6 @@ use crate::bridge;
 use crate::controller::runtime as run;
 use crate::controller::runtime::leader::{self, Identity};
 use crate::controller::settings::Settings;
-use crate::controller::submissions::job_spec::OwnImage;
 use crate::kubernetes::{Clients, Namespaces, watch_client};
 use crate::observability::health::HealthServer;
 use crate::observability::logging::{self, Format};
@@ -22,14 +21,15 @@ use crate::observability::metrics::Program;
 use crate::observability::traces::otlp;
 use crate::observability::{Observability, REVISION};
 use crate::page::Page;
-use crate::pod::judge::Pace;
-use crate::pod::places::{Places, Setting};
-use crate::pod::{logcopy as logcopy_program, ownlog, workspace as workspace_program};
-use crate::services::aws::Aws;
 use leaderboard_api::client_errors;
 use leaderboard_api::names::OPERATOR;
+use leaderboard_aws::clients::Aws;
 use leaderboard_base::shutdown::on_signals;
 use leaderboard_contract::run::ENV_CHECKSUMS;
+use leaderboard_evaluation::carla::judge::Pace;
+use leaderboard_pod::places::{Places, Setting};
+use leaderboard_pod::{logcopy as logcopy_program, ownlog, workspace as workspace_program};
+use leaderboard_pod_spec::job::OwnImage;
 
 /// What the exit code of controller and bridge means.
 pub(super) const EXIT_CODES: &str = "Exit code 0: it was stopped. 1: an error, which is the last line of its log. 2: arguments or \

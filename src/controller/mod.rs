@@ -3,12 +3,8 @@
 //! The folders show the way of an event, and each imports only what stands after it: `runtime` (watches, Lease, queues) reconciles
 //! Leaderboards by `leaderboards` and Submissions by `submissions` (observe, decide, act); both ask `slots` whose turn it is.
 
-pub mod census;
-pub mod gpu_claims;
 pub mod leaderboards;
-pub mod network_policy;
 pub mod objects;
-pub mod owner;
 pub mod runtime;
 pub mod settings;
 pub mod slots;

@@ -1,8 +1,8 @@
 //! What the command line sets.
 
-use crate::allowed::Allowed;
-use crate::controller::submissions::job_spec::OwnImage;
 use crate::kubernetes::Namespaces;
+use leaderboard_pod_spec::job::OwnImage;
+use leaderboard_policy::allowed::Allowed;
 
 /// Settings that come from the command line.
 #[derive(Clone, Debug)]

@@ -6,11 +6,11 @@ use k8s_openapi::api::networking::v1::NetworkPolicy;
 use kube::ResourceExt;
 use kube::runtime::reflector::ObjectRef;
 
-use super::network_policy;
 use super::objects::board_of;
 use crate::kubernetes::objects::{Job, Meta, Node, Pod};
 use crate::kubernetes::{Store, Synced};
 use leaderboard_api::{Leaderboard, Submission, names};
+use leaderboard_pod_spec::network_policy;
 
 /// Caches of the API server, filled by one task each. Clones are the same.
 #[derive(Clone)]

@@ -20,17 +20,17 @@ use tokio::sync::watch;
 
 use crate::support::{apiserver, ministack};
 use leaderboard_api::{Attempt, Ingested, Leaderboard, Submission, names};
+use leaderboard_aws::clients::Aws;
 use leaderboard_base::shutdown::Stop;
 use leaderboard_base::tasks::TaskFailed;
-use leaderboard_operator::allowed::Allowed;
+use leaderboard_evalai::Swept;
 use leaderboard_operator::bridge;
 use leaderboard_operator::bridge::ingest::{self, Incoming, Source};
-use leaderboard_operator::bridge::route::Outcome;
 use leaderboard_operator::kubernetes::{Clients, Namespaces};
 use leaderboard_operator::observability::Observability;
 use leaderboard_operator::observability::metrics::Program;
-use leaderboard_operator::services::aws::Aws;
-use leaderboard_operator::services::evalai::Swept;
+use leaderboard_policy::allowed::Allowed;
+use leaderboard_policy::intake::route::Outcome;
 
 /// Far longer than anything here takes, so that a busy machine fails no test.
 pub(super) const LIMIT: Duration = Duration::from_mins(2);

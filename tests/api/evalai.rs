@@ -30,11 +30,11 @@ use leaderboard_base::shutdown::Stop;
 use leaderboard_base::spans::LogSpan;
 use leaderboard_base::tasks::Tasks;
 use leaderboard_contract::report::ContentId;
-use leaderboard_operator::services::evalai::{
+use leaderboard_evalai::token::Token;
+use leaderboard_evalai::{
     Changed, DesiredUpdate, Ended, Hub, ImageAnswer, Key, Misfit, Options, Outcome, Outline, Patience, Payload,
     Progress, Publisher, Run, Status, StoredResult, Subject, SubmissionState, SweepRow, Target, Timeouts, Timing,
 };
-use leaderboard_operator::services::token::Token;
 
 /// A stand-in, a hub that speaks to it, and what the controller would hold.
 struct World {

@@ -18,8 +18,8 @@ use leaderboard_api::names::FAILURE_LOG_KEY;
 use leaderboard_api::{
     Attempt, JobNumber, Leaderboard, State, Submission, SubmissionStatus, conditions, names, reasons,
 };
+use leaderboard_aws::archive::Archive;
 use leaderboard_contract::report::{OWNER_KEY, Owner};
-use leaderboard_operator::services::archive::Archive;
 use serde_json::json;
 use tokio::time::timeout;
 

@@ -5,8 +5,8 @@ use std::collections::HashMap;
 
 use aws_sdk_cloudwatchlogs::types::LogGroup as Described;
 use leaderboard_api::LogGroup;
-use leaderboard_operator::services::fault::Fault;
-use leaderboard_operator::services::log_groups::keep;
+use leaderboard_aws::fault::Fault;
+use leaderboard_aws::log_groups::keep;
 use serde_json::json;
 
 use super::bridge::StandIn;

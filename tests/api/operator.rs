@@ -7,16 +7,16 @@ use tokio::sync::watch;
 use tokio::task::JoinHandle;
 
 use crate::support::apiserver::server;
+use leaderboard_aws::clients::Aws;
 use leaderboard_base::shutdown::Stop;
-use leaderboard_operator::allowed::Allowed;
 use leaderboard_operator::controller::runtime as run;
 use leaderboard_operator::controller::runtime::leader::{self, Identity, Timing};
 use leaderboard_operator::controller::runtime::{Clients, RunError};
 use leaderboard_operator::controller::settings::Settings;
-use leaderboard_operator::controller::submissions::job_spec::OwnImage;
 use leaderboard_operator::kubernetes::{Namespaces, watch_client};
 use leaderboard_operator::observability::Observability;
-use leaderboard_operator::services::aws::Aws;
+use leaderboard_pod_spec::job::OwnImage;
+use leaderboard_policy::allowed::Allowed;
 
 /// Longer than it takes to end, with a write to EvalAI under way.
 const END_LIMIT: Duration = Duration::from_mins(3);

@@ -6,12 +6,12 @@ use std::time::Duration;
 use aws_credential_types::provider::error::CredentialsError;
 use aws_credential_types::provider::{ProvideCredentials, SharedCredentialsProvider, future};
 use aws_sdk_sqs::types::MessageSystemAttributeName;
+use leaderboard_aws::clients::Aws;
+use leaderboard_aws::fault::Fault;
 use leaderboard_base::meter::Meter;
 use leaderboard_operator::bridge::queue::Reader;
-use leaderboard_operator::bridge::route::DeadReason;
 use leaderboard_operator::bridge::source::Received;
-use leaderboard_operator::services::aws::Aws;
-use leaderboard_operator::services::fault::Fault;
+use leaderboard_policy::intake::route::DeadReason;
 
 use super::bridge::{LIMIT, StandIn};
 

@@ -14,8 +14,8 @@ use kube::api::{DeleteParams, ListParams, Patch, PatchParams, PostParams};
 use kube::core::NamespaceResourceScope;
 use kube::{Resource, ResourceExt};
 use leaderboard_api::{Attempt, JobNumber, Leaderboard, State, Submission, SubmissionStatus, names, reasons};
+use leaderboard_aws::archive::Archive;
 use leaderboard_contract::report::REPORT_KEY;
-use leaderboard_operator::services::archive::Archive;
 use serde::de::DeserializeOwned;
 use serde_json::{Value, json};
 

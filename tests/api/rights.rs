@@ -7,11 +7,11 @@ use kube::api::{DeleteParams, ListParams, PostParams};
 use kube::runtime::wait::await_condition;
 use kube::{Api, Client, Config};
 use leaderboard_api::{Leaderboard, conditions};
-use leaderboard_operator::allowed::Allowed;
 use leaderboard_operator::cli::rights::Rights;
 use leaderboard_operator::controller::settings::Settings;
 use leaderboard_operator::kubernetes::Namespaces;
 use leaderboard_operator::kubernetes::preflight::access_missing;
+use leaderboard_policy::allowed::Allowed;
 use serde_json::{Value, json};
 use tokio::time::timeout;
 

@@ -12,13 +12,13 @@ use tokio::sync::{mpsc, watch};
 use super::bridge::{LIMIT, StandIn};
 use crate::support::throttle::Throttle;
 use leaderboard_api as api;
+use leaderboard_aws::table::{Row, Table, Written};
 use leaderboard_base::object_key::ObjectKey;
 use leaderboard_base::shutdown::Stop;
 use leaderboard_base::spans::LogSpan;
 use leaderboard_base::tasks::Tasks;
 use leaderboard_operator::ask::Asker;
 use leaderboard_operator::controller::submissions::records::{self, Record};
-use leaderboard_operator::services::table::{Row, Table, Written};
 
 fn client(stand_in: &StandIn) -> aws_sdk_dynamodb::Client {
     stand_in.aws.dynamodb(None, Some(&stand_in.endpoint))

@@ -1,8 +1,8 @@
 //! EvalAI's token in Secrets Manager, against the AWS stand-in.
 
 use super::bridge::StandIn;
+use leaderboard_evalai::token::{Scheme, TokenError};
 use leaderboard_operator::controller::leaderboards::token::TokenSource;
-use leaderboard_operator::services::token::{Scheme, TokenError};
 
 impl StandIn {
     fn token(&self, name: &str, key: &str) -> TokenSource {

@@ -18,17 +18,17 @@ use kube::{Api, Client, ResourceExt};
 use leaderboard_api::{
     Attempt, JobNumber, Leaderboard, Storage, Submission, SubmissionStatus, conditions, names, reasons,
 };
+use leaderboard_aws::archive::Archive;
 use leaderboard_base::shutdown::Stop;
-use leaderboard_operator::allowed::Allowed;
 use leaderboard_operator::controller::runtime::leader::{self, Identity};
 use leaderboard_operator::controller::runtime::{self as run, Clients};
 use leaderboard_operator::controller::settings::Settings;
-use leaderboard_operator::controller::submissions::job_spec::OwnImage;
 use leaderboard_operator::kubernetes::Namespaces;
 use leaderboard_operator::observability::Observability;
 use leaderboard_operator::page::Page;
-use leaderboard_operator::pod::workspace::WorkspaceError;
-use leaderboard_operator::services::archive::Archive;
+use leaderboard_pod::workspace::WorkspaceError;
+use leaderboard_pod_spec::job::OwnImage;
+use leaderboard_policy::allowed::Allowed;
 use leaderboard_protocol::verdict::{Verdict, What};
 use serde_json::{Map, Value, json};
 use tokio::net::TcpListener;

@@ -5,7 +5,7 @@ use std::process::Stdio;
 use std::time::Duration;
 
 use leaderboard_api::{Leaderboard, Submission};
-use leaderboard_operator::services::aws::Aws;
+use leaderboard_aws::clients::Aws;
 use serde_json::{Value, json};
 use tokio::process::Command;
 use tokio::time::timeout;

@@ -10,7 +10,7 @@ use kube::Api;
 use kube::api::{ApiResource, DynamicObject, Patch, PatchParams};
 use kube::core::{GroupVersionKind, TypeMeta};
 use leaderboard_api::{Leaderboard, State, Submission};
-use leaderboard_operator::services::aws::Aws;
+use leaderboard_aws::clients::Aws;
 use serde_json::{Value, json};
 use tokio::io::AsyncWriteExt as _;
 use tokio::process::Command;

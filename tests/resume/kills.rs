@@ -8,8 +8,8 @@ use fastrand::Rng;
 use futures::FutureExt;
 use futures::future::{self, BoxFuture};
 use leaderboard_api::LeaderboardVersion;
-use leaderboard_operator::pod::watch::Watch;
-use leaderboard_operator::services::archive::Archive;
+use leaderboard_aws::archive::Archive;
+use leaderboard_pod::watch::Watch;
 use leaderboard_protocol::files::{KEPT_CHECKPOINT, Member, Pair, Side, StatusFile};
 
 use super::kubelet::{Kubelet, Name, all_done, members};

@@ -6,7 +6,7 @@ use std::fs::{self, OpenOptions};
 use std::path::{Path, PathBuf};
 use std::process::{ExitStatus, Stdio};
 
-use leaderboard_operator::pod::places::Places;
+use leaderboard_pod::places::Places;
 use leaderboard_protocol::files::{Mark, Member, Pair, Side, StatusFile};
 use nix::sys::signal::{Signal, kill};
 use nix::unistd::Pid;

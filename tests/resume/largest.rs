@@ -10,7 +10,7 @@ use fastrand::Rng;
 use leaderboard_api::{LeaderboardVersion, RouteSlice};
 use leaderboard_contract::report::Report;
 use leaderboard_contract::run::STATUS_FOLDER;
-use leaderboard_operator::pod::gather::results_plan;
+use leaderboard_evaluation::carla::gather::results_plan;
 use serde_json::json;
 use tokio::time::timeout;
 

@@ -2,8 +2,8 @@
 
 use std::collections::BTreeMap;
 
+use leaderboard_aws::archive::Archive;
 use leaderboard_contract::report::{MAX_BYTES, REPORT_KEY, Report};
-use leaderboard_operator::services::archive::Archive;
 use serde_json::Value;
 
 const MERGED: &str = "agent/agent_results.json";

@@ -7,9 +7,9 @@ use std::sync::OnceLock;
 use std::sync::atomic::{AtomicU32, Ordering};
 
 use leaderboard_api::{Attempt, ByteQuantity, LeaderboardVersion, RunPlan, Storage, Verify};
+use leaderboard_aws::archive::Archive;
 use leaderboard_contract::run::{ENV_POD_UID, ENV_RUN, Run, SCHEMA};
-use leaderboard_operator::pod::places::Places;
-use leaderboard_operator::services::archive::Archive;
+use leaderboard_pod::places::Places;
 use leaderboard_protocol::files::{KEPT_CHECKPOINT, Member, Side};
 use tokio::process::Command;
 

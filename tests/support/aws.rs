@@ -7,7 +7,7 @@ use aws_sdk_dynamodb::types::{
     AttributeDefinition, AttributeValue, BillingMode, KeySchemaElement, KeyType, ScalarAttributeType,
 };
 use aws_sdk_sqs::types::{Message, MessageSystemAttributeName, QueueAttributeName};
-use leaderboard_operator::services::aws::Aws;
+use leaderboard_aws::clients::Aws;
 use tokio::time::{Instant, sleep};
 
 /// The region that the stand-in plays.

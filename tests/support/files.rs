@@ -2,7 +2,7 @@
 
 use std::path::Path;
 
-use leaderboard_operator::pod::watch::Watch;
+use leaderboard_pod::watch::Watch;
 
 /// Folders above a file that may not exist yet.
 const DEPTH: usize = 3;

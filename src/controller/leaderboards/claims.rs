@@ -8,12 +8,12 @@ use k8s_openapi::api::batch::v1::Job;
 use kube::api::{DeleteParams, DynamicObject, ListParams, Patch, PatchParams};
 use kube::{Api, Client, ResourceExt};
 
-use crate::controller::gpu_claims::{resource, source, template};
-use crate::controller::leaderboards::view::Claims;
 use crate::controller::objects::uid_of;
 use crate::kubernetes::{CallError, call};
 use leaderboard_api::text::sentence;
 use leaderboard_api::{ClaimOf, GpuSource, Leaderboard, names};
+use leaderboard_pod_spec::gpu_claims::{resource, source, template};
+use leaderboard_policy::leaderboards::view::Claims;
 
 /// Puts the template in place, or looks for the host's. Never fails: what is wrong is shown.
 pub async fn keep(client: &Client, leaderboard: &Leaderboard) -> Claims {

@@ -14,8 +14,6 @@ use kube::runtime::reflector::ObjectRef;
 use kube::{Api, Client, ResourceExt};
 
 use super::state::{Applied, Entry, Found, LeaderboardState, POLICY_AGAIN, RESYNC, SOONEST};
-use crate::controller::leaderboards::view::Policy;
-use crate::controller::network_policy::{is_in_place, network_policy};
 use crate::controller::objects::{Wake, key_of, uid_of};
 use crate::controller::slots::Slots;
 use crate::controller::stores::Stores;
@@ -24,6 +22,8 @@ use crate::kubernetes::{WatchEvents, call};
 use leaderboard_api::text::sentence;
 use leaderboard_api::{Enforcement, Leaderboard, PolicySource, conditions, names, reasons};
 use leaderboard_contract::verdict::{NotAVerdict, WorkspaceReason, WorkspaceVerdict};
+use leaderboard_pod_spec::network_policy::{is_in_place, network_policy};
+use leaderboard_policy::leaderboards::view::Policy;
 
 /// Policies that are restored at once.
 const RESTORED_AT_ONCE: usize = 16;

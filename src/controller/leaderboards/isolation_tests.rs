@@ -5,10 +5,10 @@ use serde_json::{Value, json};
 
 use super::*;
 use crate::controller::fixtures::{self, Cluster, Surroundings, surroundings};
-use crate::controller::leaderboards::isolated::condition;
 use crate::controller::leaderboards::reconcile;
 use crate::observability::logging::tests::Lines;
 use leaderboard_api::conditions::Truth;
+use leaderboard_policy::leaderboards::isolated::condition;
 
 fn leaderboard(network: &Value, generation: i64) -> Leaderboard {
     let spec = json!({

@@ -7,8 +7,8 @@ use tokio::time::Instant;
 
 use super::*;
 use crate::controller::fixtures::{self, Cluster, Surroundings, surroundings};
-use crate::controller::network_policy::network_policy;
 use leaderboard_api::reasons;
+use leaderboard_pod_spec::network_policy::network_policy;
 
 /// Where nobody listens: each request is refused.
 const NOBODY: &str = "http://127.0.0.1:1";

@@ -5,21 +5,16 @@
 //! and gives the way to EvalAI to `external`. `decide` and `reach` are pure.
 
 pub mod claims;
-pub mod decide;
-pub mod isolated;
 pub mod isolation;
 pub mod operator;
 mod places;
-mod pod_notes;
 mod priority;
 pub mod probe;
 mod reach;
-mod refusal;
 pub mod standing;
 pub mod state;
 pub mod token;
 mod tried_pods;
-pub mod view;
 
 use std::sync::Arc;
 use std::time::Duration;
@@ -32,18 +27,19 @@ use super::objects::{key_of, uid_of, version, version_number};
 use super::settings::Settings;
 use super::slots::Slots;
 use super::writes::{apply_status, set_finalizer};
-use crate::ask::question::Service;
-use crate::controller::census::Census;
 use crate::controller::submissions::external::ExternalSystems;
 use crate::controller::submissions::records;
 use crate::kubernetes::{CallError, Writer};
 use crate::observability::metrics::leader::{self, Gauge, Samples};
-use decide::{LeaderboardPlan, LeaderboardView, decide};
 use isolation::Policies;
 use leaderboard_api::{Leaderboard, names};
+use leaderboard_policy::ask::Service;
+use leaderboard_policy::census::Census;
+use leaderboard_policy::leaderboards::decide::{LeaderboardPlan, LeaderboardView, decide};
+use leaderboard_policy::leaderboards::refusal;
+use leaderboard_policy::leaderboards::view::Policy;
 use probe::{Asks, Looked};
 use state::{COUNTS_EVERY, LeaderboardState, RESYNC, SOONEST};
-use view::Policy;
 
 /// The first look at a spec gets so long before the status shows that it is under way: mostly it takes less, and saves a write.
 const FIRST_LOOK: Duration = Duration::from_secs(2);

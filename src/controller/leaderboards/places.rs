@@ -6,15 +6,15 @@ use std::fmt::Display;
 use std::sync::Arc;
 
 use super::reach::{AwsResource, Place, Seen};
-use crate::ask::question::Failure;
 use crate::controller::objects::key_of;
-use crate::services::archive::{Archive, ArchiveError};
-use crate::services::aws::Aws;
-use crate::services::fault::Fault;
-use crate::services::log_groups::{self, LogGroupError};
-use crate::services::queue::{self, QueueError, Reading};
-use crate::services::table::{Table, TableError};
 use leaderboard_api::{self as api, Leaderboard};
+use leaderboard_aws::archive::{Archive, ArchiveError};
+use leaderboard_aws::clients::Aws;
+use leaderboard_aws::fault::Fault;
+use leaderboard_aws::log_groups::{self, LogGroupError};
+use leaderboard_aws::queue::{self, QueueError, Reading};
+use leaderboard_aws::table::{Table, TableError};
+use leaderboard_policy::ask::Failure;
 
 /// A run that nobody has: the list below it is empty, and costs nothing.
 const NO_RUN: &str = "none/";
@@ -127,7 +127,7 @@ fn of_log_group(answer: Result<(), LogGroupError>) -> Result<Seen, Failure> {
 #[cfg(test)]
 mod tests {
     use super::*;
-    use crate::services::archive::Cause;
+    use leaderboard_aws::archive::Cause;
     use serde_json::json;
 
     #[test]

@@ -8,9 +8,9 @@ use k8s_openapi::api::scheduling::v1::PriorityClass;
 use kube::{Api, Client};
 use serde_json::Value;
 
-use super::pod_notes::TrackPods;
 use crate::kubernetes::call;
 use leaderboard_api::Track;
+use leaderboard_pod_spec::notes::TrackPods;
 
 /// A class, and who asks for it.
 #[derive(Clone, Debug, Default, PartialEq, Eq)]

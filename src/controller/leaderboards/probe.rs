@@ -14,19 +14,19 @@ use super::places;
 use super::reach::{AwsResource, Place, Reach};
 use super::token::TokenSource;
 use super::tried_pods::{self, Pods, TriedPods};
-use crate::ask::question::{Ask, Failure, Lookup, Service};
 use crate::ask::{Asker, Wake};
 use crate::controller::objects::key_of;
 use crate::controller::settings::Settings;
 use crate::kubernetes::call;
 use crate::observability::metrics::leader::{self, Gauge};
-use crate::pod::carla::results_format;
-use crate::services::aws::Aws;
-use crate::services::evalai::Target;
-use crate::services::token::Token;
 use leaderboard_api::{EvalaiMode, Leaderboard, Token as TokenPlace};
+use leaderboard_aws::clients::Aws;
 use leaderboard_base::spans::LogSpan;
 use leaderboard_base::tasks::Tasks;
+use leaderboard_evalai::Target;
+use leaderboard_evalai::token::Token;
+use leaderboard_evaluation::carla::results_format;
+use leaderboard_policy::ask::{Ask, Failure, Lookup, Service};
 
 /// A token is looked at again after this long.
 const AGAIN: Duration = Duration::from_mins(5);
@@ -249,7 +249,7 @@ async fn read_token(client: &Client, aws: &Aws, namespace: &str, place: &TokenPl
 #[cfg(test)]
 mod tests {
     use super::*;
-    use crate::ask::question::Answered;
+    use leaderboard_policy::ask::Answered;
 
     #[test]
     fn a_token_counts_only_for_the_place_where_it_was_found() {

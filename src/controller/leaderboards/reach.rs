@@ -7,12 +7,12 @@
 use std::sync::Arc;
 use std::time::Duration;
 
-use super::view::Unreachable;
-use crate::ask::question::{Ask, Failure, Lookup, Service};
 use leaderboard_api::conditions::Truth;
 use leaderboard_api::text::sentence;
 use leaderboard_api::{Leaderboard, reasons};
 use leaderboard_base::backoff::Backoff;
+use leaderboard_policy::ask::{Ask, Failure, Lookup, Service};
+use leaderboard_policy::leaderboards::view::Unreachable;
 
 /// Time after which a place that was reached is asked again.
 const AGAIN: Duration = Duration::from_mins(5);
@@ -172,8 +172,8 @@ pub(super) fn capitalized(text: &str) -> String {
 #[cfg(test)]
 mod tests {
     use super::*;
-    use crate::ask::question::{Answered, Silence};
     use crate::controller::fixtures::leaderboard;
+    use leaderboard_policy::ask::{Answered, Silence};
 
     type Found = Result<Seen, Failure>;
 

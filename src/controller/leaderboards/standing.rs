@@ -6,13 +6,13 @@ use jiff::Timestamp;
 use k8s_openapi::apimachinery::pkg::apis::meta::v1::Time;
 
 use super::reach::capitalized;
-use super::view::EvalaiStanding;
-use crate::ask::question::Failure;
 use crate::controller::objects::key_of;
-use crate::services::evalai::{Hub, InboxTrouble, Labels, Usage};
-use crate::services::token::Token;
 use leaderboard_api::text::sentence;
 use leaderboard_api::{EvalaiBacklog, EvalaiUse, Leaderboard};
+use leaderboard_evalai::token::Token;
+use leaderboard_evalai::{Hub, InboxTrouble, Labels, Usage};
+use leaderboard_policy::ask::Failure;
+use leaderboard_policy::leaderboards::view::EvalaiStanding;
 
 /// How it stands, with what was found where the Leaderboard names its token.
 pub(super) fn standing(
@@ -95,7 +95,7 @@ pub(super) fn evalai_use(usage: Usage) -> EvalaiUse {
 #[cfg(test)]
 mod tests {
     use super::*;
-    use crate::services::evalai::Misfit;
+    use leaderboard_evalai::Misfit;
 
     #[test]
     fn columns_that_stay_empty_and_a_token_that_ends_soon_are_shown() {

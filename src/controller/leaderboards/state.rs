@@ -6,9 +6,9 @@ use std::time::Duration;
 
 use jiff::Timestamp;
 
-use crate::controller::leaderboards::view::Policy;
 use leaderboard_base::lock::lock;
 use leaderboard_contract::verdict::WorkspaceVerdict;
+use leaderboard_policy::leaderboards::view::Policy;
 
 /// A status whose counts alone have changed is written at most this often.
 pub(super) const COUNTS_EVERY: Duration = Duration::from_secs(5);

@@ -4,9 +4,9 @@ use std::fmt;
 
 use serde_json::{Map, Value};
 
-use crate::services::aws::Aws;
-use crate::services::secrets::secret_text;
-use crate::services::token::{Token, TokenError};
+use leaderboard_aws::clients::Aws;
+use leaderboard_aws::secrets::secret_text;
+use leaderboard_evalai::token::{Token, TokenError};
 
 /// Where a token comes from.
 #[derive(Clone, PartialEq, Eq)]

@@ -9,18 +9,20 @@ use kube::api::{ApiResource, DynamicObject, PostParams};
 use kube::{Api, Client, ResourceExt};
 
 use super::claims;
-use super::pod_notes::{self, TrackPods, notes};
 use super::priority;
-use super::view::Claims;
 use crate::ask::Asked;
-use crate::ask::question::{Ask, Failure, Service};
 use crate::controller::objects::key_of;
 use crate::controller::settings::Settings;
-use crate::controller::submissions::job_spec::{self, JobInput};
-use crate::controller::submissions::pod_overlay;
 use crate::kubernetes::call;
-use crate::services::endpoints;
 use leaderboard_api::{Dns, JobNumber, Leaderboard, Submission, Track, effective};
+use leaderboard_aws::endpoints;
+use leaderboard_pod_spec::job as job_spec;
+use leaderboard_pod_spec::job::JobInput;
+use leaderboard_pod_spec::notes as pod_notes;
+use leaderboard_pod_spec::notes::{TrackPods, notes};
+use leaderboard_pod_spec::overlay as pod_overlay;
+use leaderboard_policy::ask::{Ask, Failure, Service};
+use leaderboard_policy::leaderboards::view::Claims;
 
 /// Classes and templates that are as they should be are looked at again after this long.
 const AGAIN: Duration = Duration::from_mins(5);

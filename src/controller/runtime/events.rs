@@ -21,9 +21,9 @@ use crate::controller::slots;
 use crate::controller::stores::Stores;
 use crate::kubernetes::objects::{Job, Pod};
 use crate::kubernetes::{Store, WatchEvent};
-use crate::services::evalai::Changed;
 use leaderboard_api::{Leaderboard, Submission, conditions, names};
 use leaderboard_base::object_key::ObjectKey;
+use leaderboard_evalai::Changed;
 
 /// Objects that something has happened to, and how urgent that is.
 pub(super) type Events<K> = BoxStream<'static, (ObjectRef<K>, Class)>;

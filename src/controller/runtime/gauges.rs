@@ -11,14 +11,14 @@ use kube::runtime::reflector::ObjectRef;
 use super::Shared;
 use super::queue::{Class, Queue};
 use super::reconciles::{LEADERBOARD, SUBMISSION};
-use crate::controller::census::Census;
 use crate::controller::leaderboards::{self, operator};
 use crate::controller::objects::{board_of, key_of};
-use crate::controller::submissions::decide::awaits_publication;
 use crate::observability::Observability;
 use crate::observability::metrics::OTHERS;
 use crate::observability::metrics::leader::{self, Samples};
 use leaderboard_api::{FailureClass, Leaderboard, State, Submission, SubmissionStatus, conditions, reasons};
+use leaderboard_policy::census::Census;
+use leaderboard_policy::submissions::awaits_publication;
 
 /// More often than anybody scrapes.
 pub(super) const EVERY: Duration = Duration::from_secs(15);

@@ -11,19 +11,19 @@ use std::time::Duration;
 use jiff::Timestamp;
 use tokio::time::{Instant, sleep};
 
-use crate::bridge::message;
 use crate::bridge::pollers::{Shared, follow};
-use crate::bridge::route::{DeadReason, Hindrance, OUTCOMES, Rules};
 use crate::bridge::source::{Received, SetAside, Source, named};
 use crate::controller::leaderboards::operator;
 use crate::controller::objects::key_of;
-use crate::services::evalai::answer::{About, Answer};
-use crate::services::evalai::request::{Reply, Request};
-use crate::services::evalai::{Hub, Row};
 use leaderboard_api::text::one_line;
 use leaderboard_api::{EvalaiQueue, Leaderboard, reasons};
 use leaderboard_base::backoff::Backoff;
 use leaderboard_base::object_key::ObjectKey;
+use leaderboard_evalai::answer::{About, Answer};
+use leaderboard_evalai::request::{Reply, Request};
+use leaderboard_evalai::{Hub, Row};
+use leaderboard_policy::intake::message;
+use leaderboard_policy::intake::route::{DeadReason, Hindrance, OUTCOMES, Rules};
 
 /// Most characters of a message that an event and the log quote.
 const QUOTED: usize = 500;

@@ -2,8 +2,8 @@ use kube::ResourceExt;
 use serde_json::{Value, json};
 
 use super::*;
-use crate::services::evalai::answer::Refusal;
-use crate::services::evalai::{Hub, Options, Status};
+use leaderboard_evalai::answer::Refusal;
+use leaderboard_evalai::{Hub, Options, Status};
 
 const US: &str = "ns/operator";
 

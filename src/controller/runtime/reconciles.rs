@@ -19,7 +19,6 @@ use crate::controller::leaderboards::{self, Reconciled, operator};
 use crate::controller::objects::{span_of, uid_of};
 use crate::controller::slots::Slots;
 use crate::controller::submissions::act::{ActError, act};
-use crate::controller::submissions::decide::{SlotUse, decide};
 use crate::controller::submissions::observe::observe;
 use crate::kubernetes::CallError;
 use crate::observability::metrics::Metrics;
@@ -27,6 +26,7 @@ use leaderboard_api::reasons::OTHER_OPERATOR;
 use leaderboard_api::{Leaderboard, Submission};
 use leaderboard_base::backoff::jittered;
 use leaderboard_base::tasks::panic_message;
+use leaderboard_policy::submissions::{SlotUse, decide};
 
 /// The kinds as their watches call them, for metrics.
 pub(super) const SUBMISSION: &str = "Submission";

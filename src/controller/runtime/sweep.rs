@@ -9,10 +9,10 @@ use tokio::sync::mpsc;
 use tracing::Instrument;
 
 use crate::bridge::ingest::{self, Incoming, Source};
-use crate::bridge::route::Outcome;
 use crate::kubernetes::Store;
-use crate::services::evalai::{SweepRow, Swept};
 use leaderboard_api::{Evalai, Foreign, Leaderboard, Submission};
+use leaderboard_evalai::{SweepRow, Swept};
+use leaderboard_policy::intake::route::Outcome;
 
 /// Takes rows in until their sender is gone.
 pub(super) async fn into_cluster(

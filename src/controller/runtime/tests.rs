@@ -9,13 +9,13 @@ use tokio::sync::watch;
 use tower_test::mock::{Handle, pair};
 
 use super::*;
-use crate::allowed::Allowed;
 use crate::controller::fixtures;
 use crate::controller::runtime::leader::Identity;
 use crate::controller::runtime::leader::tests::fake_server::FakeServer;
-use crate::controller::submissions::job_spec::OwnImage;
 use crate::kubernetes::Namespaces;
 use leaderboard_base::shutdown::Stop;
+use leaderboard_pod_spec::job::OwnImage;
+use leaderboard_policy::allowed::Allowed;
 
 /// All that runs in a leader without Leaderboards, in the order of names.
 const TASKS: [&str; 29] = [

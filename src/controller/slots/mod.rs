@@ -6,10 +6,6 @@
 //! No call here waits for anything: the next in line does not depend on a bucket, a token or another Leaderboard. The order of the line is
 //! `turns`, which is pure.
 
-mod line;
-mod member;
-pub mod turns;
-
 use std::collections::{HashMap, HashSet};
 use std::sync::Mutex;
 use std::time::Duration;
@@ -22,10 +18,10 @@ use crate::controller::objects::{Wake, board_of, uid};
 use crate::controller::stores::Stores;
 use leaderboard_api::{Leaderboard, Submission, SubmissionStatus};
 use leaderboard_base::lock::lock;
-use line::Line;
-use member::Member;
-pub use member::{check_team, mark};
-use turns::{InLine, Limits, Turn};
+use leaderboard_policy::slots::line::Line;
+use leaderboard_policy::slots::member::{self, Member};
+pub use leaderboard_policy::slots::member::{check_team, mark};
+use leaderboard_policy::slots::turns::{InLine, Limits, Turn};
 
 /// Slots are worked out once in this time at most: an event must not cost a look at all of thousands that wait.
 const EVERY: Duration = Duration::from_millis(100);

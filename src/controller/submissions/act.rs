@@ -11,14 +11,10 @@ use kube::{Resource, ResourceExt};
 use serde_json::json;
 use tokio::time::Instant;
 
-use super::decide::{Action, Event, Plan, Question, StatusWrite, pinned};
 use super::external::ExternalSystems;
-use super::job_spec::{self, JobInput};
 use super::memory::Memory;
 use super::observe::workers::Workers;
-use super::phases::{self, Ended, Phase};
 use super::spans;
-use super::view::View;
 use crate::controller::objects::{key_of, log_span_of, uid};
 use crate::controller::settings::Settings;
 use crate::controller::slots::Slots;
@@ -31,6 +27,11 @@ use crate::observability::traces::Traces;
 use leaderboard_api::text::one_line;
 use leaderboard_api::{JobNumber, RunPlan, State, Submission, SubmissionStatus, names, reasons};
 use leaderboard_contract::run::Stop;
+use leaderboard_pod_spec::job as job_spec;
+use leaderboard_pod_spec::job::JobInput;
+use leaderboard_policy::phases::{self, Ended, Phase};
+use leaderboard_policy::submissions::{Action, Event, Plan, Question, StatusWrite, pinned};
+use leaderboard_policy::view::View;
 
 /// Kubernetes refuses notes above 1 kB.
 const LONGEST_NOTE: usize = 900;

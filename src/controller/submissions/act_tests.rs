@@ -7,11 +7,11 @@ use tracing::Instrument;
 use super::*;
 use crate::controller::fixtures::{Cluster, Surroundings, leaderboard, surroundings, with_job};
 use crate::controller::objects::span_of;
-use crate::controller::submissions::decide::{Plan, StatusWrite};
 use crate::controller::submissions::observe::observe;
-use crate::controller::submissions::view::ObservedJob;
 use crate::observability::logging::tests::Lines;
 use leaderboard_api::Attempt;
+use leaderboard_policy::submissions::{Plan, StatusWrite};
+use leaderboard_policy::view::ObservedJob;
 
 /// A submission whose Job was made, as one reconcile has read it.
 async fn bench() -> (Surroundings, View) {

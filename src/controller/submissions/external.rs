@@ -6,21 +6,21 @@ use std::sync::{Arc, Mutex};
 
 use kube::ResourceExt;
 
-use super::decide::{EvalaiUpdate, TableUpdate, patience};
 use super::observe::workers::Workers;
 use super::records::{self, Record};
 use super::result_texts;
-use super::view::{EvalaiEnd, EvalaiInfo, EvalaiView, RecordView, Standing, View};
-use crate::allowed::Allowed;
 use crate::ask::Asker;
 use crate::controller::objects::{key_of, log_span_of, uid};
-use crate::services::evalai::{
-    self, DesiredUpdate, Ended, Hub, ImageAnswer, Outcome, Patience, Publisher, Run, Status, Subject, SubmissionState,
-    Target,
-};
 use leaderboard_api::{Ingested, JobNumber, Leaderboard, Submission, SubmissionStatus, names};
 use leaderboard_base::lock::lock;
 use leaderboard_base::object_key::ObjectKey;
+use leaderboard_evalai as evalai;
+use leaderboard_evalai::{
+    DesiredUpdate, Ended, Hub, ImageAnswer, Outcome, Patience, Publisher, Run, Status, Subject, SubmissionState, Target,
+};
+use leaderboard_policy::allowed::Allowed;
+use leaderboard_policy::submissions::{EvalaiUpdate, TableUpdate, patience};
+use leaderboard_policy::view::{EvalaiEnd, EvalaiInfo, EvalaiView, RecordView, Standing, View};
 
 /// Doors to both services, and what each Leaderboard needs to go through them.
 pub struct ExternalSystems {

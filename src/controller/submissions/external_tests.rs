@@ -1,5 +1,7 @@
 //! Rows of an end, against a stand-in for DynamoDB of the test's own.
 
+use leaderboard_contract::report::ContentId;
+use leaderboard_policy::report_digest::ReportDigest;
 use std::collections::BTreeMap;
 
 use axum::body::Bytes;
@@ -12,13 +14,11 @@ use serde_json::{Value, json};
 use tokio::sync::mpsc;
 
 use super::*;
-use crate::ask::question::Lookup;
 use crate::controller::fixtures::{Cluster, Surroundings, leaderboard, surroundings, with_job};
-use crate::controller::submissions::view::{
-    NodeView, ObservedFence, ObservedJob, ObservedLog, ObservedReport, ReportView, Turn,
-};
 use leaderboard_api::conditions::{self, Truth};
 use leaderboard_api::{Attempt, State, reasons};
+use leaderboard_policy::ask::Lookup;
+use leaderboard_policy::view::{NodeView, ObservedFence, ObservedJob, ObservedLog, ObservedReport, ReportView, Turn};
 
 /// Longer than a write takes on a busy machine.
 const LIMIT: std::time::Duration = std::time::Duration::from_mins(1);
@@ -137,7 +137,7 @@ fn last() -> ObservedReport {
         "unit": "routes", "workers": [], "final": true, "eligible": true, "entryStatus": "Finished", "results": results.to_string(),
     });
     let report: leaderboard_contract::report::Report = serde_json::from_value(report).unwrap();
-    ObservedReport::Ours(Arc::new((&report).into()))
+    ObservedReport::Ours(Arc::new(ReportDigest::of(&report, ContentId::default())))
 }
 
 #[tokio::test]

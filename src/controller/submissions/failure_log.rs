@@ -14,15 +14,15 @@ use kube::api::LogParams;
 use kube::{Api, Client};
 
 use super::reports::RunFiles;
-use super::view::{LogAt, LogPlace, ObservedLog};
-use crate::ask::question::{Ask, Failure, Lookup, Service};
 use crate::ask::{Asked, Asker, Wake};
-use crate::services::archive::Archive;
-use crate::services::aws::Aws;
 use leaderboard_api::client_errors;
 use leaderboard_api::names::FAILURE_LOG_KEY;
 use leaderboard_api::{Attempt, JobNumber, names};
+use leaderboard_aws::archive::Archive;
+use leaderboard_aws::clients::Aws;
 use leaderboard_base::tasks::Tasks;
+use leaderboard_policy::ask::{Ask, Failure, Lookup, Service};
+use leaderboard_policy::view::{LogAt, LogPlace, ObservedLog};
 
 /// Characters that are kept, as EvalAI's own worker does.
 const TAIL_CHARS: usize = 10_000;

@@ -4,13 +4,13 @@ use std::sync::Arc;
 use std::time::Duration;
 
 use super::reports::{RunFiles, silent};
-use super::view::ObservedFence;
-use crate::ask::question::{Ask, Failure, Lookup, Service};
 use crate::ask::{Asked, Asker, Wake};
-use crate::services::aws::Aws;
 use leaderboard_api::JobNumber;
+use leaderboard_aws::clients::Aws;
 use leaderboard_base::tasks::Tasks;
 use leaderboard_contract::report::{OWNER_KEY, Owner};
+use leaderboard_policy::ask::{Ask, Failure, Lookup, Service};
+use leaderboard_policy::view::ObservedFence;
 
 /// Time before a write that failed is made again.
 const TRY_AGAIN: Duration = Duration::from_secs(3);
@@ -82,9 +82,9 @@ pub fn seen(lookup: &Lookup<Fence>, job: JobNumber) -> ObservedFence {
 #[cfg(test)]
 mod tests {
     use super::*;
-    use crate::ask::question::Answered;
     use crate::controller::fixtures::{leaderboard, with_job};
     use leaderboard_api::Attempt;
+    use leaderboard_policy::ask::Answered;
 
     fn fence(retry: i32) -> Fence {
         let (submission, _) = with_job("sub", &leaderboard("one", "http://127.0.0.1:9"));

@@ -5,22 +5,14 @@
 //! `job_spec` and `pod_overlay` build what is created in the cluster; they know no client and no clock.
 
 pub mod act;
-pub mod decide;
 pub mod external;
 pub mod failure_log;
 pub mod fences;
-pub mod job_spec;
 pub mod memory;
 pub mod observe;
 pub mod payloads;
-pub mod phases;
-mod pod_layout;
-pub mod pod_overlay;
-pub mod questions;
 pub mod records;
-pub mod report_digest;
 pub mod reports;
 mod result_texts;
 pub mod rows;
 pub mod spans;
-pub mod view;

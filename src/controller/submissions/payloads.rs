@@ -9,11 +9,11 @@ use futures::FutureExt;
 use jiff::Timestamp;
 use sha2::{Digest, Sha256};
 
-use super::report_digest::{MAX_TEXT, METADATA_KEY, STDOUT_KEY};
-use crate::services::archive::Archive;
-use crate::services::aws::Aws;
-use crate::services::evalai::{Outline, Payload, PayloadProblem, PayloadReader, StoredResult};
+use leaderboard_aws::archive::Archive;
+use leaderboard_aws::clients::Aws;
 use leaderboard_contract::report::{ContentId, MAX_BYTES, REPORT_KEY, Report, StoredFile};
+use leaderboard_evalai::{Outline, Payload, PayloadProblem, PayloadReader, StoredResult};
+use leaderboard_policy::report_digest::{MAX_TEXT, METADATA_KEY, STDOUT_KEY};
 
 /// Time that one read may take.
 const LIMIT: Duration = Duration::from_secs(10);

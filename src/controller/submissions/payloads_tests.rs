@@ -6,11 +6,11 @@ use axum::http::{StatusCode, Uri};
 use axum::response::{IntoResponse, Response};
 use serde_json::json;
 
-use super::super::report_digest::left_out;
 use super::*;
 use crate::controller::fixtures::{Cluster, surroundings};
-use crate::services::evalai::Patience;
 use leaderboard_base::lock::lock;
+use leaderboard_evalai::Patience;
+use leaderboard_policy::report_digest::left_out;
 
 /// Objects by their key below the run's prefix.
 type Objects = Arc<Mutex<HashMap<&'static str, String>>>;

@@ -5,16 +5,16 @@
 use std::sync::Arc;
 use std::time::Duration;
 
-use super::view::RecordView;
-use crate::ask::question::{Ask, Failure, Lookup, Rank, Service};
 use crate::ask::{Asker, Wake};
-use crate::services::aws::Aws;
-use crate::services::table::{Row, TableError, Tables, Written};
 use leaderboard_api::Table;
+use leaderboard_aws::clients::Aws;
+use leaderboard_aws::table::{Row, TableError, Tables, Written};
 use leaderboard_base::backoff::Backoff;
 use leaderboard_base::object_key::ObjectKey;
 use leaderboard_base::spans::LogSpan;
 use leaderboard_base::tasks::Tasks;
+use leaderboard_policy::ask::{Ask, Failure, Lookup, Rank, Service};
+use leaderboard_policy::view::RecordView;
 
 /// Pauses after failures in a row.
 const RETRY: Backoff = Backoff::new(Duration::from_secs(4), Duration::from_mins(5));

@@ -7,15 +7,15 @@ use std::time::Duration;
 
 use jiff::Timestamp;
 
-use super::report_digest::ReportDigest;
-use super::view::{ObservedReport, ReportDemand, ReportView, Stage};
-use crate::ask::question::{Ask, Failure, Lookup, Rank, Service};
 use crate::ask::{Asked, Asker, Wake};
-use crate::services::archive::{Archive, ArchiveError, Fetched};
-use crate::services::aws::Aws;
 use leaderboard_api::{Attempt, JobNumber, RunPlan, Storage, effective};
+use leaderboard_aws::archive::{Archive, ArchiveError, Fetched};
+use leaderboard_aws::clients::Aws;
 use leaderboard_base::tasks::Tasks;
 use leaderboard_contract::report::{MAX_BYTES, REPORT_KEY};
+use leaderboard_policy::ask::{Ask, Failure, Lookup, Rank, Service};
+use leaderboard_policy::report_digest::ReportDigest;
+use leaderboard_policy::view::{ObservedReport, ReportDemand, ReportView, Stage};
 
 /// Time before a read that failed is made again while a decision waits for it.
 const READ_AGAIN: Duration = Duration::from_secs(10);

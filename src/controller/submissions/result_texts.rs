@@ -3,12 +3,12 @@
 use serde_json::Value;
 
 use super::failure_log::Tail;
-use super::report_digest::ReportDigest;
-use super::view::View;
-use crate::pod::carla::results_format;
-use crate::services::evalai::{Outline, Patience, StoredResult};
-use crate::services::table::Row;
 use leaderboard_api::{FailureClass, LeaderboardVersion, LogTail, State, SubmissionStatus, effective};
+use leaderboard_aws::table::Row;
+use leaderboard_evalai::{Outline, Patience, StoredResult};
+use leaderboard_evaluation::carla::results_format;
+use leaderboard_policy::report_digest::ReportDigest;
+use leaderboard_policy::view::View;
 use leaderboard_results::{metrics, number_text};
 
 /// What the result in the view is sent with: nothing of a bucket where none is stored. `so_far`: with the metrics over the routes so
@@ -154,7 +154,7 @@ mod tests {
             "final": true, "eligible": true, "entryStatus": "Finished", "results": results,
         }))
         .unwrap();
-        ReportDigest::from(&report)
+        ReportDigest::of(&report, leaderboard_contract::report::ContentId::default())
     }
 
     fn plan() -> Value {

@@ -3,12 +3,12 @@
 
 use std::sync::Arc;
 
-use super::questions::{ForeignRun, Row};
-use crate::ask::question::Failure;
 use crate::ask::{Asker, Wake};
-use crate::services::aws::Aws;
-use crate::services::table::{ObservedRow, TableError, Tables};
+use leaderboard_aws::clients::Aws;
+use leaderboard_aws::table::{ObservedRow, TableError, Tables};
 use leaderboard_base::tasks::Tasks;
+use leaderboard_policy::ask::Failure;
+use leaderboard_policy::questions::{ForeignRun, Row};
 
 /// What the old pipeline's row shows of a run that has not ended.
 const UNDER_WAY: [&str; 2] = ["SUBMITTED", "RUNNING"];

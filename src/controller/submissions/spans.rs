@@ -5,11 +5,11 @@
 
 use sha2::{Digest, Sha256};
 
-use super::phases::{Ended, Phase, restarted};
 use crate::controller::objects::uid_of;
 use crate::observability::traces::{Kind, Span, Value};
 use leaderboard_api::{Submission, SubmissionStatus, names, reasons};
 use leaderboard_base::trace_id::TraceId;
+use leaderboard_policy::phases::{Ended, Phase, restarted};
 
 /// The spans of what has ended with `new`.
 pub fn of(submission: &Submission, new: &SubmissionStatus, ended: &[Ended]) -> Vec<Span> {

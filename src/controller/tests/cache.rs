@@ -5,10 +5,10 @@ use serde_json::{Value, json};
 
 use crate::controller::fixtures::{leaderboard, settings, with_job};
 use crate::controller::stores::owner_uid;
-use crate::controller::submissions::job_spec::{JobInput, build_object};
 use crate::kubernetes::objects::{Job, Pod, Texts};
 use crate::kubernetes::{Index, Item, Store, Watchable};
 use leaderboard_api::{Attempt, JobNumber, Leaderboard, Submission};
+use leaderboard_pod_spec::job::{JobInput, build_object};
 
 /// As many as one page of a list has.
 const COUNT: usize = 100;

@@ -19,7 +19,6 @@ use tokio::sync::{mpsc, watch};
 use tokio::time::Instant;
 use tower_test::mock::{Handle, pair};
 
-use crate::allowed::Allowed;
 use crate::controller::leaderboards::probe::Asks;
 use crate::controller::leaderboards::state::LeaderboardState;
 use crate::controller::objects::{Wake, by_key};
@@ -28,7 +27,6 @@ use crate::controller::settings::Settings;
 use crate::controller::slots::Slots;
 use crate::controller::stores::{Stores, owner_uid};
 use crate::controller::submissions::external::ExternalSystems;
-use crate::controller::submissions::job_spec::OwnImage;
 use crate::controller::submissions::memory::Memory;
 use crate::controller::submissions::observe::causes::Causes;
 use crate::controller::submissions::observe::workers::Workers;
@@ -36,11 +34,13 @@ use crate::controller::submissions::records;
 use crate::kubernetes::objects::{Job, Owner, Pod};
 use crate::kubernetes::{Namespaces, Store, Synced, Writer};
 use crate::observability::traces::Traces;
-use crate::services::aws::Aws;
-use crate::services::evalai::{Hub, Options};
 use leaderboard_api::{Attempt, JobNumber, Leaderboard, State, Submission, SubmissionStatus, Times, effective, names};
+use leaderboard_aws::clients::Aws;
 use leaderboard_base::shutdown::Stop;
 use leaderboard_base::tasks::Tasks;
+use leaderboard_evalai::{Hub, Options};
+use leaderboard_pod_spec::job::OwnImage;
+use leaderboard_policy::allowed::Allowed;
 
 /// Namespace of everything here.
 pub const NAMESPACE: &str = "one";

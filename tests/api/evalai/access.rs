@@ -1,6 +1,6 @@
 //! Tokens that are refused, and uploaded files that name no image.
 
-use leaderboard_operator::services::evalai::Usage;
+use leaderboard_evalai::Usage;
 
 use super::*;
 

@@ -2,7 +2,7 @@
 
 use evalai_stand_in::errors;
 use futures::future::join_all;
-use leaderboard_operator::services::evalai::answer::{Answer, classify};
+use leaderboard_evalai::answer::{Answer, classify};
 use serde_json::Value;
 use tokio::io::{AsyncReadExt, AsyncWriteExt};
 

@@ -6,9 +6,9 @@ use tokio::sync::watch;
 
 use super::*;
 use crate::support::throttle::Throttle;
+use leaderboard_aws::logs::Miss;
 use leaderboard_contract::keys::{CONTENTS_LOG, WORKSPACE_LOG};
 use leaderboard_contract::report::Logs;
-use leaderboard_operator::services::logs::Miss;
 
 /// A Pod whose logs go to a group of its own, and the group's name.
 async fn pod_with_logs() -> (Pod, String) {

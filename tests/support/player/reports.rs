@@ -9,8 +9,8 @@ use futures::FutureExt;
 use futures::future::BoxFuture;
 use kube::ResourceExt;
 use leaderboard_api::{Attempt, Metric, WorkerState, names};
+use leaderboard_aws::archive::Archive;
 use leaderboard_contract::report::{REPORT_KEY, Report, ReportWorker, SCHEMA};
-use leaderboard_operator::services::archive::Archive;
 use serde_json::json;
 use tokio::time::{Instant, interval_at};
 

@@ -1,10 +1,10 @@
 //! How urgent an event is: by what the object, its Job or its Pod shows. Pure.
 
 use super::Class;
-use crate::controller::submissions::decide::Plan;
-use crate::controller::submissions::view::Stage;
 use crate::kubernetes::objects::{ContainerStatus, Job, Pod};
 use leaderboard_api::{Submission, SubmissionStatus};
+use leaderboard_policy::submissions::Plan;
+use leaderboard_policy::view::Stage;
 
 /// Conditions of a Job that has ended, or is about to.
 const JOB_ENDS: [&str; 4] = ["Complete", "Failed", "SuccessCriteriaMet", "FailureTarget"];

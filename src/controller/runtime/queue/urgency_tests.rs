@@ -1,9 +1,9 @@
 use serde_json::{Value, json};
 
 use super::*;
-use crate::controller::submissions::decide::StatusWrite;
-use crate::controller::submissions::view::ReportDemand;
 use leaderboard_api::{Attempt, JobNumber};
+use leaderboard_policy::submissions::StatusWrite;
+use leaderboard_policy::view::ReportDemand;
 
 fn submission(change: &Value) -> Submission {
     let mut object = json!({

@@ -13,12 +13,12 @@ use tokio::time::Instant;
 
 use crate::controller::objects::Wake;
 use crate::controller::stores::Stores;
-use crate::controller::submissions::view::ScaleUp;
 use crate::kubernetes::Store;
 use crate::kubernetes::objects::{Event, Involved, Job, Meta, Pod};
 use leaderboard_api::Submission;
 use leaderboard_api::text::{LONGEST_MESSAGE, one_line};
 use leaderboard_base::lock::lock;
+use leaderboard_policy::view::ScaleUp;
 
 /// Why Jobs have no Pod.
 pub const OF_JOBS: &str = "involvedObject.kind=Job,reason=FailedCreate";

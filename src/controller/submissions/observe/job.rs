@@ -1,8 +1,8 @@
 //! A Job reduced to what decisions depend on. Pure.
 
-use crate::controller::submissions::view::{JobEnd, JobView};
 use crate::kubernetes::objects::{Job, Pod};
 use leaderboard_api::text::{LONGEST_MESSAGE, one_line};
+use leaderboard_policy::view::{JobEnd, JobView};
 
 /// Reduces a Job. `pod` is its newest.
 pub fn view(job: &Job, pod: Option<&Pod>) -> JobView {

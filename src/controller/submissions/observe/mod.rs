@@ -12,10 +12,8 @@ use jiff::Timestamp;
 use kube::ResourceExt;
 use kube::runtime::reflector::ObjectRef;
 
-use super::decide::job_name;
 use super::external::ExternalSystems;
 use super::memory::Memory;
-use super::view::{EvalaiView, NodeView, ObservedJob, PodView, View};
 use super::{failure_log, fences, reports};
 use crate::controller::objects::uid;
 use crate::controller::slots::Slots;
@@ -23,6 +21,8 @@ use crate::controller::stores::Stores;
 use crate::kubernetes::objects::Job;
 use causes::Causes;
 use leaderboard_api::{Leaderboard, Submission, SubmissionStatus};
+use leaderboard_policy::submissions::job_name;
+use leaderboard_policy::view::{EvalaiView, NodeView, ObservedJob, PodView, View};
 use workers::Workers;
 
 /// What reading the world of a submission uses.

@@ -9,10 +9,10 @@ use kube::runtime::reflector::ObjectRef;
 
 use crate::controller::objects::Wake;
 use crate::controller::stores::Stores;
-use crate::controller::submissions::view::{NodeView, ObservedNode};
 use crate::kubernetes::objects::{Node, Pod};
 use crate::kubernetes::{Store, WatchEvents};
 use leaderboard_api::Submission;
+use leaderboard_policy::view::{NodeView, ObservedNode};
 
 /// Taints with which a cluster announces that a node is about to go: Karpenter, cluster-autoscaler, and a person or a controller
 /// that knows a node to be off.

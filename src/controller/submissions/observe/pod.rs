@@ -1,11 +1,11 @@
 //! A Pod reduced to what decisions depend on. Pure; reads the runner's verdicts as hostile text.
 
-use crate::controller::submissions::view::{ContainerView, EndView, PodView};
 use crate::kubernetes::objects::{Condition, ContainerStatus, Ended, Pod, PodStatus};
 use leaderboard_api::names;
 use leaderboard_api::text::{LONGEST_MESSAGE, one_line};
 use leaderboard_contract::run::Stop;
 use leaderboard_contract::verdict::{NotAVerdict, WorkspaceReason, WorkspaceVerdict};
+use leaderboard_policy::view::{ContainerView, EndView, PodView};
 use leaderboard_protocol::files::Member;
 use leaderboard_protocol::verdict::Verdict;
 

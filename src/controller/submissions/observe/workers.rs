@@ -9,13 +9,13 @@ use crate::ask::Asker;
 use crate::controller::objects::{Wake, by_key, key_of, log_span_of, uid};
 use crate::controller::submissions::failure_log::{self, FailureLog, Tail};
 use crate::controller::submissions::fences::{self, Fence};
-use crate::controller::submissions::questions::Row;
 use crate::controller::submissions::reports::{self, Report, RunFiles};
 use crate::controller::submissions::rows;
-use crate::controller::submissions::view::{LogPlace, ReportDemand};
-use crate::services::aws::Aws;
 use leaderboard_api::{Submission, SubmissionStatus};
+use leaderboard_aws::clients::Aws;
 use leaderboard_base::tasks::Tasks;
+use leaderboard_policy::questions::Row;
+use leaderboard_policy::view::{LogPlace, ReportDemand};
 
 /// Asks them, and has what was answered.
 pub struct Workers {

@@ -1,0 +1,166 @@
+//! Files that are stored in parts, because they are large or have grown: what S3 has already is copied there.
+//!
+//! Part of [`Archive`], which stores what fits into memory. How a file is cut is in `parts`.
+
+use std::fs::File;
+use std::os::unix::fs::FileExt;
+use std::sync::Arc;
+use std::time::{Duration, Instant};
+
+use aws_sdk_s3::config::RequestChecksumCalculation;
+use aws_sdk_s3::primitives::ByteStream;
+use aws_sdk_s3::types::{ChecksumAlgorithm, CompletedMultipartUpload, CompletedPart};
+use percent_encoding::{AsciiSet, NON_ALPHANUMERIC, utf8_percent_encode};
+
+use super::{Archive, ArchiveError, Cause, Kept, Part, parts};
+
+/// Time S3 may take for copying a part or joining them.
+const LONG_TRY: Duration = Duration::from_mins(5);
+/// What stays as it is in `x-amz-copy-source`.
+const PLAIN: &AsciiSet = &NON_ALPHANUMERIC
+    .remove(b'-')
+    .remove(b'_')
+    .remove(b'.')
+    .remove(b'~')
+    .remove(b'/');
+
+impl Archive {
+    /// Stores the first `size` bytes of a file in parts; what is stored of it already is copied inside S3. At most one part
+    /// is in memory. What is not done at `cut_at` is aborted. Returns the new object's entity tag.
+    pub async fn upload(
+        &self,
+        key: &str,
+        file: &Arc<File>,
+        kept: Option<Kept<'_>>,
+        size: u64,
+        cut_at: Option<Instant>,
+    ) -> Result<Option<String>, ArchiveError> {
+        const OP: &str = "storing";
+        let parts = parts::plan(kept.map_or(0, |kept| kept.size), size);
+        let parts = parts.map_err(|e| self.error(OP, key, e.into()))?;
+        let request = self.client.create_multipart_upload().bucket(&self.bucket);
+        let request = request.key(self.full(key)).set_checksum_algorithm(self.announced());
+        let output = self
+            .keeping
+            .of_upload(request)
+            .send()
+            .await
+            .map_err(|e| self.failed(OP, key, &e))?;
+        let Some(id) = output.upload_id else {
+            return Err(self.error(OP, key, Cause::Refused("no upload id in the answer".to_owned())));
+        };
+        let sending = self.send_parts(key, &id, file, kept, &parts);
+        let stored = match cut_at {
+            Some(cut_at) => tokio::time::timeout_at(cut_at.into(), sending)
+                .await
+                .unwrap_or_else(|_| Err(self.error(OP, key, Cause::Slow))),
+            None => sending.await,
+        };
+        if stored.is_err() {
+            let abort = self.client.abort_multipart_upload().bucket(&self.bucket);
+            // What is left over costs storage only; the bucket's lifecycle rule ends it.
+            let _ = abort.key(self.full(key)).upload_id(&id).send().await;
+        }
+        stored
+    }
+
+    /// The SDK adds this checksum to each part, which S3 takes only if the upload has announced it. Without it where the SDK is not to add
+    /// any: some stores refuse what they don't know.
+    fn announced(&self) -> Option<ChecksumAlgorithm> {
+        match self.client.config().request_checksum_calculation() {
+            Some(RequestChecksumCalculation::WhenRequired) => None,
+            _ => Some(ChecksumAlgorithm::Crc32),
+        }
+    }
+
+    async fn send_parts(
+        &self,
+        key: &str,
+        id: &str,
+        file: &Arc<File>,
+        kept: Option<Kept<'_>>,
+        parts: &[Part],
+    ) -> Result<Option<String>, ArchiveError> {
+        let mut done = Vec::with_capacity(parts.len());
+        for (number, part) in (1..).zip(parts) {
+            let completed = match *part {
+                Part::Copy { from, len } => {
+                    let etag = kept.map_or("", |kept| kept.etag);
+                    self.copy_part(key, id, number, etag, from..from + len).await?
+                }
+                Part::Send { from, len } => self.send_part(key, id, number, file, from..from + len).await?,
+            };
+            done.push(completed.part_number(number).build());
+        }
+        let upload = CompletedMultipartUpload::builder().set_parts(Some(done)).build();
+        let request = self.client.complete_multipart_upload().bucket(&self.bucket);
+        let request = request.key(self.full(key)).upload_id(id).multipart_upload(upload);
+        let output = request.customize().config_override(patient()).send().await;
+        Ok(output.map_err(|e| self.failed("storing", key, &e))?.e_tag)
+    }
+
+    async fn send_part(
+        &self,
+        key: &str,
+        id: &str,
+        number: i32,
+        file: &Arc<File>,
+        range: std::ops::Range<u64>,
+    ) -> Result<aws_sdk_s3::types::builders::CompletedPartBuilder, ArchiveError> {
+        const OP: &str = "storing a part of";
+        let bytes = read_range(file, range)
+            .await
+            .map_err(|e| self.error(OP, key, e.into()))?;
+        let request = self.client.upload_part().bucket(&self.bucket).key(self.full(key));
+        let request = request.upload_id(id).part_number(number);
+        let output = request.body(ByteStream::from(bytes)).send().await;
+        let output = output.map_err(|e| self.failed(OP, key, &e))?;
+        let part = CompletedPart::builder().set_e_tag(output.e_tag);
+        Ok(part.set_checksum_crc32(output.checksum_crc32))
+    }
+
+    async fn copy_part(
+        &self,
+        key: &str,
+        id: &str,
+        number: i32,
+        etag: &str,
+        range: std::ops::Range<u64>,
+    ) -> Result<aws_sdk_s3::types::builders::CompletedPartBuilder, ArchiveError> {
+        const OP: &str = "copying a part of";
+        let source = format!("{}/{}", self.bucket, self.full(key));
+        let source = utf8_percent_encode(&source, PLAIN).to_string();
+        let request = self.client.upload_part_copy().bucket(&self.bucket).key(self.full(key));
+        let request = request.upload_id(id).part_number(number).copy_source(source);
+        let request = request.copy_source_if_match(etag);
+        let request = request.copy_source_range(format!("bytes={}-{}", range.start, range.end - 1));
+        let output = request.customize().config_override(patient()).send().await;
+        let result = output.map_err(|e| self.failed(OP, key, &e))?.copy_part_result;
+        let part = CompletedPart::builder();
+        Ok(match result {
+            Some(result) => part.set_e_tag(result.e_tag).set_checksum_crc32(result.checksum_crc32),
+            None => part,
+        })
+    }
+}
+
+/// Copying and joining large objects takes S3 longer than an ordinary answer.
+fn patient() -> aws_sdk_s3::config::Builder {
+    let timeouts = aws_config::timeout::TimeoutConfig::builder()
+        .connect_timeout(Duration::from_secs(5))
+        .operation_attempt_timeout(LONG_TRY)
+        .operation_timeout(LONG_TRY * 2)
+        .build();
+    aws_sdk_s3::config::Builder::new().timeout_config(timeouts)
+}
+
+/// Reads a part of a file, on a thread that may block.
+pub async fn read_range(file: &Arc<File>, range: std::ops::Range<u64>) -> std::io::Result<Vec<u8>> {
+    let file = Arc::clone(file);
+    let read = tokio::task::spawn_blocking(move || {
+        let mut bytes = vec![0; usize::try_from(range.end - range.start).map_err(std::io::Error::other)?];
+        file.read_exact_at(&mut bytes, range.start)?;
+        Ok(bytes)
+    });
+    read.await.map_err(std::io::Error::other)?
+}

@@ -1,0 +1,197 @@
+//! Whether a Leaderboard fits its challenge: phases, splits and metrics.
+//!
+//! Called by `hub` with what `queue` has read. Pure.
+
+use std::collections::BTreeMap;
+
+use jiff::Timestamp;
+
+use super::row::{Phase, Split};
+use super::types::Target;
+
+/// What EvalAI shows of a challenge.
+#[derive(Clone, Debug, PartialEq)]
+pub struct Catalog {
+    /// When it was read.
+    pub at: Timestamp,
+    /// Its phases.
+    pub phases: Vec<Phase>,
+    /// Its leaderboards.
+    pub splits: Vec<Split>,
+    /// Codenames of dataset splits; none where EvalAI does not show them.
+    pub codenames: BTreeMap<i64, Option<String>>,
+}
+
+/// How a Leaderboard fits its challenge.
+#[derive(Clone, Debug, PartialEq)]
+pub struct Labels {
+    /// When EvalAI was read.
+    pub at: Timestamp,
+    /// What does not fit.
+    pub problems: Vec<Misfit>,
+}
+
+impl Labels {
+    /// Whether results can be published.
+    pub fn ok(&self) -> bool {
+        self.problems.iter().all(|problem| !problem.prevents())
+    }
+}
+
+/// Something that does not fit.
+#[derive(thiserror::Error, Clone, Debug, PartialEq, Eq)]
+pub enum Misfit {
+    /// A track's phase is not the challenge's.
+    #[error("challenge {challenge} has no phase {phase}; check evalai.challenge and the tracks' phases")]
+    Phase { challenge: i64, phase: i64 },
+    /// A phase has no leaderboard of that split.
+    #[error("phase {phase} has no leaderboard for the split {split}; check evalai.split")]
+    Split { phase: i64, split: String },
+    /// The leaderboard lacks metrics: EvalAI would refuse every result.
+    #[error("the leaderboard of phase {phase} has no {}; add these labels to its schema", .labels.join(", "))]
+    Unknown { phase: i64, labels: Vec<String> },
+    /// The leaderboard has metrics that are never sent: EvalAI shows them as `#`.
+    #[error("the leaderboard of phase {phase} also has {}, which the operator never sends and which stay empty; remove them from its schema, or check spec.leaderboardVersion", .labels.join(", "))]
+    Unsent { phase: i64, labels: Vec<String> },
+}
+
+impl Misfit {
+    /// Whether it keeps results from being published.
+    fn prevents(&self) -> bool {
+        !matches!(self, Self::Unsent { .. })
+    }
+}
+
+/// Compares a Leaderboard with its challenge.
+pub fn compare(target: &Target, catalog: &Catalog) -> Labels {
+    Labels {
+        at: catalog.at,
+        problems: target
+            .phases
+            .iter()
+            .flat_map(|phase| compare_phase(target, catalog, *phase))
+            .collect(),
+    }
+}
+
+fn compare_phase(target: &Target, catalog: &Catalog, phase: i64) -> Vec<Misfit> {
+    if !catalog.phases.iter().any(|known| known.id == phase) {
+        let challenge = target.challenge;
+        return vec![Misfit::Phase { challenge, phase }];
+    }
+    let Some(split) = split_of(catalog, phase, &target.split) else {
+        let split = target.split.clone();
+        return vec![Misfit::Split { phase, split }];
+    };
+    let known = &split.schema.labels;
+    let unknown: Vec<_> = target
+        .labels
+        .iter()
+        .filter(|label| !known.contains(label))
+        .cloned()
+        .collect();
+    let unsent: Vec<_> = known
+        .iter()
+        .filter(|label| !target.labels.contains(label))
+        .cloned()
+        .collect();
+    let unknown = (!unknown.is_empty()).then_some(Misfit::Unknown { phase, labels: unknown });
+    let unsent = (!unsent.is_empty()).then_some(Misfit::Unsent { phase, labels: unsent });
+    unknown.into_iter().chain(unsent).collect()
+}
+
+/// The phase's leaderboard of a split. Where EvalAI does not show a codename, a phase's only leaderboard is taken.
+fn split_of<'a>(catalog: &'a Catalog, phase: i64, codename: &str) -> Option<&'a Split> {
+    let of_phase = || catalog.splits.iter().filter(|split| split.phase == phase);
+    let name = |split: &Split| catalog.codenames.get(&split.dataset_split).cloned().flatten();
+    let named = of_phase().find(|split| name(split).as_deref() == Some(codename));
+    named.or_else(|| {
+        of_phase()
+            .next()
+            .filter(|only| of_phase().count() == 1 && name(only).is_none())
+    })
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+    use crate::row::Schema;
+    use crate::token::Token;
+    use std::sync::Arc;
+    use std::time::Duration;
+
+    fn target(phases: &[i64], labels: &[&str]) -> Target {
+        Target {
+            leaderboard: leaderboard_base::object_key::ObjectKey {
+                namespace: "ns".into(),
+                name: "board".into(),
+                uid: "board".into(),
+            },
+            api_server: "http://evalai".into(),
+            challenge: 1,
+            split: "leaderboard".into(),
+            token: Arc::new(Token::parse("x").unwrap()),
+            requests_per_minute: 54,
+            sweep: Duration::from_mins(1),
+            period: Duration::from_secs(10),
+            phases: phases.into(),
+            labels: labels.iter().map(|label| (*label).to_owned()).collect(),
+            inbox: None,
+            is_observed: false,
+            since: Timestamp::UNIX_EPOCH,
+        }
+    }
+
+    fn catalog(codename: Option<&str>) -> Catalog {
+        let split = |phase, dataset_split, labels: &[&str]| Split {
+            phase,
+            dataset_split,
+            schema: Schema {
+                labels: labels.iter().map(|label| (*label).to_owned()).collect(),
+            },
+        };
+        Catalog {
+            at: Timestamp::UNIX_EPOCH,
+            phases: [(1, false), (2, true)]
+                .map(|(id, shows_partial)| Phase { id, shows_partial })
+                .into(),
+            splits: vec![split(1, 10, &["A", "B"]), split(2, 11, &["A", "B", "C"])],
+            codenames: [(10, codename.map(str::to_owned)), (11, None)].into(),
+        }
+    }
+
+    #[test]
+    fn what_fits_is_ok_and_what_does_not_is_named() {
+        let of = |phases: &[i64], labels: &[&str], codename| compare(&target(phases, labels), &catalog(codename));
+        assert_eq!(of(&[1], &["A", "B"], Some("leaderboard")).problems, []);
+        assert_eq!(
+            of(&[1], &["A", "B"], None).problems,
+            [],
+            "a phase's only leaderboard is taken"
+        );
+        let unsent = Misfit::Unsent {
+            phase: 2,
+            labels: vec!["C".into()],
+        };
+        let found = of(&[1, 2], &["A", "B"], Some("leaderboard"));
+        assert!(found.ok() && found.problems == [unsent], "{found:?}");
+        for (phases, labels, codename, text) in [
+            (
+                &[3][..],
+                &["A", "B"][..],
+                Some("leaderboard"),
+                "challenge 1 has no phase 3",
+            ),
+            (
+                &[1],
+                &["A", "B"],
+                Some("test"),
+                "no leaderboard for the split leaderboard",
+            ),
+            (&[1], &["A", "B", "D", "E"], Some("leaderboard"), "has no D, E"),
+        ] {
+            let found = of(phases, labels, codename);
+            assert!(!found.ok() && found.problems[0].to_string().contains(text), "{found:?}");
+        }
+    }
+}

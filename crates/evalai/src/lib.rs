@@ -1,0 +1,37 @@
+//! EvalAI: what it shows of submissions, and what is written there, within a budget of requests.
+//!
+//! The controller calls [`Hub`] only, which never waits: a [`DesiredUpdate`] goes in, a [`SubmissionState`] comes out, a channel
+//! reports what has changed. Behind it each token of a namespace has one `task` that carries out what `queue` decides; a request
+//! carries the token of its own Leaderboard, and no other. The rules of what may
+//! be written over what are in [`guard`], and nowhere else. This crate knows no Kubernetes object: a [`Key`] is only handed
+//! back.
+
+pub mod answer;
+pub mod budget;
+pub mod client;
+mod files;
+pub mod guard;
+mod http;
+pub mod hub;
+mod job_names;
+pub mod labels;
+mod payload;
+pub mod queue;
+pub mod reach;
+pub mod request;
+pub mod row;
+mod task;
+pub mod token;
+pub mod types;
+
+pub use http::{ClientError, Timeouts};
+pub use hub::{Hub, Options};
+pub use labels::{Labels, Misfit};
+pub use leaderboard_api::evalai_status::{Outcome, Progress, Status};
+pub use leaderboard_contract::report::Patience;
+pub use queue::Timing;
+pub use row::Row;
+pub use types::{
+    Changed, DesiredUpdate, Ended, ImageAnswer, InboxTrouble, Key, Outline, Payload, PayloadProblem, PayloadReader,
+    Publisher, Run, StoredResult, Subject, SubmissionState, SweepRow, Swept, Target, Usage, WriteGuard,
+};

@@ -1,0 +1,234 @@
+//! Carries out what one token's queue decides: takes requests out, sends them, brings the answers back.
+//!
+//! Started by `hub`, one for each server, namespace and token. Holds the queue's lock only for moments, never while it waits.
+
+use std::collections::HashMap;
+use std::sync::{Arc, Mutex, MutexGuard};
+use std::time::Duration;
+
+use futures::stream::{FuturesUnordered, StreamExt};
+use jiff::Timestamp;
+use tokio::sync::{Notify, Semaphore, mpsc, oneshot, watch};
+use tokio::time::Instant;
+
+use super::answer::{Answer, Silence};
+use super::client::Client;
+use super::queue::{Next, Now, PAYLOADS, Place, Queue, Ticket};
+use super::request::{Reply, Request};
+use super::types::{Changed, Key, Outline, Payload, PayloadProblem, PayloadReader, SweepRow, WriteGuard};
+use crate::token::Token;
+use leaderboard_base::lock::lock;
+
+/// How long answers are waited for at the end: longer than a write may take.
+const DRAIN: Duration = Duration::from_secs(70);
+
+/// What the hub and the task of one token share.
+pub(super) struct Shared {
+    queue: Mutex<Queue>,
+    token: Arc<Token>,
+    /// Notified of new updates and questions.
+    pub notify: Notify,
+    /// The queue's time counts from here.
+    start: Instant,
+    /// Who waits for the answers to requests that the queue makes for others, by their number.
+    waiters: Mutex<HashMap<u64, oneshot::Sender<Reply>>>,
+}
+
+/// Where changes go.
+#[derive(Clone)]
+pub(super) struct Outlets {
+    pub changed: mpsc::UnboundedSender<Changed>,
+    pub sweep: mpsc::UnboundedSender<SweepRow>,
+}
+
+impl Shared {
+    pub fn new(queue: Queue, token: Arc<Token>, start: Instant) -> Self {
+        Self {
+            queue: Mutex::new(queue),
+            token,
+            notify: Notify::new(),
+            start,
+            waiters: Mutex::default(),
+        }
+    }
+
+    /// Makes a request for another. No answer comes if the task ends before.
+    pub fn pass(&self, request: Request) -> oneshot::Receiver<Reply> {
+        let (waiter, answer) = oneshot::channel();
+        let mut waiters = lock(&self.waiters);
+        let number = self.queue().pass(request, self.now());
+        waiters.retain(|_, waiter| !waiter.is_closed());
+        waiters.insert(number, waiter);
+        drop(waiters);
+        self.notify.notify_one();
+        answer
+    }
+
+    /// The moment on the queue's clock.
+    pub fn now(&self) -> Now {
+        now(self.start)
+    }
+
+    /// The queue. A panic elsewhere leaves it whole: every change of it is one call.
+    pub fn queue(&self) -> MutexGuard<'_, Queue> {
+        lock(&self.queue)
+    }
+
+    /// Reports what has changed.
+    pub fn publish(&self, outlets: &Outlets) {
+        let (changes, sweep, answers) = {
+            let mut queue = self.queue();
+            (queue.take_changes(), queue.take_sweep(), queue.take_answers())
+        };
+        // A listener that is gone has no use for it.
+        for change in changes {
+            let _ = outlets.changed.send(change);
+        }
+        for row in sweep {
+            let _ = outlets.sweep.send(row);
+        }
+        for (number, answer) in answers {
+            if let Some(waiter) = lock(&self.waiters).remove(&number) {
+                let _ = waiter.send(answer);
+            }
+        }
+    }
+}
+
+/// The moment on a clock that began at `start`.
+pub(super) fn now(start: Instant) -> Now {
+    Now {
+        at: start.elapsed(),
+        wall: Timestamp::now(),
+    }
+}
+
+/// Reads payloads, each once there is a place for it: all queues have as many as one may hold.
+#[derive(Clone)]
+pub(super) struct Payloads {
+    places: Arc<Semaphore>,
+    reader: PayloadReader,
+}
+
+impl Payloads {
+    pub fn new(reader: PayloadReader) -> Self {
+        Self {
+            places: Arc::new(Semaphore::new(PAYLOADS)),
+            reader,
+        }
+    }
+
+    async fn read(&self, key: Key, outline: Arc<Outline>) -> (Key, Result<(Payload, Place), PayloadProblem>) {
+        let place = self.places.clone().acquire_owned().await.ok();
+        let payload = (self.reader)(outline).await;
+        (key, payload.map(|payload| (payload, place)))
+    }
+}
+
+/// What a task works with.
+pub(super) struct Task {
+    pub shared: Arc<Shared>,
+    pub client: Client,
+    pub guard: Arc<dyn WriteGuard>,
+    pub payloads: Payloads,
+    pub outlets: Outlets,
+    pub closing: watch::Receiver<bool>,
+    /// Asked when nothing is on its way: true, once, if nobody uses the token any more. Then it is not handed out again.
+    pub is_unused: Box<dyn Fn() -> bool + Send + Sync>,
+}
+
+/// Runs until `closing` turns true, or its token is no longer used. Returns whether every write is answered: only then may
+/// another process write at once.
+pub(super) async fn run(task: Task) -> bool {
+    let Task {
+        shared,
+        client,
+        guard,
+        payloads,
+        outlets,
+        mut closing,
+        is_unused,
+    } = task;
+    let (mut in_flight, mut reads) = (FuturesUnordered::new(), FuturesUnordered::new());
+    while !*closing.borrow() {
+        let wait = loop {
+            let next = shared.queue().next(shared.now(), guard.may_write());
+            match next {
+                Next::Send(ticket) => in_flight.push(send(&shared, &client, &*guard, ticket)),
+                Next::Read(key, outline) => reads.push(payloads.read(key, outline)),
+                Next::Wait(until) => break until,
+            }
+        };
+        let settled_at = shared.queue().settled_at(shared.now());
+        if in_flight.is_empty() && settled_at.is_none() && is_unused() {
+            return true;
+        }
+        let wait = wait.into_iter().chain(settled_at).min();
+        shared.publish(&outlets);
+        let until = wait.map_or_else(|| Instant::now() + Duration::from_hours(1), |at| shared.start + at);
+        tokio::select! {
+            Some((ticket, reply)) = in_flight.next(), if !in_flight.is_empty() => take(&shared, &outlets, &ticket, reply),
+            Some((key, payload)) = reads.next(), if !reads.is_empty() => {
+                shared.queue().took_payload(&key, payload, shared.now());
+            }
+            () = shared.notify.notified() => {}
+            () = tokio::time::sleep_until(until) => {}
+            _ = closing.changed() => {}
+        }
+    }
+    let answers = async {
+        while let Some((ticket, reply)) = in_flight.next().await {
+            take(&shared, &outlets, &ticket, reply);
+        }
+    };
+    lock(&shared.waiters).clear();
+    let all = tokio::time::timeout(DRAIN, answers).await.is_ok();
+    all && !shared.queue().is_unsure(shared.now())
+}
+
+/// Sends one request, unless the guard forbids writes since it was chosen, or the read of a write is too old by now. None as reply: it was
+/// not sent.
+async fn send(shared: &Shared, client: &Client, guard: &dyn WriteGuard, ticket: Ticket) -> (Ticket, Option<Reply>) {
+    let write = ticket.request.is_write();
+    let is_late = ticket.leave_by.is_some_and(|by| shared.now().at > by);
+    if write && (!guard.may_write() || is_late) {
+        return (ticket, None);
+    }
+    let started = Instant::now();
+    let reply = client.send(&shared.token, &ticket.request).await;
+    log(&ticket, &reply.answer(), started.elapsed());
+    (ticket, Some(reply))
+}
+
+fn take(shared: &Shared, outlets: &Outlets, ticket: &Ticket, reply: Option<Reply>) {
+    match reply {
+        Some(reply) => shared.queue().answered(ticket, reply, shared.now()),
+        None => shared.queue().not_sent(ticket),
+    }
+    shared.publish(outlets);
+}
+
+fn log(ticket: &Ticket, answer: &Answer<()>, took: Duration) {
+    let request = ticket.request.name();
+    let subject = ticket.request.submission();
+    let _lines = subject.map(|subject| subject.log.span().entered());
+    let milliseconds = u64::try_from(took.as_millis()).unwrap_or(u64::MAX);
+    match answer {
+        Answer::Done(()) if ticket.request.is_write() => {
+            tracing::debug!(request, milliseconds, "EvalAI has stored the update");
+        }
+        Answer::Done(()) => tracing::debug!(request, milliseconds, "EvalAI has answered"),
+        Answer::Unanswered(Silence { sent: true, why }) if ticket.request.is_write() => {
+            tracing::warn!(
+                request,
+                milliseconds,
+                why,
+                "EvalAI has not answered a write; no further write to this submission for a while"
+            );
+        }
+        other => {
+            let why = other.error().unwrap_or_default();
+            tracing::warn!(request, milliseconds, why, "EvalAI request failed");
+        }
+    }
+}

@@ -1,0 +1,516 @@
+//! What the pairs have so far: their checkpoints read, merged and rendered, and their status files.
+//!
+//! Called by `logcopy` once a round. Reads the `logs` volume through [`Tree`] and writes nothing; knows no S3. A checkpoint that
+//! is torn, gone, refused or poorer leaves the last good one in place. What is to be stored is handed out from memory, so that no torn
+//! file and no full disk comes between the results and S3. [`Plan::limits_of`] bounds the memory of all pairs together.
+
+use std::collections::BTreeMap;
+use std::path::PathBuf;
+use std::sync::Arc;
+
+use bytes::Bytes;
+use sha2::{Digest, Sha256};
+
+use super::measures;
+use crate::carla::results_format;
+use leaderboard_api::{Metric, Verify, WorkerState};
+use leaderboard_contract::keys::{EVALAI, MERGED, checkpoint_path};
+use leaderboard_contract::report::{ReportWorker, StoredFile};
+use leaderboard_contract::run::{Run, STATUS_FOLDER};
+use leaderboard_evidence::{Stamp, Tree, TreeError};
+use leaderboard_protocol::files::{KEPT_CHECKPOINT, Pair, Progress};
+use leaderboard_results::{Checkpoint, Files, Merged, Plan, Refusal, Slice, Strictness, read_worker};
+
+/// The merged file under EvalAI's name.
+const METADATA: &str = "evalai/metadata.json";
+
+/// Why a plan cannot be evaluated, and what to do.
+#[derive(thiserror::Error, Clone, Debug, PartialEq, Eq)]
+#[error("{problem}. {next_step}")]
+pub struct Refused {
+    pub problem: String,
+    pub next_step: String,
+}
+
+impl From<Refusal> for Refused {
+    fn from(refusal: Refusal) -> Self {
+        Self {
+            problem: refusal.to_string(),
+            next_step: refusal.next_step().to_owned(),
+        }
+    }
+}
+
+/// The plan of the results, from the plan of the run.
+pub fn results_plan(run: &Run) -> Result<Plan, Refusal> {
+    let slices = run.plan.slices.iter();
+    let pairs: Vec<Slice> = slices
+        .map(|slice| Slice {
+            first: slice.first,
+            last: slice.last,
+        })
+        .collect();
+    let plan = Plan {
+        format: results_format(run.plan.leaderboard_version),
+        strictness: Strictness::Pod,
+        routes: pairs.iter().map(|slice| slice.routes()).fold(0, u32::saturating_add),
+        pairs,
+        repetitions: u32::try_from(run.plan.repetitions).unwrap_or(0),
+        verify: match run.verify {
+            Verify::Disabled => leaderboard_results::Verify::Disabled,
+            Verify::Warn => leaderboard_results::Verify::Warn,
+            Verify::Refuse => leaderboard_results::Verify::Refuse,
+        },
+        as_original: false,
+    };
+    if plan.pairs.is_empty() {
+        let problem = "it has no pair".to_owned();
+        return Err(Refusal::Plan { problem });
+    }
+    plan.check()?;
+    Ok(plan)
+}
+
+/// An error if the plan of a run contradicts itself.
+pub fn check(run: &Run) -> Result<(), Refused> {
+    results_plan(run)?;
+    Ok(())
+}
+
+/// Its last whole copy, which the agent's runner keeps.
+fn kept_path(pair: Pair) -> String {
+    format!("{STATUS_FOLDER}/{}/{KEPT_CHECKPOINT}", pair.agent())
+}
+
+/// One pair, as its status files show it.
+#[derive(Clone, Copy, Debug, PartialEq, Eq)]
+pub struct PairSeen {
+    /// From its agent's folder.
+    pub agent: Progress,
+    /// From its simulator's folder.
+    pub simulator: Progress,
+}
+
+impl PairSeen {
+    fn read(status: &std::path::Path, pair: Pair) -> Self {
+        Self {
+            agent: Progress::read(status, pair.agent()),
+            simulator: Progress::read(status, pair.host()),
+        }
+    }
+
+    /// `Waiting`, `Running`, `Done` or `Crashed`; the last means between a crash and the next start.
+    pub fn state(&self) -> WorkerState {
+        match self {
+            Self { agent, .. } if agent.done => WorkerState::Done,
+            Self { agent, simulator } if agent.started || simulator.started => WorkerState::Running,
+            _ if self.crashes() > 0 => WorkerState::Crashed,
+            _ => WorkerState::Waiting,
+        }
+    }
+
+    /// Of the side that had more.
+    pub fn crashes(&self) -> u32 {
+        self.agent.crashes.max(self.simulator.crashes)
+    }
+}
+
+/// What one worker has, over the rounds.
+#[derive(Debug, Default)]
+struct Worker {
+    good: Option<Checkpoint>,
+    seen: Option<Stamp>,
+    /// The runner's copy as it was read last.
+    kept: Option<Stamp>,
+    refused: Option<String>,
+    /// Why this node can't read it at present, which says nothing about its content.
+    unreadable: Option<String>,
+}
+
+/// What reading a checkpoint gave.
+#[derive(Clone, Copy, Debug, PartialEq, Eq)]
+enum ReadOutcome {
+    /// Another good one.
+    New,
+    /// Nothing that was not known.
+    Same,
+    /// None, or half of one.
+    Unusable,
+}
+
+/// Results by their keys below the run's prefix.
+pub type Objects = BTreeMap<String, Object>;
+
+/// The results so far in numbers.
+#[derive(Clone, Debug, Default, PartialEq)]
+pub struct Summary {
+    /// Units of work done.
+    pub done: u32,
+    /// Over the units done so far; over all of them once `is_complete`.
+    pub score: Option<Metric>,
+    /// Further numbers, over the same units.
+    pub metrics: Vec<Metric>,
+    /// No unit of the plan is missing.
+    pub is_complete: bool,
+    /// Every evaluator has come to its regular end.
+    pub has_ended: bool,
+    /// The results count.
+    pub eligible: bool,
+    /// How the run ended, in the words of its evaluators.
+    pub ended_as: String,
+    /// Scores that do not follow from what was recorded, one sentence each.
+    pub warnings: Vec<String>,
+}
+
+impl From<&Merged> for Summary {
+    fn from(merged: &Merged) -> Self {
+        Self {
+            done: merged.done,
+            score: measures::score(merged),
+            metrics: measures::others(merged),
+            is_complete: merged.is_final,
+            has_ended: merged.pairs.iter().all(|pair| pair.ended),
+            eligible: merged.eligible,
+            ended_as: merged.ended_as().to_owned(),
+            warnings: merged.warnings.clone(),
+        }
+    }
+}
+
+/// What EvalAI gets as a result.
+#[derive(Clone, Debug, PartialEq, Eq)]
+pub struct Texts {
+    /// JSON of the metrics; zeros until the results are complete.
+    pub results: String,
+    /// The same with the metrics so far; `None` before the first unit, and once the results are complete.
+    pub partial_results: Option<String>,
+}
+
+/// What one round found.
+#[derive(Clone, Debug)]
+pub struct Gathered {
+    /// The last good merge; `None` before the first checkpoint.
+    pub merged: Option<Arc<Summary>>,
+    /// EvalAI's short texts, of the same merge.
+    pub texts: Arc<Texts>,
+    /// The last good checkpoints, the merged file and EvalAI's texts, as they are to be stored.
+    pub objects: Objects,
+    /// Each pair from its status files.
+    pub seen: Vec<PairSeen>,
+    /// Each pair for the report.
+    pub pairs: Vec<ReportWorker>,
+    /// Why each pair's checkpoint is refused, if it is.
+    pub refused: Vec<Option<String>>,
+    /// Each pair whose checkpoint this node can't read at present.
+    pub unreadable: Vec<bool>,
+    /// Why the checkpoints can't be merged, if they can't.
+    pub unmerged: Option<String>,
+}
+
+impl Gathered {
+    /// The first reason why something is refused; none once nothing is missing, since what came later changes nothing.
+    pub fn why(&self) -> Option<String> {
+        let first = self.refused.iter().flatten().next().or(self.unmerged.as_ref());
+        first.filter(|_| !self.is_complete()).cloned()
+    }
+
+    /// Whether nothing is missing: judged by the plan and the last good files, whatever the agents report.
+    pub fn is_complete(&self) -> bool {
+        self.unmerged.is_none() && self.merged.as_ref().is_some_and(|merged| merged.is_complete)
+    }
+
+    /// Whether every evaluator has come to its regular end. One whose simulator crashed in its last route has a record of each
+    /// and has not: it will repeat that route, as long as it is restarted.
+    pub fn has_ended(&self) -> bool {
+        self.merged.as_ref().is_some_and(|merged| merged.has_ended)
+    }
+
+    /// Digests of EvalAI's texts, by key.
+    pub fn digests(&self) -> BTreeMap<String, StoredFile> {
+        let texts = self.objects.iter().filter(|(key, _)| key.starts_with(EVALAI));
+        texts
+            .map(|(key, object)| (key.clone(), object.digest.clone()))
+            .collect()
+    }
+}
+
+/// Takes in EvalAI's texts. The merged file can be large, so it is moved: it is in memory once, under both of its keys.
+fn take_texts(objects: &mut Objects, files: Files) -> Arc<Texts> {
+    objects.insert(
+        "evalai/results.json".to_owned(),
+        Object::new(files.results_json.clone()),
+    );
+    objects.insert("evalai/stdout.txt".to_owned(), Object::new(files.stdout_txt));
+    if let Some(metadata) = files.metadata_json {
+        let merged = Object::new(metadata);
+        objects.insert(MERGED.to_owned(), merged.clone());
+        objects.insert(METADATA.to_owned(), merged);
+    }
+    Arc::new(Texts {
+        results: files.results_json,
+        partial_results: files.partial_json,
+    })
+}
+
+/// Reads the volume round by round.
+#[derive(Debug)]
+pub struct Gatherer {
+    plan: Plan,
+    tree: Arc<Tree>,
+    status: PathBuf,
+    workers: Vec<Worker>,
+    merged: Option<Arc<Summary>>,
+    texts: Arc<Texts>,
+    objects: Objects,
+    unmerged: Option<String>,
+}
+
+impl Gatherer {
+    /// For a run whose plan holds.
+    pub fn new(run: &Run, tree: Arc<Tree>) -> Result<Self, Refused> {
+        let plan = results_plan(run)?;
+        let mut objects = Objects::new();
+        let texts = take_texts(&mut objects, leaderboard_results::render(&plan, None)?);
+        Ok(Self {
+            status: tree.path().join(STATUS_FOLDER),
+            workers: plan.pairs.iter().map(|_| Worker::default()).collect(),
+            plan,
+            tree,
+            merged: None,
+            texts,
+            objects,
+            unmerged: None,
+        })
+    }
+
+    /// Removes the checkpoints of other routes, as those of before the plan was changed. None of their routes counts here, and one that is
+    /// complete would be taken for a pair with nothing left to drive.
+    pub fn remove_others(&self) -> Result<(), TreeError> {
+        for pair in Pair::first(self.workers.len()) {
+            let (path, index) = (checkpoint_path(pair), pair.index());
+            let found = match self.tree.read(&path, self.plan.limits_of(index).bytes as u64) {
+                Ok(Some((bytes, _))) => read_worker(&self.plan, index, &bytes),
+                // A round refuses it.
+                Ok(None) | Err(TreeError::TooLarge { .. }) => continue,
+                Err(error) => return Err(error),
+            };
+            if let Err(refusal) = found
+                && refusal.is_of_other_routes()
+            {
+                tracing::warn!("{refusal}: the stored checkpoint is not gone on with, and the pair begins anew");
+                self.tree.remove(&path)?;
+            }
+        }
+        Ok(())
+    }
+
+    /// Reads everything once. Blocks: not for an asynchronous thread.
+    pub fn round(&mut self) -> Gathered {
+        // The status files are read before the results: an agent that is done has written everything.
+        let pairs = Pair::first(self.workers.len());
+        let seen: Vec<PairSeen> = pairs.clone().map(|pair| PairSeen::read(&self.status, pair)).collect();
+        let mut changed = false;
+        for pair in pairs {
+            changed |= match self.read(pair) {
+                ReadOutcome::New => true,
+                ReadOutcome::Same => false,
+                ReadOutcome::Unusable => self.read_kept(pair),
+            };
+        }
+        if changed {
+            self.merge();
+        }
+        let pairs = self.pairs(&seen);
+        Gathered {
+            merged: self.merged.clone(),
+            texts: Arc::clone(&self.texts),
+            objects: self.objects.clone(),
+            pairs,
+            seen,
+            refused: self.workers.iter().map(|worker| worker.refused.clone()).collect(),
+            unreadable: self.workers.iter().map(|worker| worker.unreadable.is_some()).collect(),
+            unmerged: self.unmerged.clone(),
+        }
+    }
+
+    /// Reads one worker's checkpoint, if it is not the one of the last round.
+    fn read(&mut self, pair: Pair) -> ReadOutcome {
+        let (path, index) = (checkpoint_path(pair), pair.index());
+        let limit = self.plan.limits_of(index).bytes as u64;
+        let Some(worker) = self.workers.get_mut(index) else {
+            return ReadOutcome::Unusable;
+        };
+        let (file, stamp) = match self.tree.file(&path) {
+            Ok(Some(found)) => found,
+            Ok(None) => {
+                worker.unreadable = None;
+                return ReadOutcome::Unusable;
+            }
+            Err(error) => return worker.cannot_read(pair, &error),
+        };
+        if worker.seen == Some(stamp) {
+            worker.unreadable = None;
+            return ReadOutcome::Same;
+        }
+        drop(file);
+        let (bytes, stamp) = match self.tree.read(&path, limit) {
+            Ok(Some(read)) => read,
+            // The next round finds it whole.
+            Ok(None) | Err(TreeError::Changed) => return ReadOutcome::Unusable,
+            Err(error) => return worker.cannot_read(pair, &error),
+        };
+        worker.unreadable = None;
+        match read_worker(&self.plan, index, &bytes) {
+            Ok(None) => ReadOutcome::Unusable,
+            Ok(Some(checkpoint)) => {
+                worker.seen = Some(stamp);
+                if let Some(why) = worker.refused.take() {
+                    tracing::info!(pair = pair.get(), "the checkpoint is good again; before: {why}");
+                }
+                if !worker.take(checkpoint) {
+                    tracing::info!(
+                        pair = pair.get(),
+                        "the new checkpoint has less than the one before, which stays"
+                    );
+                    return ReadOutcome::Same;
+                }
+                self.objects.insert(path, Object::new(bytes));
+                ReadOutcome::New
+            }
+            Err(refusal) => {
+                worker.seen = Some(stamp);
+                worker.refuse_with(reason(&refusal))
+            }
+        }
+    }
+
+    /// Reads what the agent's runner has kept, when the file itself is being written: that is further than what this logcopy has
+    /// read, if its rounds are rare, or it has begun just now.
+    fn read_kept(&mut self, pair: Pair) -> bool {
+        let (path, index) = (kept_path(pair), pair.index());
+        let limit = self.plan.limits_of(index).bytes as u64;
+        let Some(worker) = self.workers.get_mut(index) else {
+            return false;
+        };
+        match self.tree.file(&path) {
+            Ok(Some((_, stamp))) if worker.kept != Some(stamp) => {}
+            _ => return false,
+        }
+        let Ok(Some((bytes, stamp))) = self.tree.read(&path, limit) else {
+            return false;
+        };
+        worker.kept = Some(stamp);
+        let Ok(Some(kept)) = read_worker(&self.plan, index, &bytes) else {
+            return false;
+        };
+        let is_taken = worker.take(kept);
+        if is_taken {
+            self.objects.insert(checkpoint_path(pair), Object::new(bytes));
+        }
+        is_taken
+    }
+
+    fn merge(&mut self) {
+        let workers: Vec<Option<&Checkpoint>> = self.workers.iter().map(|worker| worker.good.as_ref()).collect();
+        if workers.iter().all(Option::is_none) {
+            return;
+        }
+        let merged = leaderboard_results::merge(&self.plan, &workers).and_then(|merged| {
+            let files = leaderboard_results::render(&self.plan, Some(&merged))?;
+            Ok((merged, files))
+        });
+        match merged {
+            Ok((merged, files)) => {
+                self.texts = take_texts(&mut self.objects, files);
+                self.merged = Some(Arc::new(Summary::from(&merged)));
+                self.unmerged = None;
+            }
+            Err(refusal) => {
+                let reason = reason(&refusal);
+                tracing::warn!("the checkpoints are not merged: {reason}");
+                self.unmerged = Some(reason);
+            }
+        }
+    }
+
+    fn pairs(&self, seen: &[PairSeen]) -> Vec<ReportWorker> {
+        let slices = self.plan.pairs.iter().zip(&self.workers).zip(seen);
+        (1..)
+            .zip(slices)
+            .map(|(id, ((slice, worker), seen))| {
+                let total = slice.routes().saturating_mul(self.plan.repetitions);
+                let done = worker.good.as_ref().map_or(0, Checkpoint::done);
+                ReportWorker {
+                    id,
+                    done: done.min(total),
+                    total,
+                    crashes: seen.crashes(),
+                    state: seen.state(),
+                    names_crash: worker.good.as_ref().is_some_and(Checkpoint::names_crash),
+                }
+            })
+            .collect()
+    }
+}
+
+impl Worker {
+    /// Takes a checkpoint, unless it has less than the last good one. Returns whether it did.
+    fn take(&mut self, found: Checkpoint) -> bool {
+        let next = match &self.good {
+            Some(good) => found.after(good),
+            None => Some(found),
+        };
+        let is_taken = next.is_some();
+        self.good = next.or(self.good.take());
+        is_taken
+    }
+
+    fn cannot_read(&mut self, pair: Pair, error: &TreeError) -> ReadOutcome {
+        if error.is_the_writers() {
+            self.unreadable = None;
+            return self.refuse_with(format!(
+                "pair {pair}: the checkpoint can't be read: {error}. Leave it to the evaluator."
+            ));
+        }
+        let reason = format!("pair {pair}: the checkpoint can't be read on this node: {error}");
+        if self.unreadable.as_ref() != Some(&reason) {
+            tracing::warn!("{reason}. It is tried again in each round.");
+        }
+        self.unreadable = Some(reason);
+        ReadOutcome::Unusable
+    }
+
+    fn refuse_with(&mut self, reason: String) -> ReadOutcome {
+        if self.refused.as_ref() != Some(&reason) {
+            tracing::warn!("a checkpoint is refused, the last good one stays: {reason}");
+        }
+        self.refused = Some(reason);
+        ReadOutcome::Same
+    }
+}
+
+/// Which checkpoint, why, and what to do.
+fn reason(refusal: &Refusal) -> String {
+    format!("{refusal}. {}", refusal.next_step())
+}
+
+/// A result that is stored from memory. Its content is shared, never copied.
+#[derive(Clone, Debug, PartialEq, Eq)]
+pub struct Object {
+    /// Its content.
+    pub bytes: Bytes,
+    /// Size and digest of it.
+    pub digest: StoredFile,
+}
+
+impl Object {
+    /// With its digest.
+    pub fn new(bytes: impl Into<Bytes>) -> Self {
+        let bytes = bytes.into();
+        let digest = StoredFile {
+            size: bytes.len() as u64,
+            sha256: hex::encode(Sha256::digest(&bytes)),
+        };
+        Self { bytes, digest }
+    }
+}

@@ -1,0 +1,229 @@
+//! Whether a run goes on, is wound down, or has ended: a pure function of what a round found, and the little memory it needs
+//! to say for how long.
+//!
+//! Called by `logcopy`. Knows no clock but the one handed in, no file and no S3.
+
+use std::time::Duration;
+
+use super::gather::Gathered;
+use leaderboard_contract::run::Stop;
+
+/// How a run ended.
+#[derive(Clone, Debug, PartialEq, Eq)]
+pub enum Ending {
+    /// The results are complete.
+    Complete,
+    /// It was stopped from outside; the results are what there is.
+    Stopped(Stop),
+    /// A pair has come to its end with results that can't be used: why, for the participant.
+    Invalid(String),
+}
+
+impl std::fmt::Display for Ending {
+    fn fmt(&self, f: &mut std::fmt::Formatter<'_>) -> std::fmt::Result {
+        match self {
+            Self::Complete => f.write_str("the results are complete"),
+            Self::Stopped(stop) => write!(f, "the run was stopped ({})", stop.as_str()),
+            Self::Invalid(why) => write!(f, "the results can't be used: {why}"),
+        }
+    }
+}
+
+/// What logcopy does next.
+#[derive(Clone, Debug, PartialEq, Eq)]
+pub enum Step {
+    /// Nothing out of the ordinary.
+    GoOn,
+    /// Ask all containers to stop, and have another round soon.
+    Cancel,
+    /// Store the final report.
+    Finish(Ending),
+}
+
+/// What one round found, with the times since when.
+#[derive(Clone, Debug, PartialEq, Eq, Default)]
+pub struct Situation {
+    /// No route is missing.
+    pub whole: bool,
+    /// No route is missing and every evaluator has come to its regular end, for this long.
+    pub complete: Option<Duration>,
+    /// All agents report that they are done.
+    pub all_done: bool,
+    /// Some container has begun.
+    pub any_started: bool,
+    /// A stop is requested.
+    pub stop: Option<Stop>,
+    /// A pair has ended badly: why, and for how long.
+    pub spoiled: Option<(String, Duration)>,
+    /// `simulation.cancel` is there for this long.
+    pub cancelled: Option<Duration>,
+    /// The agents' folders have not changed for this long.
+    pub quiet: Duration,
+}
+
+/// What to do next.
+pub fn decide(seen: &Situation, pace: &Pace, cancel: Duration) -> Step {
+    // Who has a record of each route without a regular end will repeat the last one, if only its container comes back.
+    let settled = (seen.whole && seen.all_done) || seen.complete.is_some_and(|since| since >= pace.settle);
+    if let (true, None) = (settled, seen.stop) {
+        return Step::Finish(Ending::Complete);
+    }
+    let spoiled = seen.spoiled.as_ref().filter(|(_, since)| *since >= pace.quiet);
+    let ending = match (seen.stop, spoiled) {
+        (Some(stop), _) => Ending::Stopped(stop),
+        (None, Some((why, _))) => Ending::Invalid(why.clone()),
+        (None, None) => return Step::GoOn,
+    };
+    if settled || seen.all_done {
+        return Step::Finish(ending);
+    }
+    let Some(cancelled) = seen.cancelled else {
+        return Step::Cancel;
+    };
+    // The other half of the time is for storing.
+    let longest = pace.grace.min(cancel.checked_div(2).unwrap_or_default());
+    let is_still = cancelled.min(seen.quiet) >= pace.quiet.min(longest);
+    if !seen.any_started || is_still || cancelled >= longest {
+        Step::Finish(ending)
+    } else {
+        Step::GoOn
+    }
+}
+
+/// Remembers since when something is so.
+#[derive(Debug, Default)]
+pub struct Judge {
+    complete: Option<Duration>,
+    spoiled: Option<(String, Duration)>,
+    cancelled: Option<Duration>,
+    quiet: Duration,
+    activity: Option<u64>,
+}
+
+/// What a round hands to [`Judge::see`] besides the results.
+#[derive(Clone, Copy, Debug)]
+pub struct Outside {
+    /// A stop is requested.
+    pub stop: Option<Stop>,
+    /// `simulation.cancel` is there.
+    pub cancelled: bool,
+    /// A digest of the agents' folders: another one means that something was written.
+    pub activity: u64,
+    /// Clock of this process.
+    pub now: Duration,
+}
+
+impl Judge {
+    /// Takes in one round.
+    pub fn see(&mut self, gathered: &Gathered, outside: Outside) -> Situation {
+        let now = outside.now;
+        let whole = gathered.is_complete();
+        self.complete = (whole && gathered.has_ended()).then(|| self.complete.unwrap_or(now));
+        self.spoiled = spoiled(gathered).map(|why| {
+            let since = self.spoiled.as_ref().map_or(now, |(_, since)| *since);
+            (why, since)
+        });
+        self.cancelled = outside.cancelled.then(|| self.cancelled.unwrap_or(now));
+        if self.activity != Some(outside.activity) {
+            self.activity = Some(outside.activity);
+            self.quiet = now;
+        }
+        let since = |then: Duration| now.saturating_sub(then);
+        Situation {
+            whole,
+            complete: self.complete.map(since),
+            all_done: gathered.seen.iter().all(|pair| pair.agent.done),
+            any_started: gathered
+                .seen
+                .iter()
+                .any(|pair| pair.agent.started || pair.simulator.started),
+            stop: outside.stop,
+            spoiled: self.spoiled.clone().map(|(why, then)| (why, since(then))),
+            cancelled: self.cancelled.map(since),
+            quiet: since(self.quiet),
+        }
+    }
+}
+
+/// A pair that reports it is done without complete results will not get them any more. An agent's report alone ends
+/// nothing well: it can only end its own run badly. Nothing is known of a checkpoint that this node can't read: if that lasts, the run
+/// ends without final results, which is the infrastructure's failure.
+fn spoiled(gathered: &Gathered) -> Option<String> {
+    if gathered.is_complete() {
+        return None;
+    }
+    let ended = gathered.seen.iter().zip(&gathered.pairs).zip(&gathered.refused);
+    let readable = ended.zip(&gathered.unreadable).filter(|(_, unreadable)| !**unreadable);
+    let mut short = readable.filter(|(((seen, pair), _), _)| seen.agent.done && pair.done < pair.total);
+    if let Some((((_, pair), refused), _)) = short.next() {
+        let incomplete = || {
+            format!(
+                "pair {} ended with {} of its {} route runs. Leave the checkpoint to the evaluator.",
+                pair.id, pair.done, pair.total
+            )
+        };
+        return Some(refused.clone().unwrap_or_else(incomplete));
+    }
+    let all_done = gathered.seen.iter().all(|pair| pair.agent.done);
+    gathered.unmerged.clone().filter(|_| all_done)
+}
+
+/// How long the programs wait for what they cannot observe.
+#[derive(Clone, Copy, Debug, PartialEq, Eq)]
+pub struct Pace {
+    /// From complete results to the end, when an agent does not report that it is done.
+    pub settle: Duration,
+    /// Without a change in the agents' folders, they count as stopped.
+    pub quiet: Duration,
+    /// From a cancel to the last round, when they are never quiet: the runner's grace and a margin.
+    pub grace: Duration,
+    /// Smallest time between two rounds.
+    pub least: Duration,
+    /// Longest pause after rounds that failed.
+    pub backoff: Duration,
+    /// Shortest time that logs get in a round of a running run.
+    pub logs: Duration,
+    /// What a file that is being sent gets beyond the time for logs in a round: the next report waits that long at most.
+    pub in_air: Duration,
+    /// How long a network plugin may take until it enforces the policy of a new Pod.
+    pub enforced_within: Duration,
+}
+
+impl Default for Pace {
+    fn default() -> Self {
+        Self {
+            settle: Duration::from_secs(30),
+            quiet: Duration::from_secs(5),
+            grace: Duration::from_secs(25),
+            least: Duration::from_secs(1),
+            backoff: Duration::from_mins(1),
+            logs: Duration::from_secs(10),
+            in_air: Duration::from_mins(1),
+            enforced_within: Duration::from_mins(1),
+        }
+    }
+}
+
+impl Pace {
+    /// All times divided: for runs that take seconds.
+    #[must_use]
+    pub fn faster(self, times: u32) -> Self {
+        let part = |whole: Duration| whole.checked_div(times).unwrap_or(whole);
+        Self {
+            settle: part(self.settle),
+            quiet: part(self.quiet),
+            grace: part(self.grace),
+            least: part(self.least),
+            backoff: part(self.backoff),
+            // A network gets no faster.
+            logs: self.logs,
+            in_air: self.in_air,
+            enforced_within: part(self.enforced_within),
+        }
+    }
+}
+
+#[cfg(test)]
+mod file_tests;
+#[cfg(test)]
+mod tests;

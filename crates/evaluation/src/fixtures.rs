@@ -1,0 +1,102 @@
+//! A run and its checkpoints, for the tests of this module.
+
+use std::fs;
+use std::path::Path;
+
+use leaderboard_protocol::files::{Mark, Member, Pair, Side, StatusFile};
+
+use leaderboard_api::{Attempt, ByteQuantity, LeaderboardVersion, RouteSlice, RunPlan, Storage, Verify};
+use leaderboard_contract::run::{Run, SCHEMA, STATUS_FOLDER};
+
+/// Two pairs of two routes each, once.
+pub fn run() -> Run {
+    Run {
+        schema: SCHEMA,
+        namespace: "default".to_owned(),
+        submission: "submission-77".to_owned(),
+        uid: "uid-1".to_owned(),
+        attempt: Attempt(1),
+        plan: RunPlan {
+            run_id: "77".parse().unwrap(),
+            leaderboard_version: LeaderboardVersion::V2,
+            track: "sensors".into(),
+            codename: "SENSORS".into(),
+            phase: None,
+            slices: vec![RouteSlice { first: 0, last: 1 }, RouteSlice { first: 2, last: 3 }],
+            routes: 4,
+            repetitions: 1,
+            storage: Storage {
+                bucket: "results".to_owned(),
+                prefix: Some("2026/".to_owned()),
+                region: None,
+                endpoint: None,
+                size_limit: ByteQuantity::gibibytes(1),
+                kms_key_arn: None,
+                storage_class: None,
+            },
+            image: "image".to_owned(),
+            contents_image: "contents".into(),
+            simulator_image: "simulator".into(),
+            resume: false,
+            earlier_attempts: 0,
+            submission_uid: None,
+        },
+        verify: Verify::Disabled,
+        period_seconds: 1,
+        flush_seconds: 60,
+        cancel_seconds: 20,
+        log_group: None,
+        isolation: None,
+    }
+}
+
+/// A V2 checkpoint with the routes `first..first + done` of `total`.
+pub fn checkpoint(first: u32, done: u32, total: u32) -> String {
+    let record = |index: u32| {
+        serde_json::json!({
+            "index": index,
+            "route_id": format!("RouteScenario_{}_rep0", first + index),
+            "status": "Completed",
+            "num_infractions": 0,
+            "infractions": {"collisions_pedestrian": [], "collisions_vehicle": [], "collisions_layout": [],
+                "red_light": [], "stop_infraction": [], "outside_route_lanes": [], "min_speed_infractions": [],
+                "yield_emergency_vehicle_infractions": [], "scenario_timeouts": [], "route_dev": [],
+                "vehicle_blocked": [], "route_timeout": []},
+            "scores": {"score_route": 100.0, "score_penalty": 1.0, "score_composed": 100.0},
+            "meta": {"route_length": 100.0, "duration_game": 10.0, "duration_system": 20.0},
+        })
+    };
+    let global = if done == total {
+        serde_json::json!({"index": -1, "status": "Completed"})
+    } else {
+        serde_json::json!({})
+    };
+    let file = serde_json::json!({
+        "_checkpoint": {
+            "global_record": global,
+            "progress": [done, total],
+            "records": (0..done).map(record).collect::<Vec<_>>(),
+        },
+        "entry_status": if done == total { "Finished" } else { "Started" },
+        "eligible": done == total,
+        "sensors": ["carla_camera", "carla_gnss"],
+        "values": [],
+        "labels": [],
+    });
+    file.to_string()
+}
+
+/// Puts a checkpoint where the agent of a pair would.
+pub fn put_checkpoint(logs: &Path, pair: usize, text: &str) {
+    let folder = logs.join(format!("agent/agent{pair}"));
+    fs::create_dir_all(&folder).unwrap();
+    fs::write(folder.join("agent_results.json"), text).unwrap();
+}
+
+/// Puts a status file where the container would.
+pub fn put_status(logs: &Path, side: Side, pair: u16, mark: Mark) {
+    let pair = Pair::new(pair).unwrap();
+    let root = logs.join(STATUS_FOLDER);
+    fs::create_dir_all(&root).unwrap();
+    StatusFile::Of(Member { side, pair }, mark).create(&root).unwrap();
+}

@@ -1,0 +1,163 @@
+//! CARLA's simulators and agents: images, commands, flags, variables and mounts of a pair. Pure.
+//!
+//! What they see is the original's, version by version.
+
+use super::display;
+use super::workload::{Asked, Contents, Mount, Role, Workload};
+use crate::layout::{AGENT, CONTENTS_VOLUMES, SAVED};
+use leaderboard_api::{LeaderboardVersion, SimulatorContainer};
+use leaderboard_contract::keys::agent_folder;
+use leaderboard_contract::run::console_name;
+use leaderboard_evaluation::carla::commands::{self, Adapter};
+use leaderboard_evaluation::carla::layout::{CARLA_ROOT, LEADERBOARD_ROOT, SCENARIO_RUNNER_ROOT, python_path};
+use leaderboard_protocol::files::Pair;
+use leaderboard_protocol::graphics::Needs;
+
+const ROUTES_FILE: &str = "/workspace/leaderboard/data/routes_testing.xml";
+const SCENARIOS_FILE: &str = "/workspace/leaderboard/data/all_towns_traffic_scenarios_private.json";
+const CHECKPOINT: &str = "/tmp/agent/agent_results.json";
+const LIVE_RESULTS: &str = "/tmp/agent/live_results.txt";
+/// A server prints little; one that floods must not fill the disk. In bytes.
+const SIMULATOR_LOG_LIMIT: u64 = 64 << 20;
+
+/// Port of a pair's simulator.
+fn port(pair: Pair) -> usize {
+    2000 + 100 * pair.index()
+}
+
+/// The container with the private contents.
+pub fn contents(asked: &Asked<'_>) -> Contents {
+    let spec = &asked.spec.contents;
+    let host = commands::of_host(spec.command.as_deref(), spec.args.as_deref());
+    Contents {
+        image: asked.plan.contents_image.to_string(),
+        command: host.unwrap_or_else(commands::contents),
+    }
+}
+
+/// The simulator and the agent of a pair.
+pub fn workload(asked: &Asked<'_>, pair: Pair) -> Workload {
+    Workload {
+        host: simulator(asked, pair),
+        agent: Some(agent(asked, pair)),
+    }
+}
+
+fn simulator(asked: &Asked<'_>, pair: Pair) -> Role {
+    let (spec, deadlines) = (&asked.spec.simulator, &asked.deadlines);
+    let version = asked.plan.leaderboard_version;
+    let flags = vec![
+        format!("--port={}", port(pair)),
+        seconds("ready", deadlines.ready_seconds),
+        seconds("flush", deadlines.flush_seconds),
+        seconds("cancel", deadlines.cancel_seconds),
+        format!("--log={}/{}", SAVED, console_name(pair)),
+        format!("--log-limit={SIMULATOR_LOG_LIMIT}"),
+    ];
+    let own = Mount::Own {
+        folder: "simulator".into(),
+        path: SAVED,
+    };
+    let port = ("CARLA_PORT", port(pair).to_string());
+    Role {
+        image: asked.plan.simulator_image.to_string(),
+        flags,
+        command: commands::of_host(spec.command.as_deref(), spec.args.as_deref())
+            .unwrap_or_else(|| commands::simulator(version, adapter(spec, asked.has_gpus))),
+        env: [port].into_iter().chain(display::variables(spec, version)).collect(),
+        mounts: [own].into_iter().chain(display::sockets(spec)).collect(),
+        removes: display::removed(spec),
+        draws: Some(needs(spec, version)),
+    }
+}
+
+/// What the server draws with. Of a command of the host's that is not known.
+fn needs(spec: &SimulatorContainer, version: LeaderboardVersion) -> Needs {
+    match (&spec.command, version) {
+        (Some(_), _) => Needs::Any,
+        (None, LeaderboardVersion::V1) => Needs::OpenGl,
+        (None, LeaderboardVersion::V2) => Needs::Vulkan,
+    }
+}
+
+fn adapter(spec: &SimulatorContainer, has_gpus: bool) -> Adapter {
+    match spec.graphics_adapter {
+        Some(number) => Adapter::Numbered(number),
+        None if has_gpus => Adapter::Found,
+        None => Adapter::Unnamed,
+    }
+}
+
+fn agent(asked: &Asked<'_>, pair: Pair) -> Role {
+    let (spec, deadlines) = (&asked.spec.agent, &asked.deadlines);
+    let flags = vec![
+        format!("--work={AGENT}"),
+        format!("--checkpoint={CHECKPOINT}"),
+        seconds("ready", deadlines.ready_seconds),
+        seconds("idle", deadlines.idle_seconds),
+        format!("--log-limit={}", spec.log_size_limit.bytes()),
+        format!("--python-path={}", python_path()),
+        format!("--route-runs={}", route_runs(asked, pair)),
+    ];
+    let host = commands::of_host(spec.command.as_deref(), spec.args.as_deref());
+    let words = host.unwrap_or_else(|| commands::agent(asked.plan.leaderboard_version));
+    let own = Mount::Own {
+        folder: agent_folder(pair),
+        path: AGENT,
+    };
+    Role {
+        image: asked.plan.image.clone(),
+        flags,
+        // The runner expands these words, so that RESUME is what it is in this round.
+        command: words.iter().map(|word| commands::literal(word)).collect(),
+        env: agent_env(asked, pair),
+        mounts: CONTENTS_VOLUMES.map(Mount::Contents).into_iter().chain([own]).collect(),
+        removes: &[],
+        draws: None,
+    }
+}
+
+/// How many route runs the pair's evaluator is to drive; 0 if there were no slice for it.
+fn route_runs(asked: &Asked<'_>, pair: Pair) -> u32 {
+    let slice = asked.plan.slices.get(pair.index());
+    let repetitions = u32::try_from(asked.plan.repetitions).unwrap_or(0);
+    slice.map_or(0, |slice| slice.routes().saturating_mul(repetitions))
+}
+
+/// A flag of the runner, which counts seconds in 32 bits.
+fn seconds(what: &str, value: i64) -> String {
+    let value = value.clamp(0, u32::MAX.into());
+    format!("--{what}-seconds={value}")
+}
+
+fn agent_env(asked: &Asked<'_>, pair: Pair) -> Vec<(&'static str, String)> {
+    let (plan, track) = (asked.plan, asked.track);
+    let routes = track
+        .and_then(|track| track.routes_file.as_deref())
+        .unwrap_or(ROUTES_FILE);
+    let scenarios = track
+        .and_then(|track| track.scenarios_file.as_deref())
+        .unwrap_or(SCENARIOS_FILE);
+    let slice = plan.slices.get(pair.index());
+    let resume = if asked.resume { "1" } else { "" };
+    vec![
+        ("CARLA_PORT", port(pair).to_string()),
+        ("CARLA_TM_PORT", (port(pair) + 10).to_string()),
+        ("CHALLENGE_TRACK_CODENAME", plan.codename.to_string()),
+        ("ROUTES", routes.to_owned()),
+        ("ROUTES_SUBSET", slice.map(ToString::to_string).unwrap_or_default()),
+        ("REPETITIONS", plan.repetitions.to_string()),
+        ("RESUME", resume.to_owned()),
+        ("CHECKPOINT_ENDPOINT", CHECKPOINT.to_owned()),
+        ("RECORD_PATH", SAVED.to_owned()),
+        ("DEBUG_CHALLENGE", "0".to_owned()),
+        ("CARLA_ROOT", CARLA_ROOT.to_owned()),
+        ("SCENARIO_RUNNER_ROOT", SCENARIO_RUNNER_ROOT.to_owned()),
+        ("LEADERBOARD_ROOT", LEADERBOARD_ROOT.to_owned()),
+        match plan.leaderboard_version {
+            LeaderboardVersion::V1 => ("SCENARIOS", scenarios.to_owned()),
+            // The original's file lies in the contents, which are read-only here.
+            LeaderboardVersion::V2 => ("DEBUG_CHECKPOINT_ENDPOINT", LIVE_RESULTS.to_owned()),
+        },
+    ]
+}

@@ -1,0 +1,185 @@
+//! Which container of a Pod gets which GPU, and from where. Pure, and the only place that knows NVIDIA's names.
+//!
+//! On a node whose default runtime is NVIDIA's, the variable decides, not what was requested: an image that sets `all` has every
+//! GPU of the node. So each container without a GPU has `void`. The kubelet puts the Pod's variables behind those of a device plugin,
+//! and the last one counts: a container that requests a GPU of its own must not have the variable, or it would hide what the plugin
+//! gave.
+
+use std::collections::BTreeMap;
+
+use k8s_openapi::api::core::v1::{EnvVar, PodResourceClaim, ResourceClaim, ResourceRequirements};
+use k8s_openapi::apimachinery::pkg::api::resource::Quantity;
+use serde_json::{Value, json};
+
+use super::failed_nodes::{HOSTNAME, REQUIRED};
+use super::{JobInput, variable};
+use crate::gpu_claims::{source, template_name};
+use leaderboard_api::{GpuSource, LeaderboardSpec, names};
+use leaderboard_protocol::files::{Member, Pair, Side};
+use leaderboard_protocol::graphics::{INDEX, Needs};
+
+const DEVICES: &str = "NVIDIA_VISIBLE_DEVICES";
+const CAPABILITIES: &str = "NVIDIA_DRIVER_CAPABILITIES";
+const NO_DEVICE: &str = "void";
+/// What the resources of NVIDIA's device plugin begin with: whole GPUs, shared ones, MIG slices.
+const RESOURCES: &str = "nvidia.com/";
+/// The variables of a container of a pair.
+pub(super) fn variables(source: GpuSource<'_>, member: Member) -> Vec<EnvVar> {
+    let index = member.pair.index().to_string();
+    let devices = match source {
+        // `hide` decides, by what the finished container requests.
+        GpuSource::None => return Vec::new(),
+        GpuSource::PerContainer(_) => None,
+        GpuSource::NodeIndex(_) => Some(index.as_str()),
+        // The devices come by CDI, past this variable.
+        GpuSource::Claim(_) => Some(NO_DEVICE),
+    };
+    let devices = devices.map(|devices| variable(DEVICES, devices));
+    let index = (member.side == Side::Host).then(|| variable(INDEX, &index));
+    devices
+        .into_iter()
+        .chain([variable(CAPABILITIES, "all")])
+        .chain(index)
+        .collect()
+}
+
+/// What a container of a pair requests, with its GPU.
+pub(super) fn resources(
+    source: GpuSource<'_>,
+    member: Member,
+    hosts: Option<ResourceRequirements>,
+) -> Option<ResourceRequirements> {
+    let is_requested = |mut resources: ResourceRequirements, resource: &str| {
+        let limits = resources.limits.get_or_insert_with(BTreeMap::new);
+        limits.insert(resource.to_owned(), Quantity("1".into()));
+        Some(resources)
+    };
+    match (source, member.side) {
+        (GpuSource::None, _) | (GpuSource::NodeIndex(_), Side::Agent) => hosts,
+        (GpuSource::PerContainer(resource), _) | (GpuSource::NodeIndex(resource), Side::Host) => {
+            is_requested(hosts.unwrap_or_default(), resource)
+        }
+        (GpuSource::Claim(_), _) => {
+            let mut resources = hosts.unwrap_or_default();
+            resources.claims.get_or_insert_with(Vec::new).push(ResourceClaim {
+                name: claim_name(member.pair),
+                request: None,
+            });
+            Some(resources)
+        }
+    }
+}
+
+/// One claim for each pair, which its two containers share.
+pub(super) fn claims(input: &JobInput<'_>) -> Option<Vec<PodResourceClaim>> {
+    let GpuSource::Claim(claim) = source(input.spec()) else {
+        return None;
+    };
+    let leaderboard = input.leaderboard.metadata.name.as_deref().unwrap_or_default();
+    let template = template_name(leaderboard, claim);
+    let of_pair = |pair| PodResourceClaim {
+        name: claim_name(pair),
+        resource_claim_name: None,
+        resource_claim_template_name: Some(template.clone()),
+    };
+    Some(Pair::first(input.pairs()).map(of_pair).collect())
+}
+
+fn claim_name(pair: Pair) -> String {
+    format!("gpu-{pair}")
+}
+
+/// Flags of the runner: what it checks before it starts its command, which is nothing where the operator gives no GPU. By its index the
+/// agent has one only if the node's runtime obeys the variable, and else it would be charged for the lack of it: it reports to its host.
+pub(super) fn flags(source: GpuSource<'_>, side: Side, draws: Option<Needs>) -> impl Iterator<Item = String> {
+    let own = draws.filter(|_| source != GpuSource::None);
+    let of_agent = is_by_index(source).then(|| match side {
+        Side::Host => "--agent-gpu=true".to_owned(),
+        Side::Agent => "--report-gpu=true".to_owned(),
+    });
+    own.map(|needs| format!("--gpu={needs}")).into_iter().chain(of_agent)
+}
+
+fn is_by_index(source: GpuSource<'_>) -> bool {
+    matches!(source, GpuSource::NodeIndex(_))
+}
+
+/// Hides the node's GPUs from a container that neither requests one nor has the variable. It comes first, so that the container's
+/// other variables can refer to it.
+pub(super) fn hide(container: &mut Value, source: GpuSource<'_>) {
+    if !requested(container, source).is_empty() {
+        return;
+    }
+    let Some(container) = container.as_object_mut() else {
+        return;
+    };
+    let env = container.entry("env").or_insert_with(|| json!([]));
+    if let Some(env) = env.as_array_mut()
+        && env.iter().all(|variable| variable["name"] != DEVICES)
+    {
+        env.insert(0, json!({"name": DEVICES, "value": NO_DEVICE}));
+    }
+}
+
+/// Names of the GPUs that a container requests of a device plugin.
+fn requested<'a>(container: &'a Value, source: GpuSource<'_>) -> Vec<&'a str> {
+    let is_none = |amount: &Value| amount.is_null() || *amount == json!("0") || *amount == json!(0);
+    let lists = ["requests", "limits"].map(|list| container["resources"][list].as_object());
+    let named = lists.into_iter().flatten().flatten();
+    let named = named.filter(|(name, amount)| is_gpu(name, source) && !is_none(amount));
+    named.map(|(name, _)| name.as_str()).collect()
+}
+
+/// Whether a resource is a GPU.
+pub(super) fn is_gpu(resource: &str, source: GpuSource<'_>) -> bool {
+    let own = match source {
+        GpuSource::PerContainer(own) | GpuSource::NodeIndex(own) => Some(own),
+        GpuSource::None | GpuSource::Claim(_) => None,
+    };
+    resource.starts_with(RESOURCES) || Some(resource) == own
+}
+
+/// Why it is not clear which container of a finished template is meant to have which GPU. A resource that a container of a pair names
+/// is its own alone: without `gpu` the other one would have none, and with a claim the pair would take two.
+pub fn unclear(spec: &LeaderboardSpec, template: &Value) -> Option<String> {
+    let source = source(spec);
+    let containers = template["spec"]["containers"].as_array()?;
+    let mut of_pairs = containers.iter().filter(|container| member(container).is_some());
+    let (container, resource) =
+        of_pairs.find_map(|container| Some((container["name"].as_str()?, *requested(container, source).first()?)))?;
+    match (&spec.gpu, source) {
+        (None, _) => Some(format!(
+            "{container} requests {resource} and the Leaderboard has no field gpu, so it is not known what the other container of the \
+             pair is to have. Set gpu.resourceName: {resource} and remove it from resources; or set gpu.mode: None, and only the \
+             containers that request a GPU themselves have one."
+        )),
+        (Some(_), GpuSource::Claim(_)) => Some(format!(
+            "{container} requests {resource} of a device plugin, and gpu.mode is Claim: a pair would take two GPUs. Remove {resource} from \
+             resources and podOverrides."
+        )),
+        (Some(_), GpuSource::None | GpuSource::PerContainer(_) | GpuSource::NodeIndex(_)) => None,
+    }
+}
+
+/// The container of a pair, by its name.
+pub(super) fn member(container: &Value) -> Option<Member> {
+    Member::parse(container["name"].as_str()?)
+}
+
+/// Keeps a Pod whose pairs know their GPU by its index away from nodes with another submission's Pod, whatever its namespace. It comes
+/// after the overlay, whose lists would take the place of these.
+pub(super) fn place(pod: &mut Value, source: GpuSource<'_>) {
+    if !is_by_index(source) {
+        return;
+    }
+    let others = json!({
+        "topologyKey": HOSTNAME,
+        "namespaceSelector": {},
+        "labelSelector": {"matchExpressions": [{"key": names::LABEL_SUBMISSION, "operator": "Exists"}]},
+    });
+    let terms = &mut pod["affinity"]["podAntiAffinity"][REQUIRED];
+    match terms.as_array_mut() {
+        Some(terms) => terms.push(others),
+        None => *terms = json!([others]),
+    }
+}

@@ -1,0 +1,178 @@
+//! How many GPUs a Pod takes from its node. Pure: read off what the host requests, as the scheduler does.
+
+use leaderboard_protocol::files::Pair;
+use serde_json::{Value, json};
+
+use super::{gpu, pairs};
+use crate::gpu_claims::source;
+use crate::overlay as pod_overlay;
+use leaderboard_api::{GpuSource, LeaderboardSpec, RunPlan, Track};
+
+/// GPUs that the Pod of a plan requests or claims; shares of GPUs and MIG slices count as one each.
+pub fn gpus(spec: &LeaderboardSpec, track: Option<&Track>, plan: &RunPlan) -> i64 {
+    let source = source(spec);
+    let of_worker = |worker: Pair| {
+        [worker.host(), worker.agent()].map(|member| {
+            let hosts = spec.given(track, pairs::part(member.side)).resources;
+            let resources = gpu::resources(source, member, hosts);
+            json!({"name": member.to_string(), "resources": resources})
+        })
+    };
+    let containers: Vec<Value> = Pair::first(plan.workers()).flat_map(of_worker).collect();
+    let mut template = json!({"spec": {"containers": containers}});
+    let overlay = spec.pod_overrides.as_ref();
+    if let Some(overlay) = overlay.filter(|pod| pod_overlay::validate_overlay(pod).is_ok()) {
+        pod_overlay::apply(&mut template, overlay);
+    }
+    let containers = template.pointer("/spec/containers").and_then(Value::as_array);
+    let each = containers
+        .into_iter()
+        .flatten()
+        .map(|container| requested(&container["resources"], source));
+    each.fold(claimed(source, plan), i64::saturating_add)
+}
+
+/// One device for each worker.
+fn claimed(source: GpuSource<'_>, plan: &RunPlan) -> i64 {
+    match source {
+        GpuSource::Claim(_) => i64::try_from(plan.workers()).unwrap_or(i64::MAX),
+        GpuSource::None | GpuSource::PerContainer(_) | GpuSource::NodeIndex(_) => 0,
+    }
+}
+
+/// What a container requests of GPUs: the limit of such a resource is its request.
+fn requested(resources: &Value, source: GpuSource<'_>) -> i64 {
+    let of_list = |list: &str| {
+        let named = resources[list].as_object().into_iter().flatten();
+        let amounts = named
+            .filter(|(name, _)| gpu::is_gpu(name, source))
+            .map(|(_, amount)| amount.as_i64().or_else(|| amount.as_str()?.parse().ok()).unwrap_or(0));
+        amounts.fold(0, |sum: i64, amount: i64| sum.saturating_add(amount.max(0)))
+    };
+    of_list("limits").max(of_list("requests"))
+}
+
+#[cfg(test)]
+mod tests {
+    use serde_json::json;
+
+    use super::*;
+    use leaderboard_api::effective;
+
+    /// GPUs of a Leaderboard of four pairs with these fields.
+    fn counted(fields: &Value) -> i64 {
+        let mut spec = json!({
+            "tracks": [{"name": "sensors", "codename": "SENSORS"}],
+            "leaderboardVersion": "V2",
+            "contents": {"image": "contents:1"},
+            "simulator": {},
+            "agent": {},
+            "pairs": 4,
+            "routes": 20,
+            "storage": {"bucket": "results"},
+        });
+        for (name, value) in fields.as_object().unwrap() {
+            spec[name] = value.clone();
+        }
+        spec["simulator"]["image"] = json!("simulator:1");
+        let spec: LeaderboardSpec = serde_json::from_value(spec).unwrap();
+        let track = spec.tracks[0].clone();
+        let plan = effective::plan(&spec, &track, "77".parse().unwrap(), "a:1".into(), false);
+        gpus(&spec, Some(&track), &plan)
+    }
+
+    /// What a container with one GPU asks for.
+    fn one() -> Value {
+        json!({"limits": {"nvidia.com/gpu": "1", "cpu": "4"}})
+    }
+
+    #[test]
+    fn gpus_are_counted_as_they_are_requested() {
+        let cases = [
+            ("nothing is requested", json!({}), 0),
+            (
+                "one for each container",
+                json!({"gpu": {"resourceName": "nvidia.com/gpu"}}),
+                8,
+            ),
+            (
+                "one for both of a pair",
+                json!({"gpu": {"mode": "NodeIndex", "resourceName": "nvidia.com/gpu"}}),
+                4,
+            ),
+            ("another vendor's", json!({"gpu": {"resourceName": "amd.com/gpu"}}), 8),
+            (
+                "one claim for each pair",
+                json!({"gpu": {"mode": "Claim", "claim": {"deviceClassName": "gpu.nvidia.com"}}}),
+                4,
+            ),
+            ("one a simulator", json!({"simulator": {"resources": one()}}), 4),
+            (
+                "as a number",
+                json!({"simulator": {"resources": {"requests": {"nvidia.com/gpu": 1}}}}),
+                4,
+            ),
+            (
+                "limits and requests are one",
+                json!({"simulator": {"resources":
+                {"limits": {"nvidia.com/gpu": "1"}, "requests": {"nvidia.com/gpu": "1"}}}}),
+                4,
+            ),
+            (
+                "both sides",
+                json!({"simulator": {"resources": one()}, "agent": {"resources": one()}}),
+                8,
+            ),
+            (
+                "a track of its own",
+                json!({"tracks": [{"name": "sensors", "codename": "S", "simulator": {"resources": one()}}]}),
+                4,
+            ),
+            (
+                "slices",
+                json!({"simulator": {"resources": {"limits": {"nvidia.com/mig-1g.5gb": "2"}}}}),
+                8,
+            ),
+            (
+                "other resources",
+                json!({"simulator": {"resources": {"limits": {"cpu": "2"}}}}),
+                0,
+            ),
+        ];
+        for (what, fields, expected) in cases {
+            assert_eq!(counted(&fields), expected, "{what}");
+        }
+    }
+
+    #[test]
+    fn an_overlay_changes_what_is_requested() {
+        let one_each = || json!({"resources": one()});
+        let overlay = |container: Value| json!({"spec": {"containers": [container]}});
+        let three = json!({"name": "simulator-1", "resources": {"limits": {"nvidia.com/gpu": "3"}}});
+        let cases = [
+            ("another number for one pair", one_each(), three, 6),
+            (
+                "without a GPU",
+                one_each(),
+                json!({"name": "simulator-1", "env": []}),
+                4,
+            ),
+            (
+                "for all agents",
+                json!({}),
+                json!({"name": "agent", "resources": one()}),
+                4,
+            ),
+            (
+                "none for any simulator",
+                one_each(),
+                json!({"name": "simulator", "resources": null}),
+                0,
+            ),
+        ];
+        for (what, simulator, container, expected) in cases {
+            let fields = json!({"simulator": simulator, "podOverrides": overlay(container)});
+            assert_eq!(counted(&fields), expected, "{what}");
+        }
+    }
+}

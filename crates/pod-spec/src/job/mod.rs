@@ -1,0 +1,369 @@
+//! The Job of one attempt: names, labels, deadlines, volumes, and which container gets what.
+//!
+//! Pure: no client, no clock, no error. Called by the controller when an attempt starts, and for the dry run that checks a
+//! Leaderboard. It owns everything the Pod is made of; what the containers then do is in `pod` and in the runner.
+
+mod carla;
+mod disk;
+mod display;
+mod failed_nodes;
+mod gpu;
+mod gpu_count;
+mod init;
+mod own_uid;
+mod pairs;
+mod security;
+mod volumes;
+pub mod workload;
+
+#[cfg(test)]
+mod command_tests;
+#[cfg(test)]
+mod container_tests;
+#[cfg(test)]
+mod gpu_tests;
+#[cfg(test)]
+mod hardening_tests;
+#[cfg(test)]
+mod tests;
+
+use std::collections::BTreeMap;
+use std::time::Duration;
+
+pub use gpu::unclear;
+use jiff::Timestamp;
+use k8s_openapi::api::batch::v1::{Job, JobSpec};
+use k8s_openapi::api::core::v1::{EnvVar, PodSpec, PodTemplateSpec, Toleration};
+use k8s_openapi::apimachinery::pkg::apis::meta::v1::ObjectMeta;
+use kube::api::{DynamicObject, TypeMeta};
+use serde_json::Value;
+
+use crate::gpu_claims::source;
+use crate::layout::ANNOTATION_SKIP_CONTAINERS;
+use crate::overlay as pod_overlay;
+use crate::owner::owner_reference;
+pub use gpu_count::gpus;
+use leaderboard_api::{
+    Attempt, Deadlines, Enforcement, FailedNode, GpuSource, JobNumber, Leaderboard, LeaderboardSpec, PolicySource,
+    RunPlan, Submission, Track, conditions, effective, names, reasons,
+};
+use leaderboard_contract::run::{Isolation, Run, SCHEMA};
+use workload::Asked;
+
+/// Seconds the containers have between SIGTERM and SIGKILL: the agents' 20 s, then logcopy's last upload.
+const GRACE_SECONDS: i64 = 600;
+/// Seconds a Pod stays on a node that is not ready or not reachable; Kubernetes' own default is 300.
+const LOST_NODE_SECONDS: i64 = 60;
+/// What the net under all deadlines allows beyond their sum, in seconds.
+const NET_SECONDS: i64 = 1800;
+/// Restarts beyond those of the pairs that do not end the Job: `contents`, `workspace` and `logcopy` count too.
+const SPARE_RESTARTS: i32 = 20;
+/// A policy that a Pod has found not to be enforced is taken for such so long; after that each Pod waits its full time again.
+const KNOWN_OPEN_FOR: Duration = Duration::from_hours(1);
+
+/// The operator's own image, with `workspace` and `logcopy` in it, and what of its environment their containers get.
+#[derive(Clone, Debug, Default)]
+pub struct OwnImage {
+    pub image: String,
+    pub pull_policy: Option<String>,
+    /// AWS region.
+    pub region: Option<String>,
+    /// When S3 is sent checksums.
+    pub checksums: Option<String>,
+}
+
+/// What a Job is built from.
+#[derive(Clone, Copy, Debug)]
+pub struct JobInput<'a> {
+    /// Whose attempt it is; name, namespace and UID are used.
+    pub submission: &'a Submission,
+    /// How it is run.
+    pub leaderboard: &'a Leaderboard,
+    /// What is run, pinned at acceptance.
+    pub plan: &'a RunPlan,
+    /// Which Job it is.
+    pub number: JobNumber,
+    pub own: &'a OwnImage,
+    /// Nodes that have failed earlier Jobs of the attempt.
+    pub failed_nodes: &'a [FailedNode],
+    /// When it is made.
+    pub now: Timestamp,
+}
+
+impl JobInput<'_> {
+    fn spec(&self) -> &LeaderboardSpec {
+        &self.leaderboard.spec
+    }
+
+    fn deadlines(&self) -> Deadlines {
+        effective::deadlines(self.spec(), self.track())
+    }
+
+    fn asked(&self) -> Asked<'_> {
+        Asked {
+            spec: self.spec(),
+            track: self.track(),
+            plan: self.plan,
+            deadlines: self.deadlines(),
+            resume: is_resumed(self),
+            has_gpus: source(self.spec()) != GpuSource::None,
+        }
+    }
+
+    fn pairs(&self) -> usize {
+        self.plan.workers()
+    }
+
+    fn submission_name(&self) -> &str {
+        self.submission.metadata.name.as_deref().unwrap_or_default()
+    }
+
+    /// The track; `None` if an edit of the Leaderboard has taken it away since.
+    fn track(&self) -> Option<&Track> {
+        self.spec().tracks.iter().find(|track| track.name == self.plan.track)
+    }
+}
+
+/// The Job as it is created: ours, with the Leaderboard's `podOverrides` laid over its template. As JSON, since newer Pod fields
+/// survive there.
+///
+/// An overlay that `pod_overlay::validate_overlay` refuses is not applied at all, so that nothing gets around its rules.
+pub fn build_object(input: &JobInput<'_>) -> DynamicObject {
+    // Maps with text as keys and finite numbers always become JSON.
+    let mut spec = serde_json::to_value(ours(input)).unwrap_or_default();
+    let template = &mut spec["template"];
+    let overlay = input.spec().pod_overrides.as_ref();
+    if let Some(overlay) = overlay.filter(|pod| pod_overlay::validate_overlay(pod).is_ok()) {
+        pod_overlay::apply(template, overlay);
+    }
+    settle(template, input);
+    skip_strangers(template);
+    DynamicObject {
+        types: Some(TypeMeta::resource::<Job>()),
+        metadata: metadata(input),
+        // A value as it is: `json!` would copy all of it.
+        data: Value::Object([("spec".to_owned(), spec)].into_iter().collect()),
+    }
+}
+
+/// What the Pod receives as `LEADERBOARD_RUN`.
+fn run_document(input: &JobInput<'_>) -> Run {
+    let unsigned = |seconds: i64| u64::try_from(seconds).unwrap_or_default();
+    let (spec, meta) = (input.spec(), &input.submission.metadata);
+    Run {
+        schema: SCHEMA,
+        namespace: meta.namespace.clone().unwrap_or_default(),
+        submission: input.submission_name().to_owned(),
+        uid: input
+            .plan
+            .submission_uid
+            .clone()
+            .or_else(|| meta.uid.clone())
+            .unwrap_or_default(),
+        attempt: input.number.attempt,
+        plan: input.plan.clone(),
+        verify: spec.verify,
+        period_seconds: unsigned(spec.sync_period_seconds),
+        flush_seconds: unsigned(spec.deadlines.flush_seconds),
+        cancel_seconds: unsigned(spec.deadlines.cancel_seconds),
+        log_group: spec.log_group.clone(),
+        isolation: isolation(input.leaderboard, input.now),
+    }
+}
+
+/// How the Pod measures whether its policy is enforced. What policies of the cluster's own forbid is not known.
+fn isolation(leaderboard: &Leaderboard, now: Timestamp) -> Option<Isolation> {
+    let network = &leaderboard.spec.network;
+    if network.policy == PolicySource::External || network.enforcement == Enforcement::Disabled {
+        return None;
+    }
+    let is_open = leaderboard.condition(conditions::ISOLATED).is_some_and(|found| {
+        let age = now.duration_since(found.last_transition_time.0).unsigned_abs();
+        found.reason == reasons::NOT_ENFORCED
+            && found.observed_generation == leaderboard.metadata.generation
+            && age < KNOWN_OPEN_FOR
+    });
+    Some(Isolation {
+        enforcement: network.enforcement,
+        probe: network.probe.clone(),
+        egress: network.egress.iter().map(|egress| egress.cidr.clone()).collect(),
+        // A run that must not go on is given every chance.
+        is_known_open: is_open && network.enforcement == Enforcement::Warn,
+    })
+}
+
+fn ours(input: &JobInput<'_>) -> JobSpec {
+    JobSpec {
+        completions: Some(1),
+        parallelism: Some(1),
+        backoff_limit: Some(backoff_limit(input)),
+        // The default starts the next Pod while the old one still writes.
+        pod_replacement_policy: Some("Failed".into()),
+        ttl_seconds_after_finished: Some(input.spec().job_seconds()),
+        template: template(input),
+        ..JobSpec::default()
+    }
+}
+
+fn metadata(input: &JobInput<'_>) -> ObjectMeta {
+    ObjectMeta {
+        name: Some(names::job(input.submission_name(), input.number)),
+        namespace: input.submission.metadata.namespace.clone(),
+        labels: Some(labels(input)),
+        annotations: Some(BTreeMap::from([(
+            names::ANNOTATION_RETRY.into(),
+            input.number.retry.to_string(),
+        )])),
+        owner_references: Some(vec![owner_reference(input.submission)]),
+        ..ObjectMeta::default()
+    }
+}
+
+fn labels(input: &JobInput<'_>) -> BTreeMap<String, String> {
+    let leaderboard = input.leaderboard.metadata.name.clone().unwrap_or_default();
+    BTreeMap::from([
+        (names::LABEL_MANAGED_BY.into(), names::OPERATOR.into()),
+        (names::LABEL_SUBMISSION.into(), input.submission_name().to_owned()),
+        (names::LABEL_ATTEMPT.into(), input.number.attempt.to_string()),
+        (names::LABEL_LEADERBOARD.into(), leaderboard),
+        (names::LABEL_RUN.into(), input.plan.run_id.to_string()),
+    ])
+}
+
+/// A net only: the controller counts the crashes of each pair itself. This limit is one budget over all containers, and
+/// at it the Pod is deleted with its statuses.
+fn backoff_limit(input: &JobInput<'_>) -> i32 {
+    let pairs = i32::try_from(input.pairs()).unwrap_or(i32::MAX);
+    pairs
+        .saturating_mul(2)
+        .saturating_mul(input.spec().retries.per_worker.saturating_add(1))
+        .saturating_add(SPARE_RESTARTS)
+}
+
+/// The net for an absent controller; none without a limit on the run. It belongs to the Pod and not to the Job, whose own
+/// would count the wait for a node.
+fn active_deadline(deadlines: &Deadlines) -> Option<i64> {
+    let seconds = [
+        deadlines.pull_seconds,
+        deadlines.start_seconds,
+        deadlines.run_seconds?,
+        deadlines.cancel_seconds,
+        deadlines.flush_seconds,
+    ]
+    .into_iter()
+    .fold(NET_SECONDS, i64::saturating_add);
+    Some(seconds.min(i32::MAX.into()))
+}
+
+fn template(input: &JobInput<'_>) -> PodTemplateSpec {
+    PodTemplateSpec {
+        metadata: Some(ObjectMeta {
+            labels: Some(labels(input)),
+            // Moving a run to another node costs hours of simulation.
+            annotations: Some(BTreeMap::from([
+                ("cluster-autoscaler.kubernetes.io/safe-to-evict".into(), "false".into()),
+                ("karpenter.sh/do-not-disrupt".into(), "true".into()),
+                (names::ANNOTATION_GENERATION.into(), generation(input).to_string()),
+            ])),
+            ..ObjectMeta::default()
+        }),
+        spec: Some(pod(input)),
+    }
+}
+
+fn generation(input: &JobInput<'_>) -> i64 {
+    input.leaderboard.metadata.generation.unwrap_or_default()
+}
+
+fn pod(input: &JobInput<'_>) -> PodSpec {
+    let identity = input.spec().pod_identity.as_ref();
+    PodSpec {
+        restart_policy: Some("OnFailure".into()),
+        init_containers: Some(vec![
+            // First, since it makes the folders and the runner that the other one has.
+            init::workspace(input),
+            init::contents(input),
+            init::logcopy(input),
+        ]),
+        containers: pairs::all(input),
+        volumes: Some(volumes::all(input)),
+        active_deadline_seconds: active_deadline(&input.deadlines()),
+        termination_grace_period_seconds: Some(GRACE_SECONDS),
+        service_account_name: identity.and_then(|identity| identity.service_account_name.clone()),
+        automount_service_account_token: Some(false),
+        enable_service_links: Some(false),
+        share_process_namespace: Some(false),
+        priority_class_name: input.track().and_then(|track| track.priority_class_name.clone()),
+        runtime_class_name: input.spec().runtime_class_name.clone(),
+        resource_claims: gpu::claims(input),
+        node_selector: Some(node_selector(input)),
+        tolerations: Some(tolerations(input)),
+        ..PodSpec::default()
+    }
+}
+
+/// Participants' images, and CARLA's, are for one kind of machine. A track can choose another.
+fn node_selector(input: &JobInput<'_>) -> BTreeMap<String, String> {
+    let mut nodes = BTreeMap::from([("kubernetes.io/arch".into(), "amd64".into())]);
+    nodes.extend(
+        input
+            .track()
+            .map(|track| track.node_selector.clone())
+            .unwrap_or_default(),
+    );
+    nodes
+}
+
+fn tolerations(input: &JobInput<'_>) -> Vec<Toleration> {
+    let lost_node = ["not-ready", "unreachable"].map(|what| Toleration {
+        key: Some(format!("node.kubernetes.io/{what}")),
+        operator: Some("Exists".into()),
+        effect: Some("NoExecute".into()),
+        toleration_seconds: Some(LOST_NODE_SECONDS),
+        ..Toleration::default()
+    });
+    let track = input.track().map(|track| track.tolerations.clone()).unwrap_or_default();
+    lost_node.into_iter().chain(track).collect()
+}
+
+/// What depends on all that the host says: filled in where nothing is said, in the containers of the overlay too.
+fn settle(template: &mut Value, input: &JobInput<'_>) {
+    let pod = &mut template["spec"];
+    let gpus = source(input.spec());
+    for list in ["initContainers", "containers"] {
+        for container in pod[list].as_array_mut().into_iter().flatten() {
+            gpu::hide(container, gpus);
+            pairs::settle(container, input);
+            security::settle(container);
+        }
+    }
+    gpu::place(pod, gpus);
+    failed_nodes::avoid(pod, input.failed_nodes);
+    disk::fill(pod, volumes::logs_limit(input));
+}
+
+/// Names every container but our own two for EKS, those of the overlay too.
+fn skip_strangers(template: &mut Value) {
+    let strangers: Vec<&str> = ["/spec/initContainers", "/spec/containers"]
+        .into_iter()
+        .filter_map(|list| template.pointer(list)?.as_array())
+        .flatten()
+        .filter_map(|container| container["name"].as_str())
+        .filter(|name| ![names::CONTAINER_WORKSPACE, names::CONTAINER_LOGCOPY].contains(name))
+        .collect();
+    let strangers = strangers.join(",");
+    template["metadata"]["annotations"][ANNOTATION_SKIP_CONTAINERS] = strangers.into();
+}
+
+/// A variable with a literal value: what Kubernetes would expand in it stays as it is.
+fn variable(name: &str, value: &str) -> EnvVar {
+    EnvVar {
+        name: name.into(),
+        value: Some(leaderboard_evaluation::carla::commands::literal(value)),
+        value_from: None,
+    }
+}
+
+fn is_resumed(input: &JobInput<'_>) -> bool {
+    input.plan.resume || input.number.attempt > Attempt::FIRST
+}

@@ -1,0 +1,110 @@
+//! The two containers of each worker: strangers' images behind our runner. Pure.
+
+use k8s_openapi::api::core::v1::{Container, EnvVar};
+use serde_json::Value;
+
+use super::security::context;
+use super::workload::{Role, Workload};
+use super::{JobInput, carla, gpu, variable, volumes};
+use crate::gpu_claims::source;
+use crate::layout::{FIXED_ENV, STATUS};
+use leaderboard_api::Part;
+use leaderboard_contract::run::{RUNNER, TOOLS};
+use leaderboard_protocol::files::{Member, Pair, Side};
+
+pub(super) fn workload(input: &JobInput<'_>, pair: Pair) -> Workload {
+    carla::workload(&input.asked(), pair)
+}
+
+fn role(input: &JobInput<'_>, member: Member) -> Option<Role> {
+    let workload = workload(input, member.pair);
+    match member.side {
+        Side::Host => Some(workload.host),
+        Side::Agent => workload.agent,
+    }
+}
+
+/// The hosts' containers of all workers, then the agents'.
+pub(super) fn all(input: &JobInput<'_>) -> Vec<Container> {
+    let pairs = Pair::first(input.pairs());
+    let members = pairs.clone().map(Pair::host).chain(pairs.map(Pair::agent));
+    members
+        .filter_map(|member| Some(container(input, member, role(input, member)?)))
+        .collect()
+}
+
+fn container(input: &JobInput<'_>, member: Member, role: Role) -> Container {
+    let (gpus, name) = (source(input.spec()), member.to_string());
+    let hosts = input.spec().given(input.track(), part(member.side));
+    let env = role.env.iter().map(|(name, value)| variable(name, value));
+    let env = env.chain(gpu::variables(gpus, member)).collect();
+    let flags = role.flags.into_iter().chain(gpu::flags(gpus, member.side, role.draws));
+    Container {
+        image: Some(role.image),
+        // Kubernetes asks for `latest` anew before each container: a worker, or a restart, could get another image.
+        image_pull_policy: (member.side == Side::Agent).then(|| "IfNotPresent".into()),
+        command: Some(behind_runner(member, flags, role.command)),
+        env: Some(merged(env, hosts.env)),
+        resources: gpu::resources(gpus, member, hosts.resources),
+        security_context: Some(context(hosts.security)),
+        volume_mounts: Some(volumes::of_member(input, member, &role.mounts)),
+        name,
+        ..Container::default()
+    }
+}
+
+pub(super) fn part(side: Side) -> Part {
+    match side {
+        Side::Host => Part::Host,
+        Side::Agent => Part::Agent,
+    }
+}
+
+fn behind_runner(member: Member, flags: impl IntoIterator<Item = String>, words: Vec<String>) -> Vec<String> {
+    let start = [
+        format!("{TOOLS}/{RUNNER}"),
+        member.side.name().to_owned(),
+        format!("--pair={}", member.pair),
+        format!("--status={STATUS}"),
+    ];
+    start
+        .into_iter()
+        .chain(flags)
+        .chain(["--".to_owned()])
+        .chain(words)
+        .collect()
+}
+
+/// The host's variables take the place of ours of the same name, but for those that follow from the plan.
+fn merged(mut ours: Vec<EnvVar>, hosts: &[EnvVar]) -> Vec<EnvVar> {
+    for variable in hosts
+        .iter()
+        .filter(|variable| !FIXED_ENV.contains(&variable.name.as_str()))
+    {
+        match ours.iter_mut().find(|known| known.name == variable.name) {
+            Some(known) => known.clone_from(variable),
+            None => ours.push(variable.clone()),
+        }
+    }
+    ours
+}
+
+/// Takes variables of its image from a container. A Pod cannot remove a variable, so the runner does; what the host sets stays.
+pub(super) fn settle(container: &mut Value, input: &JobInput<'_>) {
+    let Some(role) = gpu::member(container).and_then(|member| role(input, member)) else {
+        return;
+    };
+    let env = container["env"].as_array().map(Vec::as_slice).unwrap_or_default();
+    let is_set = |name: &&&str| env.iter().any(|variable| variable["name"] == **name);
+    let removed: Vec<&str> = role.removes.iter().filter(|name| !is_set(name)).copied().collect();
+    if removed.is_empty() {
+        return;
+    }
+    let flag = format!("--unset={}", removed.join(","));
+    // The first of these ends the runner's own flags.
+    if let Some(words) = container["command"].as_array_mut()
+        && let Some(end) = words.iter().position(|word| word == "--")
+    {
+        words.insert(end, flag.into());
+    }
+}

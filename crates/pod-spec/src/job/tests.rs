@@ -1,0 +1,265 @@
+//! The built Job as JSON: the committed golden files, and what must hold for every input.
+
+use std::fs;
+use std::path::PathBuf;
+
+use serde_json::{Value, json};
+
+use super::*;
+use leaderboard_api::{FailedNode, JobNumber, effective};
+
+pub(super) const OPERATOR_IMAGE: &str = "registry.example/leaderboard-operator:1";
+
+/// What a test builds a Job from.
+pub(super) struct Case {
+    pub(super) submission: Submission,
+    pub(super) leaderboard: Leaderboard,
+    pub(super) plan: RunPlan,
+    pub(super) number: JobNumber,
+    pub(super) own: OwnImage,
+    pub(super) failed_nodes: Vec<FailedNode>,
+}
+
+impl Case {
+    /// A Leaderboard with one track, `more` laid over its spec.
+    pub(super) fn new(format: &str, more: Value) -> Self {
+        let mut spec = json!({
+            "leaderboardVersion": format,
+            "tracks": [{"name": "sensors", "codename": "SENSORS"}],
+            "contents": {"image": "registry.example/contents:1"},
+            "simulator": {"image": "registry.example/carla:1"},
+            "gpu": {"resourceName": "nvidia.com/gpu"},
+            "agent": {},
+            "storage": {"bucket": "results", "prefix": "runs/", "region": "eu-west-1"},
+        });
+        let Value::Object(more) = more else { panic!("an object") };
+        for (key, value) in more {
+            spec[key] = value;
+        }
+        let leaderboard: Leaderboard = serde_json::from_value(json!({
+            "apiVersion": "leaderboard.carla.org/v1alpha1", "kind": "Leaderboard",
+            "metadata": {"name": "carla", "namespace": "challenge", "uid": "leaderboard-uid"}, "spec": spec,
+        }))
+        .unwrap();
+        let submission: Submission = serde_json::from_value(json!({
+            "apiVersion": "leaderboard.carla.org/v1alpha1", "kind": "Submission",
+            "metadata": {"name": "submission-4711", "namespace": "challenge", "uid": "submission-uid"},
+            "spec": {"leaderboardName": "carla", "evalai": {"challenge": 1, "phase": 2, "submission": 4711}},
+        }))
+        .unwrap();
+        let image = "registry.example/team@sha256:0a1b".to_owned();
+        let plan = effective::plan(
+            &leaderboard.spec,
+            &leaderboard.spec.tracks[0],
+            "4711".parse().unwrap(),
+            image,
+            false,
+        );
+        Self {
+            submission,
+            leaderboard,
+            plan,
+            number: JobNumber::first(Attempt(1)),
+            own: OwnImage {
+                image: OPERATOR_IMAGE.into(),
+                ..OwnImage::default()
+            },
+            failed_nodes: Vec::new(),
+        }
+    }
+
+    pub(super) fn input(&self) -> JobInput<'_> {
+        JobInput {
+            submission: &self.submission,
+            leaderboard: &self.leaderboard,
+            plan: &self.plan,
+            number: self.number,
+            own: &self.own,
+            failed_nodes: &self.failed_nodes,
+            now: "2026-11-01T12:00:00Z".parse().unwrap(),
+        }
+    }
+
+    pub(super) fn json(&self) -> Value {
+        serde_json::to_value(build_object(&self.input())).unwrap()
+    }
+}
+
+pub(super) fn containers(job: &Value) -> Vec<&Value> {
+    let pod = &job["spec"]["template"]["spec"];
+    [&pod["initContainers"], &pod["containers"]]
+        .into_iter()
+        .flat_map(|list| list.as_array().unwrap())
+        .collect()
+}
+
+pub(super) fn container<'a>(job: &'a Value, name: &str) -> &'a Value {
+    containers(job)
+        .into_iter()
+        .find(|container| container["name"] == name)
+        .unwrap()
+}
+
+pub(super) fn role() -> Value {
+    json!({"serviceAccountName": "submission-worker", "roleARN": "arn:aws:iam::123456789012:role/results"})
+}
+
+fn golden(name: &str, case: &Case) {
+    let path = PathBuf::from(env!("CARGO_MANIFEST_DIR"))
+        .join("src/job/golden")
+        .join(name);
+    let built = format!("{:#}\n", case.json());
+    if std::env::var_os("UPDATE_GOLDEN").is_some() {
+        fs::write(&path, &built).unwrap();
+    }
+    let known = fs::read_to_string(&path).unwrap();
+    assert!(
+        built == known,
+        "{name} differs from what is built; set UPDATE_GOLDEN=1 and read the difference"
+    );
+}
+
+#[test]
+fn the_job_of_leaderboard_1_is_as_committed() {
+    golden(
+        "v1.json",
+        &Case::new("V1", json!({"podIdentity": {"secretName": "results-writer"}})),
+    );
+}
+
+#[test]
+fn the_job_of_leaderboard_2_is_as_committed() {
+    let mut case = Case::new(
+        "V2",
+        json!({
+            "podIdentity": role(),
+            "runtimeClassName": "gvisor",
+            "logGroup": {"name": "leaderboard"},
+            "tracks": [{
+                "name": "sensors", "codename": "SENSORS", "phase": 2,
+                "nodeSelector": {"node.kubernetes.io/instance-type": "g5.12xlarge"},
+                "tolerations": [{"key": "nvidia.com/gpu", "operator": "Exists", "effect": "NoSchedule"}],
+            }],
+        }),
+    );
+    case.number.attempt = Attempt(3);
+    case.number.retry = 1;
+    golden("v2.json", &case);
+}
+
+#[test]
+fn the_job_has_no_field_that_kubernetes_does_not_know() {
+    let case = Case::new("V2", json!({"podIdentity": role()}));
+    let json = case.json();
+    let typed: Job = serde_json::from_value(json.clone()).unwrap();
+    assert_eq!(serde_json::to_value(typed).unwrap(), json);
+}
+
+#[test]
+fn a_field_that_this_client_does_not_know_survives() {
+    let case = Case::new(
+        "V2",
+        json!({"podOverrides": {"spec": {"fieldOfTheFuture": {"on": true}}}}),
+    );
+    assert_eq!(
+        case.json()["spec"]["template"]["spec"]["fieldOfTheFuture"],
+        json!({"on": true})
+    );
+}
+
+#[test]
+fn an_overlay_that_is_refused_is_not_applied() {
+    let case = Case::new(
+        "V2",
+        json!({"podOverrides": {"spec": {"hostNetwork": true, "priorityClassName": "high"}}}),
+    );
+    assert_eq!(case.json(), Case::new("V2", json!({})).json());
+    assert_eq!(containers(&case.json()).len(), 3 + 8);
+}
+
+#[test]
+fn names_fit_wherever_kubernetes_puts_them() {
+    let mut case = Case::new("V2", json!({"pairs": 16, "routes": 100}));
+    case.submission.metadata.name = Some("s".repeat(52));
+    case.number.attempt = Attempt(99_999);
+    case.number.retry = 100;
+    let job = case.json();
+    // Kubernetes makes a label of it.
+    assert!(job["metadata"]["name"].as_str().unwrap().len() <= 63);
+    for value in job["spec"]["template"]["metadata"]["labels"]
+        .as_object()
+        .unwrap()
+        .values()
+    {
+        assert!(value.as_str().unwrap().len() <= 63, "{value}");
+    }
+    let pod = &job["spec"]["template"]["spec"];
+    for name in containers(&job).into_iter().chain(pod["volumes"].as_array().unwrap()) {
+        assert!(name["name"].as_str().unwrap().len() <= 63);
+    }
+}
+
+#[test]
+fn jobs_and_pods_show_whose_they_are() {
+    let mut case = Case::new("V2", json!({}));
+    case.number = JobNumber {
+        attempt: Attempt(2),
+        retry: 3,
+    };
+    let job = case.json();
+    assert_eq!(job["metadata"]["name"], "submission-4711-2-r3");
+    assert_eq!(job["metadata"]["annotations"]["leaderboard.carla.org/retry"], "3");
+    let labels = json!({
+        "app.kubernetes.io/managed-by": "leaderboard-operator",
+        "leaderboard.carla.org/submission": "submission-4711",
+        "leaderboard.carla.org/attempt": "2",
+        "leaderboard.carla.org/leaderboard": "carla",
+        "leaderboard.carla.org/run": "4711",
+    });
+    assert_eq!(job["metadata"]["labels"], labels);
+    assert_eq!(job["spec"]["template"]["metadata"]["labels"], labels);
+}
+
+#[test]
+fn the_nets_are_wider_than_the_rules_above_them() {
+    let cases = [
+        (json!({}), 52, None),
+        (
+            json!({"pairs": 1, "retries": {"perWorker": 0}, "deadlines": {"runSeconds": 7200}}),
+            22,
+            Some(5400 + 1800 + 7200 + 120 + 1800 + 1800),
+        ),
+        (
+            json!({"pairs": 16, "retries": {"perWorker": 100}, "deadlines": {"runSeconds": i64::MAX}}),
+            3252,
+            Some(i32::MAX.into()),
+        ),
+    ];
+    for (more, backoff, deadline) in cases {
+        let job = Case::new("V2", more).json();
+        assert_eq!(job["spec"]["backoffLimit"], backoff);
+        assert_eq!(
+            job["spec"]["template"]["spec"]["activeDeadlineSeconds"].as_i64(),
+            deadline
+        );
+        assert_eq!(job["spec"].get("activeDeadlineSeconds"), None);
+    }
+}
+
+#[test]
+fn kubernetes_keeps_a_finished_job_long_enough_for_its_end_to_be_read() {
+    for (hosts, kept) in [
+        (json!({}), 604_800),
+        (json!(0), 604_800),
+        (json!(86_400), 604_800),
+        (json!(1_000_000), 1_000_000),
+    ] {
+        let more = if hosts.is_number() {
+            json!({"ttlSecondsAfterFinished": hosts})
+        } else {
+            hosts
+        };
+        let job = Case::new("V2", more).json();
+        assert_eq!(job["spec"]["ttlSecondsAfterFinished"], kept);
+    }
+}

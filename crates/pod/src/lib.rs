@@ -1,0 +1,24 @@
+//! The programs of the operator that run inside a submission's Pod: `workspace` prepares its volumes and restores what an earlier attempt
+//! stored, `logcopy` stores results and logs round by round and reports.
+//!
+//! They know S3, CloudWatch and the Pod's volumes. They know no Kubernetes API, no EvalAI and no DynamoDB, and read nothing of a stranger's
+//! but through `leaderboard-evidence`.
+#![cfg_attr(not(test), deny(clippy::indexing_slicing, clippy::arithmetic_side_effects))]
+
+pub mod daily;
+pub mod identity;
+pub mod isolation;
+pub mod logcopy;
+mod name_files;
+pub mod ownlog;
+pub mod places;
+pub mod ship;
+pub mod upload;
+pub mod watch;
+pub mod workspace;
+
+/// Does what may wait for a disk, on a thread that may block. The runtime's own threads serve what must never wait, above
+/// all the watch of the stop annotation.
+pub(crate) async fn blocking<T: Send + 'static>(work: impl FnOnce() -> T + Send + 'static) -> std::io::Result<T> {
+    tokio::task::spawn_blocking(work).await.map_err(std::io::Error::other)
+}

@@ -1,0 +1,75 @@
+//! The content of a round's report. Pure.
+
+use std::collections::BTreeMap;
+
+use leaderboard_api::text::one_line;
+use leaderboard_contract::report::{LONGEST_TEXT, MAX_BYTES, Report, SCHEMA};
+use leaderboard_contract::run::Run;
+use leaderboard_evaluation::carla::gather::Gathered;
+use leaderboard_evaluation::carla::judge::Ending;
+use leaderboard_evaluation::carla::measures::UNIT;
+
+/// Warnings of the results' check that are reported.
+const WARNINGS: usize = 50;
+
+/// The report of a round; its number is the caller's.
+pub fn describe(run: &Run, pod_uid: &str, gathered: &Gathered, ending: Option<&Ending>) -> Report {
+    let merged = gathered.merged.as_deref();
+    let invalid = match ending {
+        Some(Ending::Invalid(why)) => Some(why.clone()),
+        _ => None,
+    };
+    let stopped = match ending {
+        Some(Ending::Stopped(stop)) => Some(*stop),
+        _ => None,
+    };
+    let counts = invalid.is_none() && gathered.is_complete();
+    let total = gathered
+        .pairs
+        .iter()
+        .map(|pair| pair.total)
+        .fold(0, u32::saturating_add);
+    let warnings = merged.map_or(&[][..], |merged| &merged.warnings);
+    Report {
+        schema: SCHEMA,
+        submission_uid: run.uid.clone(),
+        attempt: run.attempt,
+        pod_uid: pod_uid.to_owned(),
+        round: 0,
+        done: merged.map_or(0, |merged| merged.done).min(total),
+        total,
+        unit: UNIT.to_owned(),
+        workers: gathered.pairs.clone(),
+        score: merged.and_then(|merged| merged.score.clone()),
+        metrics: merged.map(|merged| merged.metrics.clone()).unwrap_or_default(),
+        is_final: ending.is_some(),
+        eligible: counts && merged.is_some_and(|merged| merged.eligible),
+        entry_status: merged.map_or("Started", |merged| merged.ended_as.as_str()).to_owned(),
+        stopped,
+        why: invalid.or_else(|| gathered.why()).map(|why| shorten(&why)),
+        warnings: warnings.iter().take(WARNINGS).map(|warning| shorten(warning)).collect(),
+        logs: None,
+        results: gathered.texts.results.clone(),
+        partial_results: gathered.texts.partial_results.clone().filter(|_| ending.is_none()),
+        agents_fill_disk: false,
+        files: gathered.digests(),
+    }
+}
+
+/// Its JSON, without the long parts if it were larger than what is read.
+pub(super) fn to_bytes(report: &Report) -> Vec<u8> {
+    let bytes = serde_json::to_vec(report).unwrap_or_default();
+    if bytes.len() <= MAX_BYTES {
+        return bytes;
+    }
+    let short = Report {
+        warnings: report.warnings.iter().take(1).cloned().collect(),
+        files: BTreeMap::new(),
+        ..report.clone()
+    };
+    serde_json::to_vec(&short).unwrap_or_default()
+}
+
+fn shorten(text: &str) -> String {
+    one_line(text, LONGEST_TEXT)
+}

@@ -1,0 +1,407 @@
+//! How much of a run is stored: bytes and objects at once, requests and bytes a day. Pure.
+//!
+//! An agent costs itself nothing when it fills its folder, also with sparse or empty files. So its own files get a part of the
+//! limits only, and the logs by which a run is judged keep room that nothing else can use.
+
+use std::collections::BTreeSet;
+use std::fmt;
+
+use super::Decision;
+use crate::daily::Spent;
+use leaderboard_aws::archive::PART;
+use leaderboard_contract::keys::{EVALAI, REFUSED, known_logs};
+use leaderboard_contract::run::STATUS_FOLDER;
+
+/// Objects of one run.
+pub const OBJECTS: u64 = 20_000;
+/// Objects that are kept for results, status files and the known logs.
+const KEPT_OBJECTS: u64 = 4_500;
+/// Bytes that an object counts at least: an empty one costs a request, an entry in each list, and memory here.
+pub const LEAST: u64 = 4 << 10;
+/// Bytes that the server copies with one request of an append.
+const COPIED: u64 = 1 << 30;
+
+/// What a key is for, in the order in which files are sent.
+#[derive(Clone, Copy, Debug, PartialEq, Eq, PartialOrd, Ord)]
+pub enum Kind {
+    /// Checkpoints, results and status files: stored from memory, and bounded there.
+    Result,
+    /// A known log; see [`known_logs`].
+    Log,
+    /// Another file of the simulators or of logcopy.
+    Host,
+    /// Another file of an agent, or its refused checkpoint.
+    Agent,
+}
+
+/// Why a file is not stored.
+#[derive(Clone, Copy, Debug, PartialEq, Eq)]
+pub enum Limit {
+    /// Bytes of the run.
+    Bytes(u64),
+    /// Bytes of the agents' own files.
+    AgentBytes(u64),
+    /// Objects of the run.
+    Objects(u64),
+    /// Objects of the agents' own files.
+    AgentObjects(u64),
+}
+
+impl fmt::Display for Limit {
+    fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
+        match self {
+            Self::Bytes(limit) => write!(
+                f,
+                "storage.sizeLimit is reached: of it, {limit} bytes are for all but the known logs. Raise it, or have the \
+                 simulators and the agent write less"
+            ),
+            Self::AgentBytes(limit) => write!(
+                f,
+                "the agents' own files have reached their half of storage.sizeLimit, {limit} bytes. Raise it, or have the \
+                 agent write less"
+            ),
+            Self::Objects(limit) => write!(
+                f,
+                "a run's limit of objects is reached: {limit} for files of simulators and agents. Have them write fewer \
+                 files"
+            ),
+            Self::AgentObjects(limit) => write!(
+                f,
+                "the agents' own files have reached the limit of {limit} objects. Have the agent write fewer files"
+            ),
+        }
+    }
+}
+
+/// The limits of one run.
+#[derive(Clone, Debug, PartialEq, Eq)]
+pub struct Quota {
+    /// Bytes: `storage.sizeLimit`.
+    pub bytes: u64,
+    /// Objects.
+    pub objects: u64,
+    /// What may be sent of one known log on a day.
+    pub log_a_day: Spent,
+    /// What may be sent of the agents' own files together on a day, and of the simulators' other files.
+    pub files_a_day: Spent,
+    logs: BTreeSet<String>,
+}
+
+impl Quota {
+    /// For a run of so many pairs that may store so many bytes.
+    pub fn new(bytes: u64, pairs: usize) -> Self {
+        let at_least = |bytes: u64, gibibytes: u64| bytes.max(gibibytes << 30);
+        Self {
+            bytes,
+            objects: OBJECTS,
+            // A growing log costs four requests a minute.
+            log_a_day: Spent {
+                requests: 10_000,
+                bytes: at_least(bytes, 8),
+            },
+            files_a_day: Spent {
+                requests: 50_000,
+                bytes: at_least(bytes.saturating_mul(4), 16),
+            },
+            logs: known_logs(pairs).collect(),
+        }
+    }
+
+    /// What a key is for.
+    pub fn kind(&self, key: &str) -> Kind {
+        if self.logs.contains(key) {
+            return Kind::Log;
+        }
+        let is_result = key.starts_with(EVALAI)
+            || key
+                .strip_prefix(STATUS_FOLDER)
+                .is_some_and(|rest| rest.starts_with('/'))
+            || is_checkpoint(key);
+        match key {
+            _ if is_result => Kind::Result,
+            _ if key.starts_with(REFUSED) => Kind::Agent,
+            _ if key.starts_with("simulator/") || key.starts_with("logcopy/") => Kind::Host,
+            _ => Kind::Agent,
+        }
+    }
+
+    /// Who shares a day's allowance, and how much it is.
+    pub fn purse<'a>(&self, key: &'a str) -> (&'a str, Spent) {
+        match self.kind(key) {
+            Kind::Result | Kind::Log => (key, self.log_a_day),
+            Kind::Host => ("simulators", self.files_a_day),
+            Kind::Agent => ("agents", self.files_a_day),
+        }
+    }
+
+    /// What counts already, by what is stored.
+    pub fn ledger<'a>(&'a self, stored: impl Iterator<Item = (&'a str, u64)>) -> Ledger<'a> {
+        let mut ledger = Ledger {
+            quota: self,
+            bytes: 0,
+            agent_bytes: 0,
+            objects: 0,
+            agent_objects: 0,
+        };
+        for (key, size) in stored {
+            ledger.take(key, None, size);
+        }
+        ledger
+    }
+
+    /// Bytes that each known log keeps for itself: together a quarter of the limit.
+    fn log_share(&self) -> u64 {
+        let logs = u64::try_from(self.logs.len()).unwrap_or(u64::MAX);
+        quarter(self.bytes).checked_div(logs).unwrap_or(0)
+    }
+
+    /// Bytes for everything but the known logs' shares.
+    fn common(&self) -> u64 {
+        self.bytes.saturating_sub(quarter(self.bytes))
+    }
+
+    /// Bytes of a key that count against what is common.
+    fn weight(&self, kind: Kind, size: u64) -> u64 {
+        let counted = size.max(LEAST);
+        if kind == Kind::Log {
+            counted.saturating_sub(self.log_share())
+        } else {
+            counted
+        }
+    }
+}
+
+fn half(limit: u64) -> u64 {
+    limit.checked_div(2).unwrap_or(0)
+}
+
+fn quarter(limit: u64) -> u64 {
+    half(half(limit))
+}
+
+/// The merged file, or the checkpoint of a pair.
+fn is_checkpoint(key: &str) -> bool {
+    let inner = key
+        .strip_prefix("agent/")
+        .and_then(|rest| rest.strip_suffix("agent_results.json"));
+    inner.is_some_and(|inner| {
+        let number = inner.strip_prefix("agent").and_then(|rest| rest.strip_suffix('/'));
+        inner.is_empty() || number.is_some_and(|number| number.parse::<u16>().is_ok())
+    })
+}
+
+/// Whether a stranger's container writes it.
+fn is_agents(kind: Kind, key: &str) -> bool {
+    kind == Kind::Agent || (kind == Kind::Log && key.starts_with("agent/"))
+}
+
+/// What counts at present.
+#[derive(Clone, Debug)]
+pub struct Ledger<'a> {
+    quota: &'a Quota,
+    bytes: u64,
+    agent_bytes: u64,
+    objects: u64,
+    agent_objects: u64,
+}
+
+impl Ledger<'_> {
+    /// How many bytes of a file may be stored, of which `before` are. All or none, but for a known log: of that one at least
+    /// what it keeps for itself.
+    pub fn admit(&self, key: &str, before: Option<u64>, size: u64) -> Result<u64, Limit> {
+        let quota = self.quota;
+        let kind = quota.kind(key);
+        let weight = quota.weight(kind, size);
+        let weight_before = before.map_or(0, |before| quota.weight(kind, before));
+        if kind == Kind::Result || (before.is_some() && weight <= weight_before) {
+            return Ok(size);
+        }
+        let room = |limit: u64, used: u64| limit.saturating_sub(used.saturating_sub(weight_before));
+        let common = room(quota.common(), self.bytes);
+        let agents = room(half(quota.bytes), self.agent_bytes);
+        let (room, limit) = if is_agents(kind, key) && agents <= common {
+            (agents, Limit::AgentBytes(half(quota.bytes)))
+        } else {
+            (common, Limit::Bytes(quota.common()))
+        };
+        if kind == Kind::Log {
+            return Ok(size.min(quota.log_share().saturating_add(room)));
+        }
+        if weight > room {
+            return Err(limit);
+        }
+        let files = quota.objects.saturating_sub(KEPT_OBJECTS);
+        match before {
+            None if kind == Kind::Agent && self.agent_objects >= half(quota.objects).min(files) => {
+                Err(Limit::AgentObjects(half(quota.objects).min(files)))
+            }
+            None if self.objects >= files => Err(Limit::Objects(files)),
+            _ => Ok(size),
+        }
+    }
+
+    /// Takes in that a file with `before` bytes has `size` now.
+    pub fn take(&mut self, key: &str, before: Option<u64>, size: u64) {
+        let kind = self.quota.kind(key);
+        let weight = self.quota.weight(kind, size);
+        let weight_before = before.map_or(0, |before| self.quota.weight(kind, before));
+        let changed = |sum: u64| sum.saturating_sub(weight_before).saturating_add(weight);
+        self.bytes = changed(self.bytes);
+        if is_agents(kind, key) {
+            self.agent_bytes = changed(self.agent_bytes);
+        }
+        let new = u64::from(before.is_none());
+        // The others have objects of their own, and are bounded where they are made.
+        if matches!(kind, Kind::Host | Kind::Agent) {
+            self.objects = self.objects.saturating_add(new);
+        }
+        if kind == Kind::Agent {
+            self.agent_objects = self.agent_objects.saturating_add(new);
+        }
+    }
+}
+
+/// What sending a file of `size` bytes costs.
+pub fn cost(decision: Decision, size: u64) -> Spent {
+    let parts = |bytes: u64, of: u64| bytes.div_ceil(of);
+    match decision {
+        Decision::Keep => Spent::default(),
+        Decision::PutWhole if size <= PART => Spent {
+            requests: 1,
+            bytes: size,
+        },
+        Decision::PutWhole => Spent {
+            requests: parts(size, PART).saturating_add(2),
+            bytes: size,
+        },
+        Decision::Append { from } => {
+            let bytes = size.saturating_sub(from);
+            let requests = parts(bytes, PART).saturating_add(parts(from, COPIED));
+            Spent {
+                requests: requests.saturating_add(2),
+                bytes,
+            }
+        }
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    const MIB: u64 = 1 << 20;
+
+    /// Two pairs and 100 MiB: 25 for the known logs, 5 for each; 75 for the rest, of which the agents have 50.
+    fn quota() -> Quota {
+        Quota::new(100 * MIB, 2)
+    }
+
+    #[test]
+    fn each_key_has_its_kind() {
+        let table = [
+            ("agent/agent_results.json", Kind::Result),
+            ("agent/agent2/agent_results.json", Kind::Result),
+            ("evalai/metadata.json", Kind::Result),
+            ("containers-status/agent-1.done", Kind::Result),
+            ("agent/agent2/leaderboard.log", Kind::Log),
+            ("simulator/console-1.log", Kind::Log),
+            ("logcopy/logcopy.log", Kind::Log),
+            ("simulator/Logs/CarlaUE4.log", Kind::Host),
+            ("simulator/console-3.log", Kind::Host),
+            ("agent/agent3/leaderboard.log", Kind::Agent),
+            ("agent/agent1/x/agent_results.json", Kind::Agent),
+            ("agent/agent1/leaderboard.log.1", Kind::Agent),
+            ("logcopy/refused/agent/agent1/agent_results.json", Kind::Agent),
+            ("containers-status-x/y", Kind::Agent),
+        ];
+        for (key, kind) in table {
+            assert_eq!(quota().kind(key), kind, "{key}");
+        }
+    }
+
+    #[test]
+    fn the_agents_files_get_half_and_the_simulators_files_what_is_left() {
+        let quota = quota();
+        let mut ledger = quota.ledger(std::iter::empty());
+        assert_eq!(ledger.admit("agent/agent1/a", None, 50 * MIB), Ok(50 * MIB));
+        ledger.take("agent/agent1/a", None, 50 * MIB);
+        let full = Err(Limit::AgentBytes(50 * MIB));
+        assert_eq!(
+            ledger.admit("agent/agent2/b", None, 0),
+            full,
+            "an empty file counts as well"
+        );
+        assert_eq!(ledger.admit("agent/agent1/a", Some(50 * MIB), 50 * MIB + 1), full);
+        assert_eq!(ledger.admit("agent/agent1/a", Some(50 * MIB), 9), Ok(9));
+        assert_eq!(ledger.admit("simulator/a", None, 25 * MIB), Ok(25 * MIB));
+        ledger.take("simulator/a", None, 25 * MIB);
+        assert_eq!(ledger.admit("simulator/b", None, 1), Err(Limit::Bytes(75 * MIB)));
+        for result in ["evalai/metadata.json", "containers-status/agent-1.done"] {
+            assert_eq!(ledger.admit(result, None, 30 * MIB), Ok(30 * MIB), "{result}");
+        }
+    }
+
+    #[test]
+    fn each_known_log_keeps_its_share_and_gets_no_more_than_there_is() {
+        let quota = quota();
+        let files = [("agent/agent1/a", 50 * MIB), ("simulator/a", 25 * MIB)];
+        let mut ledger = quota.ledger(files.into_iter());
+        for log in known_logs(2) {
+            assert_eq!(ledger.admit(&log, None, 4 << 40), Ok(5 * MIB), "{log}");
+            ledger.take(&log, None, 5 * MIB);
+        }
+        assert_eq!(ledger.admit("simulator/a", Some(25 * MIB), 20 * MIB), Ok(20 * MIB));
+        ledger.take("simulator/a", Some(25 * MIB), 20 * MIB);
+        // Room of the simulators is none for an agent's log, but for a server's.
+        assert_eq!(
+            ledger.admit("agent/agent2/leaderboard.log", Some(5 * MIB), 6 * MIB),
+            Ok(5 * MIB)
+        );
+        assert_eq!(
+            ledger.admit("simulator/console-1.log", Some(5 * MIB), 4 << 40),
+            Ok(10 * MIB)
+        );
+    }
+
+    #[test]
+    fn empty_files_end_at_a_number_of_objects() {
+        let quota = Quota::new(1 << 40, 16);
+        let names: Vec<String> = (0..10_000).map(|number| format!("agent/agent1/{number}")).collect();
+        let mut ledger = quota.ledger(names.iter().map(|name| (name.as_str(), 0)));
+        let full = Err(Limit::AgentObjects(10_000));
+        assert_eq!(ledger.admit("agent/agent2/one-more", None, 0), full);
+        assert_eq!(
+            ledger.admit("agent/agent1/0", Some(0), 5),
+            Ok(5),
+            "what is there may change"
+        );
+        for number in 0..5_500 {
+            let key = format!("simulator/{number}");
+            assert_eq!(ledger.admit(&key, None, 0), Ok(0));
+            ledger.take(&key, None, 0);
+        }
+        assert_eq!(ledger.admit("simulator/one-more", None, 0), Err(Limit::Objects(15_500)));
+        assert_eq!(ledger.admit("simulator/console-16.log", None, 7), Ok(7));
+    }
+
+    #[test]
+    fn each_way_of_sending_has_its_cost() {
+        let cost = |decision, size| {
+            let Spent { requests, bytes } = cost(decision, size);
+            (requests, bytes)
+        };
+        assert_eq!(cost(Decision::Keep, 9), (0, 0));
+        assert_eq!(cost(Decision::PutWhole, PART), (1, PART));
+        assert_eq!(cost(Decision::PutWhole, PART + 1), (4, PART + 1));
+        assert_eq!(cost(Decision::Append { from: 2 * COPIED }, 2 * COPIED + 5), (5, 5));
+    }
+
+    #[test]
+    fn each_known_log_has_a_purse_of_its_own() {
+        let quota = quota();
+        assert_eq!(quota.purse("simulator/console-1.log").0, "simulator/console-1.log");
+        assert_eq!(quota.purse("simulator/x").0, "simulators");
+        assert_eq!(quota.purse("agent/agent2/x").0, "agents");
+        assert_eq!(quota.purse("agent/agent2/x").1.requests, 50_000);
+    }
+}

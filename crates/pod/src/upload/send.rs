@@ -1,0 +1,350 @@
+//! Stores files by the rules of the parent module: a few at a time, at most one part of each in memory.
+//!
+//! Called by `logcopy`. A file that can't be read, or for which there is no room, is left out and named; only S3's own failures
+//! end a round.
+
+use std::collections::{BTreeMap, BTreeSet};
+use std::sync::Arc;
+use std::sync::atomic::{AtomicBool, Ordering};
+use std::time::{Duration, Instant};
+
+use futures::StreamExt;
+
+use super::complaints::{Complaints, Why};
+use super::job::{Job, Outcome, Put};
+use super::quota::{Ledger, Quota, cost};
+use super::wanted::Wanted;
+use super::{Decision, Memory, Stored, decide_upload};
+use crate::blocking;
+use crate::daily::{Spent, today};
+use leaderboard_aws::archive::{Archive, ArchiveError, Cause};
+use leaderboard_evaluation::carla::gather::Object;
+use leaderboard_evidence::{Stamp, Tree, TreeError};
+
+/// Files in the air at once.
+const AT_ONCE: usize = 4;
+/// Pause before a file that was cut is tried again; doubled each time.
+const AFTER_A_CUT: Duration = Duration::from_mins(10);
+
+/// What became of one round of files.
+#[derive(Clone, Copy, Debug, Default, PartialEq, Eq)]
+pub struct Sent {
+    /// Objects written.
+    pub objects: usize,
+    /// Files that were due when the time was over.
+    pub late: usize,
+    /// Files that could not be read, did not fit into a limit, or took too long.
+    pub left_out: usize,
+}
+
+/// How long files may take.
+#[derive(Clone, Copy, Debug, Default)]
+pub struct Window {
+    /// From then on no file is begun.
+    pub begin_until: Option<Instant>,
+    /// What is in the air then is cut.
+    pub cut_at: Option<Instant>,
+    /// There is no later time for what would wait: neither the day's allowance nor an earlier cut holds it back.
+    pub is_last: bool,
+}
+
+/// Stores the files of one run.
+#[derive(Debug)]
+pub struct Uploader {
+    archive: Archive,
+    tree: Arc<Tree>,
+    memory: Memory,
+    quota: Quota,
+    epoch: Instant,
+    complaints: Complaints,
+    /// Files that were cut.
+    slow: BTreeMap<String, Slow>,
+}
+
+/// A file that was cut.
+#[derive(Clone, Copy, Debug)]
+struct Slow {
+    /// When it is tried again, on the clock of [`Stored::at`].
+    again: Duration,
+    times: u32,
+}
+
+/// Who pays for a file, and how much.
+struct Bill {
+    key: String,
+    purse: String,
+    cost: Spent,
+}
+
+/// Keys, and why nothing is stored there.
+type LeftOut = Vec<(String, Why)>;
+
+/// A file that is due.
+#[derive(Clone, Copy, Debug)]
+struct Due {
+    decision: Decision,
+    /// With as many bytes as it may have.
+    stamp: Stamp,
+    cost: Spent,
+}
+
+impl Uploader {
+    /// With the memory of what an earlier program of this Pod stored.
+    pub fn new(archive: Archive, tree: Arc<Tree>, quota: Quota) -> Self {
+        Self {
+            memory: Memory::load(&tree),
+            archive,
+            tree,
+            quota,
+            epoch: Instant::now(),
+            complaints: Complaints::default(),
+            slow: BTreeMap::new(),
+        }
+    }
+
+    /// What is stored.
+    pub fn memory(&self) -> &Memory {
+        &self.memory
+    }
+
+    /// Logs once why something is not stored.
+    pub fn complain(&mut self, key: &str, why: &Why) {
+        self.complaints.say(key, why);
+    }
+
+    /// Stores results that are in memory, each that is not what is stored already. They are stored even beyond the limit: what
+    /// is in memory is bounded.
+    pub async fn put(&mut self, objects: &BTreeMap<String, Object>) -> Result<Sent, ArchiveError> {
+        let now = self.epoch.elapsed();
+        let is_stored = |key: &String, object: &Object| {
+            let known = self.memory.stored.get(key);
+            known.is_some_and(|known| {
+                known.stamp.size == object.digest.size && known.fingerprint == object.digest.sha256
+            })
+        };
+        let jobs: Vec<Put> = objects
+            .iter()
+            .filter(|(key, object)| !is_stored(key, object))
+            .map(|(key, object)| Put {
+                archive: self.archive.clone(),
+                key: key.clone(),
+                object: object.clone(),
+                known: self.memory.stored.get(key).and_then(|known| known.etag.clone()),
+                now,
+            })
+            .collect();
+        let work = jobs.into_iter().map(Put::store);
+        let outcomes = futures::stream::iter(work).buffer_unordered(AT_ONCE).collect().await;
+        let mut sent = Sent::default();
+        let failed = self.settle(outcomes, None, &mut sent);
+        if sent.objects > 0 || failed.is_some() {
+            self.remember().await;
+        }
+        failed.map_or(Ok(sent), Err)
+    }
+
+    /// Stores what is due, the known logs first, as far as several at once allow. The first failure of S3 ends it; what was
+    /// stored until then is remembered.
+    pub async fn sync(&mut self, files: &[Wanted], window: Window) -> Result<Sent, ArchiveError> {
+        let began = Instant::now();
+        let mut sent = Sent::default();
+        self.memory.sent.begin(today());
+        let (jobs, left_out) = self.due(files, window.is_last);
+        sent.left_out = left_out.len();
+        for (key, why) in &left_out {
+            self.complaints.say(key, why);
+        }
+        for (job, bill) in jobs.iter().filter(|(job, _)| job.is_shortened) {
+            self.complaints.say(&bill.key, &Why::Shortened(job.wanted.stamp.size));
+        }
+        let new = self.count_new(&jobs).await;
+        // What is in the air comes to its end or is cut, so that it is remembered; nothing new is begun.
+        let broken = Arc::new(AtomicBool::new(false));
+        let work = jobs.into_iter().map(|(job, bill)| {
+            let broken = Arc::clone(&broken);
+            async move {
+                let is_over = window.begin_until.is_some_and(|until| Instant::now() >= until);
+                if is_over || broken.load(Ordering::Relaxed) {
+                    return (bill, Outcome::Late);
+                }
+                let outcome = job.store(window.cut_at).await;
+                if matches!(outcome, Outcome::Failed(_)) {
+                    broken.store(true, Ordering::Relaxed);
+                }
+                (bill, outcome)
+            }
+        });
+        let outcomes: Vec<(Bill, Outcome)> = futures::stream::iter(work).buffer_unordered(AT_ONCE).collect().await;
+        let has_changed = !outcomes.is_empty();
+        let outcomes = outcomes.into_iter().map(|(bill, outcome)| {
+            if !matches!(outcome, Outcome::Late) {
+                self.memory.sent.add(&bill.purse, bill.cost);
+            }
+            if matches!(outcome, Outcome::Late | Outcome::LeftOut(_)) && new.contains(&bill.key) {
+                self.memory.stored.remove(&bill.key);
+            }
+            (bill.key, outcome)
+        });
+        let outcomes = outcomes.collect();
+        let time = window.cut_at.map(|cut_at| cut_at.saturating_duration_since(began));
+        let failed = self.settle(outcomes, time, &mut sent);
+        if has_changed {
+            self.remember().await;
+        }
+        failed.map_or(Ok(sent), Err)
+    }
+
+    /// Counts the objects that are going to be made, before the first of them is: a logcopy that is killed meanwhile must not
+    /// forget any. Returns their keys.
+    async fn count_new(&mut self, jobs: &[(Job, Bill)]) -> BTreeSet<String> {
+        let new = jobs
+            .iter()
+            .filter(|(_, bill)| !self.memory.stored.contains_key(&bill.key));
+        let new: BTreeMap<String, u64> = new
+            .map(|(job, bill)| (bill.key.clone(), job.wanted.stamp.size))
+            .collect();
+        for (key, size) in &new {
+            self.memory.stored.insert(key.clone(), Stored::unknown(*size));
+        }
+        if !new.is_empty() {
+            self.remember().await;
+        }
+        new.into_keys().collect()
+    }
+
+    /// Takes in what became of the files, of which none had more time than `time`. Returns S3's failure, if there was one.
+    fn settle(
+        &mut self,
+        outcomes: Vec<(String, Outcome)>,
+        time: Option<Duration>,
+        sent: &mut Sent,
+    ) -> Option<ArchiveError> {
+        let mut failed = None;
+        for (key, outcome) in outcomes {
+            match outcome {
+                Outcome::Stored(stored, written) => {
+                    sent.objects = sent.objects.saturating_add(usize::from(written));
+                    self.slow.remove(&key);
+                    self.memory.stored.insert(key, *stored);
+                }
+                Outcome::LeftOut(why) => {
+                    sent.left_out = sent.left_out.saturating_add(1);
+                    self.complaints.say(&key, &Why::File(why));
+                }
+                Outcome::Slow => {
+                    sent.left_out = sent.left_out.saturating_add(1);
+                    self.complaints.say(&key, &Why::Slow(time.unwrap_or_default()));
+                    self.wait_after_a_cut(key);
+                }
+                Outcome::Late => sent.late = sent.late.saturating_add(1),
+                Outcome::Failed(error) => {
+                    if matches!(error.cause, Cause::Changed) {
+                        // Another writer's object: it is written whole the next time.
+                        self.forget_content(&key);
+                    }
+                    failed = Some(error);
+                }
+            }
+        }
+        failed
+    }
+
+    /// What is stored under a key is another's, or not known. It counts all the same.
+    fn forget_content(&mut self, key: &str) {
+        if let Some(known) = self.memory.stored.get_mut(key) {
+            *known = Stored::unknown(known.stamp.size);
+        }
+    }
+
+    fn wait_after_a_cut(&mut self, key: String) {
+        let times = self.slow.get(&key).map_or(0, |slow| slow.times);
+        let pause = AFTER_A_CUT.saturating_mul(1 << times.min(8));
+        let again = self.epoch.elapsed().saturating_add(pause);
+        let times = times.saturating_add(1);
+        self.slow.insert(key, Slow { again, times });
+    }
+
+    /// The files that are due and fit, the known logs first, and what is to be shown of the others.
+    fn due(&self, files: &[Wanted], is_last: bool) -> (Vec<(Job, Bill)>, LeftOut) {
+        let now = self.epoch.elapsed();
+        let stored = self.memory.stored.iter();
+        let stored = stored.map(|(key, stored)| (key.as_str(), stored.stamp.size));
+        let (mut ledger, mut planned) = (self.quota.ledger(stored), self.memory.sent.clone());
+        let mut files: Vec<&Wanted> = files.iter().collect();
+        files.sort_by_key(|file| self.quota.kind(&file.key));
+        let (mut jobs, mut left_out, mut keys) = (Vec::new(), Vec::new(), BTreeSet::new());
+        for file in files {
+            let key = file.key.as_str();
+            // Two files under one key would overwrite each other in any order.
+            if !keys.insert(key) {
+                left_out.push((key.to_owned(), Why::SameKey));
+                continue;
+            }
+            if !is_last && self.slow.get(key).is_some_and(|slow| slow.again > now) {
+                continue;
+            }
+            let known = self.memory.stored.get(key);
+            let (purse, allowed) = self.quota.purse(key);
+            match due(file, known, &ledger, now) {
+                Ok(None) => {}
+                Err(why) => left_out.push((key.to_owned(), why)),
+                Ok(Some(due)) if !is_last && !planned.of(purse).plus(due.cost).fits(allowed) => {
+                    left_out.push((key.to_owned(), Why::Day));
+                }
+                Ok(Some(due)) => {
+                    ledger.take(key, known.map(|known| known.stamp.size), due.stamp.size);
+                    planned.add(purse, due.cost);
+                    jobs.push(self.job(file, due, purse, now));
+                }
+            }
+        }
+        (jobs, left_out)
+    }
+
+    fn job(&self, file: &Wanted, due: Due, purse: &str, now: Duration) -> (Job, Bill) {
+        let bill = Bill {
+            key: file.key.clone(),
+            purse: purse.to_owned(),
+            cost: due.cost,
+        };
+        let job = Job {
+            archive: self.archive.clone(),
+            tree: Arc::clone(&self.tree),
+            wanted: Wanted {
+                stamp: due.stamp,
+                ..file.clone()
+            },
+            is_shortened: due.stamp.size < file.stamp.size,
+            decision: due.decision,
+            known: self.memory.stored.get(&file.key).cloned(),
+            now,
+        };
+        (job, bill)
+    }
+
+    async fn remember(&self) {
+        let (memory, tree) = (self.memory.clone(), Arc::clone(&self.tree));
+        let saved = blocking(move || memory.save(&tree)).await;
+        if let Err(error) = saved.map_err(TreeError::from).flatten() {
+            tracing::warn!("what is stored can't be noted down, a restart will send it again: {error}");
+        }
+    }
+}
+
+/// Whether a file is due, and how much of it there is room for.
+fn due(file: &Wanted, known: Option<&Stored>, ledger: &Ledger<'_>, now: Duration) -> Result<Option<Due>, Why> {
+    if decide_upload(&file.stamp, known, now, file.haste) == Decision::Keep {
+        return Ok(None);
+    }
+    let before = known.map(|known| known.stamp.size);
+    let size = ledger.admit(&file.key, before, file.stamp.size).map_err(Why::Limit)?;
+    let stamp = Stamp { size, ..file.stamp };
+    let is_whole = size == file.stamp.size;
+    // Of a log that is too large the beginning is stored, and that does not change while it grows.
+    if !is_whole && known.is_some_and(|known| known.stamp.inode == stamp.inode && known.stamp.size >= size) {
+        return Ok(None);
+    }
+    let decision = decide_upload(&stamp, known, now, file.haste);
+    let cost = cost(decision, size);
+    Ok((decision != Decision::Keep).then_some(Due { decision, stamp, cost }))
+}

@@ -1,0 +1,346 @@
+//! The init container that prepares a Pod: the runner for all containers, the folders, the fence that makes this Pod the one
+//! whose writes count, and what earlier Pods stored.
+//!
+//! Called by `leaderboard-operator workspace`. Knows S3 and the volumes. Everything it does may be done again: the kubelet
+//! restarts it when it fails.
+
+pub mod restore;
+
+use std::collections::BTreeMap;
+use std::fs;
+use std::io;
+use std::os::unix::fs::PermissionsExt;
+use std::path::Path;
+use std::sync::Arc;
+use std::time::Duration;
+
+use super::identity;
+use super::isolation::{self, Finding};
+use super::logcopy::describe::describe;
+use super::name_files;
+use super::places::{Places, Setting};
+use leaderboard_api::names::FAILURE_LOG_KEY;
+use leaderboard_api::{Attempt, Enforcement};
+use leaderboard_aws::archive::{Archive, ArchiveError};
+use leaderboard_contract::report::{MAX_BYTES, OWNER_KEY, Owner, REPORT_KEY, Report};
+use leaderboard_contract::run::{Run, STATUS_FOLDER};
+use leaderboard_contract::verdict::{WorkspaceReason, WorkspaceVerdict};
+use leaderboard_evaluation::carla::gather::{Gatherer, Refused, check};
+use leaderboard_evidence::{Tree, TreeError};
+
+/// Folders that no mount makes. The others are the kubelet's.
+const FOLDERS: [&str; 4] = ["agent", STATUS_FOLDER, "logcopy", "contents"];
+/// Names the Pod whose volume this is, once it is prepared.
+const PREPARED: &str = "logcopy/.prepared";
+/// Tries while S3 does not answer, before the kubelet is left to start this again.
+const TRIES: u32 = 6;
+/// What a Pod that goes on reports of its isolation.
+fn verdict_of(finding: &Finding) -> WorkspaceVerdict {
+    let reason = match finding {
+        Finding::Enforced(..) => WorkspaceReason::Enforced,
+        Finding::Open(_) => WorkspaceReason::NotEnforced,
+        Finding::Unmeasured(_) => WorkspaceReason::NotMeasured,
+    };
+    WorkspaceVerdict::new(reason, finding.to_string())
+}
+
+/// Why the workspace could not be prepared.
+#[derive(thiserror::Error, Debug)]
+pub enum WorkspaceError {
+    /// The results of another submission are there.
+    #[error("s3://{0} already holds results of something else.")]
+    PrefixInUse(String),
+    /// `network.enforcement` is `Require`.
+    #[error("{0} The run is not started, because network.enforcement is Require.")]
+    NotIsolated(Finding),
+    /// The plan does not hold.
+    #[error(transparent)]
+    Plan(#[from] Refused),
+    /// S3.
+    #[error(transparent)]
+    Storage(#[from] ArchiveError),
+    /// A file below the volume's root.
+    #[error("{path} on the logs volume can't be used: {error}. Look at the node's disk and the Pod's volumes.")]
+    Volume {
+        /// Which.
+        path: String,
+        /// The system's own text.
+        error: TreeError,
+    },
+    /// The files by which names are resolved.
+    #[error("{path} can't be written: {error}. Look at the node's disk and the Pod's volumes.")]
+    NameFile {
+        /// Where to.
+        path: String,
+        /// The system's own text.
+        error: io::Error,
+    },
+    /// The runner.
+    #[error("the runner can't be copied to {path}: {error}. Use the operator's own image for this container.")]
+    Runner {
+        /// Where to.
+        path: String,
+        /// The system's own text.
+        error: io::Error,
+    },
+}
+
+impl WorkspaceError {
+    /// For the termination message.
+    pub fn verdict(&self) -> WorkspaceVerdict {
+        let reason = match self {
+            Self::PrefixInUse(_) => WorkspaceReason::PrefixInUse,
+            Self::NotIsolated(Finding::Unmeasured(_)) => WorkspaceReason::NotKnownIsolated,
+            Self::NotIsolated(_) => WorkspaceReason::NotIsolated,
+            Self::Plan(_) => WorkspaceReason::PlanInvalid,
+            Self::Storage(_) => WorkspaceReason::StorageFailed,
+            Self::Volume { .. } | Self::NameFile { .. } | Self::Runner { .. } => WorkspaceReason::VolumeFailed,
+        };
+        WorkspaceVerdict::new(reason, self.to_string())
+    }
+}
+
+/// Prepares the Pod. A failure, and what was found of the Pod's isolation, are also written to the termination log.
+pub async fn main(setting: Setting) -> Result<(), WorkspaceError> {
+    let result = measure_and_prepare(&setting).await;
+    let verdict = match &result {
+        Ok(finding) => finding.as_ref().map(verdict_of),
+        Err(error) => Some(error.verdict()),
+    };
+    if let Some(verdict) = verdict
+        && let Err(error) = fs::write(&setting.places.termination_log, verdict.to_json())
+    {
+        tracing::warn!("the termination log can't be written: {error}");
+    }
+    result.map(|_| ())
+}
+
+async fn measure_and_prepare(setting: &Setting) -> Result<Option<Finding>, WorkspaceError> {
+    let plan = &setting.run.plan;
+    check(&setting.run)?;
+    let finding = measure(setting).await?;
+    let aws = identity::aws(setting, "workspace").await;
+    prepare(setting, &Archive::of_run(&aws, &plan.storage, &plan.run_id)).await?;
+    Ok(finding)
+}
+
+/// Whether the Pod's NetworkPolicy is enforced; an error if the run may not go on as it is.
+async fn measure(setting: &Setting) -> Result<Option<Finding>, WorkspaceError> {
+    let Some(asked) = &setting.run.isolation else {
+        return Ok(None);
+    };
+    let finding = isolation::find(asked, setting.api_server, setting.pace.enforced_within).await;
+    tracing::info!("{finding}");
+    if asked.enforcement == Enforcement::Require && !matches!(finding, Finding::Enforced(..)) {
+        return Err(WorkspaceError::NotIsolated(finding));
+    }
+    Ok(Some(finding))
+}
+
+/// Does the work, again and again while S3 does not answer.
+pub async fn prepare(setting: &Setting, archive: &Archive) -> Result<(), WorkspaceError> {
+    check(&setting.run)?;
+    copy_runner(&setting.places)?;
+    name_files::copy(&setting.places).map_err(|(path, error)| WorkspaceError::NameFile {
+        path: path.display().to_string(),
+        error,
+    })?;
+    let tree = folders(&setting.places.logs)?;
+    if is_prepared(&tree, &setting.pod_uid) {
+        // The node was restarted under the Pod: the volume is newer than what is stored, and the fence may be another's.
+        tracing::info!("this Pod's volume is prepared already");
+        return Ok(());
+    }
+    let mut pause = Duration::from_secs(1);
+    for _ in 1..TRIES {
+        match take(setting, archive, &tree).await {
+            Err(WorkspaceError::Storage(error)) if error.cause.is_transient() => tracing::warn!("{error}"),
+            other => return other,
+        }
+        tokio::time::sleep(pause.min(setting.pace.backoff)).await;
+        pause = pause.saturating_mul(2);
+    }
+    take(setting, archive, &tree).await
+}
+
+/// Takes the prefix for this Pod.
+async fn take(setting: &Setting, archive: &Archive, tree: &Arc<Tree>) -> Result<(), WorkspaceError> {
+    let run = &setting.run;
+    let mut gatherer = Gatherer::new(run, Arc::clone(tree))?;
+    let owner = Owner::new(setting.pod_uid.clone()).to_json();
+    match claim(run, archive).await? {
+        Claim::Fresh => {
+            // Names the prefix's owner before anything else is in it, so that a Pod that is lost early can be replaced.
+            let report = first_report(run, &setting.pod_uid, &mut gatherer);
+            let bytes = serde_json::to_vec(&report).unwrap_or_default();
+            archive.put(REPORT_KEY, bytes).await?;
+            archive.put(OWNER_KEY, owner).await?;
+        }
+        Claim::TakeUp => {
+            // The fence first: what a Pod before this one still stores, it stores before it next reads the fence, and what is
+            // restored is then the last of it.
+            archive.put(OWNER_KEY, owner).await?;
+            let restored = restore::restore(gatherer, run, archive, tree).await?;
+            tracing::info!(
+                files = restored.files,
+                bytes = restored.bytes,
+                "restored what was stored"
+            );
+        }
+    }
+    let noted = tree.write(PREPARED, setting.pod_uid.as_bytes());
+    noted.map_err(|error| WorkspaceError::Volume {
+        path: PREPARED.to_owned(),
+        error,
+    })
+}
+
+fn is_prepared(tree: &Tree, pod_uid: &str) -> bool {
+    let noted = tree.read(PREPARED, 1024).ok().flatten();
+    noted.is_some_and(|(bytes, _)| bytes == pod_uid.as_bytes())
+}
+
+/// What becomes of what is stored.
+#[derive(Clone, Copy, Debug, PartialEq, Eq)]
+enum Claim {
+    /// There is nothing.
+    Fresh,
+    /// It is ours, or the run goes on with it.
+    TakeUp,
+}
+
+async fn claim(run: &Run, archive: &Archive) -> Result<Claim, WorkspaceError> {
+    if run.plan.resume || run.attempt > Attempt::FIRST {
+        return Ok(Claim::TakeUp);
+    }
+    let stored = archive.get(REPORT_KEY, MAX_BYTES as u64).await?;
+    let stored = stored.and_then(|object| Report::parse(&object.bytes).ok());
+    if stored.is_some_and(|report| report.submission_uid == run.uid) {
+        return Ok(Claim::TakeUp);
+    }
+    // The controller may have taken the fence from a Pod that never came this far, and stored why it failed.
+    let controllers = [OWNER_KEY, FAILURE_LOG_KEY];
+    let there = archive.list("", controllers.len().saturating_add(1)).await?.objects;
+    if there.iter().all(|object| controllers.contains(&object.key.as_str())) {
+        return Ok(Claim::Fresh);
+    }
+    let plan = &run.plan;
+    let prefix = leaderboard_api::effective::key_prefix(&plan.storage, &plan.run_id);
+    Err(WorkspaceError::PrefixInUse(format!("{}/{prefix}", plan.storage.bucket)))
+}
+
+/// The report of a run in which nothing has happened, and nothing but it is stored.
+fn first_report(run: &Run, pod_uid: &str, gatherer: &mut Gatherer) -> Report {
+    Report {
+        files: BTreeMap::new(),
+        ..describe(run, pod_uid, &gatherer.round(), None)
+    }
+}
+
+/// Puts the runner where every container finds it, executable for every user.
+fn copy_runner(places: &Places) -> Result<(), WorkspaceError> {
+    let target = places.runner_for_all();
+    let copy = |target: &Path| {
+        let temporary = target.with_extension("tmp");
+        fs::copy(&places.runner, &temporary)?;
+        fs::set_permissions(&temporary, fs::Permissions::from_mode(0o755))?;
+        fs::rename(&temporary, target)
+    };
+    copy(&target).map_err(|error| WorkspaceError::Runner {
+        path: target.display().to_string(),
+        error,
+    })
+}
+
+fn folders(logs: &Path) -> Result<Arc<Tree>, WorkspaceError> {
+    let volume = |path: &str, error| WorkspaceError::Volume {
+        path: path.to_owned(),
+        error,
+    };
+    let tree = Tree::open(logs).map_err(|error| volume("/", error.into()))?;
+    for folder in FOLDERS {
+        tree.folder(folder).map_err(|error| volume(folder, error))?;
+    }
+    Ok(Arc::new(tree))
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+    use crate::isolation::Blocked;
+    use leaderboard_contract::verdict::{NotAVerdict, VERDICT_BYTES};
+    use leaderboard_evaluation::fixtures;
+
+    fn first() -> Report {
+        let (run, folder) = (fixtures::run(), tempfile::tempdir().unwrap());
+        let tree = Arc::new(Tree::open(folder.path()).unwrap());
+        first_report(&run, "pod-1", &mut Gatherer::new(&run, tree).unwrap())
+    }
+
+    #[test]
+    fn the_first_report_is_one_the_controller_takes() {
+        let report = first();
+        let read = Report::parse(&serde_json::to_vec(&report).unwrap()).unwrap();
+        assert!(read.belongs_to("uid-1", Attempt(1)) && !read.is_final);
+        assert_eq!((read.total, read.workers.len(), read.workers[1].total), (4, 2, 2));
+    }
+
+    #[test]
+    fn what_a_report_quotes_is_one_harmless_line() {
+        let mut report = first();
+        report.why = Some("pair 1: \u{1b}[2J\nbad".into());
+        report.warnings = vec!["\u{202e}route 1".into()];
+        report.entry_status = "Started\u{7}".into();
+        let read = Report::parse(&serde_json::to_vec(&report).unwrap()).unwrap();
+        assert_eq!(read.why.as_deref(), Some("pair 1: \u{fffd}[2J bad"));
+        assert_eq!(read.warnings, ["\u{fffd}route 1"]);
+        assert_eq!(read.entry_status, "Started\u{fffd}");
+    }
+
+    #[test]
+    fn what_a_pod_found_of_its_isolation_is_no_failure_unless_it_has_to_be_isolated() {
+        let address = "10.96.0.1:443".parse().unwrap();
+        for (finding, reason, required) in [
+            (
+                Finding::Enforced(address, Blocked::Silent),
+                WorkspaceReason::Enforced,
+                WorkspaceReason::NotIsolated,
+            ),
+            (
+                Finding::Open(address),
+                WorkspaceReason::NotEnforced,
+                WorkspaceReason::NotIsolated,
+            ),
+            (
+                Finding::Unmeasured("No address.".to_owned()),
+                WorkspaceReason::NotMeasured,
+                WorkspaceReason::NotKnownIsolated,
+            ),
+        ] {
+            let verdict = verdict_of(&finding);
+            assert_eq!(verdict.reason, reason);
+            assert_eq!(WorkspaceVerdict::parse(&verdict.to_json()), Ok(verdict));
+            let verdict = WorkspaceError::NotIsolated(finding).verdict();
+            assert_eq!(verdict.reason, required);
+            assert!(
+                verdict.message.contains("network.enforcement is Require"),
+                "{}",
+                verdict.message
+            );
+        }
+    }
+
+    #[test]
+    fn verdicts_are_short_and_read_back() {
+        let verdict = WorkspaceError::PrefixInUse("bucket/77/".to_owned()).verdict();
+        assert_eq!(verdict.reason, WorkspaceReason::PrefixInUse);
+        assert_eq!(WorkspaceVerdict::parse(&verdict.to_json()), Ok(verdict));
+        let long = WorkspaceError::PrefixInUse("é\"".repeat(3000)).verdict();
+        assert!(long.to_json().len() <= VERDICT_BYTES);
+        assert!(WorkspaceVerdict::parse(&long.to_json()).is_ok());
+        assert!(matches!(
+            WorkspaceVerdict::parse("Error"),
+            Err(NotAVerdict::Malformed(_))
+        ));
+    }
+}

@@ -1,0 +1,411 @@
+//! Brings back what earlier Pods of a run have stored, so that the agents go on where they were.
+//!
+//! Called by `workspace`. What is stored came from strangers' containers: keys are checked like paths, sizes against the
+//! run's limit. Status files speak of containers that are gone; they are dropped on both sides.
+//!
+//! The newest pipeline before this operator (carla-simulator/leaderboard-cloud, one Job for each worker) has the checkpoints of its
+//! workers at other keys. They are restored to where a pair's is.
+
+use std::collections::BTreeSet;
+use std::sync::Arc;
+
+use futures::{StreamExt, TryStreamExt};
+
+use super::WorkspaceError;
+use crate::blocking;
+use crate::daily::Daily;
+use crate::upload::quota::{LEAST, Quota};
+use crate::upload::{Memory, Stored, fingerprint};
+use leaderboard_api::names::FAILURE_LOG_KEY;
+use leaderboard_aws::archive::{Archive, Listed};
+use leaderboard_contract::keys::{EVALAI, MERGED, REFUSED, checkpoint_path};
+use leaderboard_contract::report::{OWNER_KEY, REPORT_KEY};
+use leaderboard_contract::run::{Run, STATUS_FOLDER};
+use leaderboard_evaluation::carla::gather::Gatherer;
+use leaderboard_evidence::{Stamp, Tree, TreeError, is_plain};
+use leaderboard_protocol::files::Pair;
+
+/// Most objects of a run.
+const MAX_OBJECTS: usize = 100_000;
+/// Downloads at once.
+const AT_ONCE: usize = 4;
+
+/// What was brought back.
+#[derive(Clone, Copy, Debug, Default, PartialEq, Eq)]
+pub struct Restored {
+    /// Files.
+    pub files: usize,
+    /// Their bytes.
+    pub bytes: u64,
+    /// Objects with impossible keys or beyond the limit.
+    pub left_out: usize,
+}
+
+/// Downloads what the run goes on with, and removes the stored status files.
+pub async fn restore(
+    gatherer: Gatherer,
+    run: &Run,
+    archive: &Archive,
+    tree: &Arc<Tree>,
+) -> Result<Restored, WorkspaceError> {
+    let statuses = archive.list(&format!("{STATUS_FOLDER}/"), MAX_OBJECTS).await?;
+    let keys: Vec<String> = statuses.objects.into_iter().map(|object| object.key).collect();
+    archive.delete(&keys).await?;
+
+    let listing = archive.list("", MAX_OBJECTS).await?;
+    if !listing.complete {
+        tracing::warn!("the prefix holds more than {MAX_OBJECTS} objects; the rest is not restored");
+    }
+    let limit = run.plan.storage.size_limit.bytes();
+    let chosen = choose(
+        listing.objects,
+        &Quota::new(limit, run.plan.workers()),
+        run.plan.workers(),
+    );
+    let others = chosen.others.iter().chain(&chosen.of_workers);
+    let others: Vec<(String, Stored)> = others
+        .map(|other| (other.key.clone(), Stored::unknown(other.size)))
+        .collect();
+    let of_workers = chosen.of_workers.len();
+    for object in chosen.of_workers {
+        let path = of_worker(&object.key).map(checkpoint_path).unwrap_or_default();
+        // Not known as stored: it gets a pair's key with the first upload.
+        download(archive, tree, object, &path).await?;
+    }
+    let stored = download_all(archive, tree, chosen.objects).await?;
+    let removed = blocking(move || gatherer.remove_others()).await;
+    removed
+        .map_err(TreeError::from)
+        .flatten()
+        .map_err(|error| volume("agent", error))?;
+    let mut memory = Memory {
+        stored: stored.into_iter().flatten().collect(),
+        sent: Daily::default(),
+    };
+    let restored = Restored {
+        files: memory.stored.len().saturating_add(of_workers),
+        bytes: memory.bytes(),
+        left_out: chosen.left_out,
+    };
+    // What is not restored is stored all the same, and counts.
+    memory.stored.extend(others);
+    memory.save(tree).map_err(|error| volume("logcopy", error))?;
+    if restored.left_out > 0 {
+        tracing::warn!(
+            objects = restored.left_out,
+            "not restored: impossible keys, or beyond storage.sizeLimit"
+        );
+    }
+    Ok(restored)
+}
+
+#[derive(Debug, PartialEq, Eq)]
+struct Chosen {
+    objects: Vec<Listed>,
+    /// The checkpoints of another pipeline's workers, each for the pair of its number.
+    of_workers: Vec<Listed>,
+    /// What stays in the bucket only.
+    others: Vec<Listed>,
+    /// How many of them are not left there on purpose.
+    left_out: usize,
+}
+
+/// What is restored: results and known logs first, then the smallest, so that no flood and no huge file keeps a checkpoint out.
+fn choose(objects: Vec<Listed>, quota: &Quota, pairs: usize) -> Chosen {
+    let not_counted = [OWNER_KEY, REPORT_KEY, FAILURE_LOG_KEY];
+    let (of_workers, objects) = checkpoints_of_workers(objects, quota, pairs);
+    let (mut objects, mut others): (Vec<_>, Vec<_>) = objects
+        .into_iter()
+        .filter(|object| !not_counted.contains(&object.key.as_str()))
+        .partition(|object| is_restored(&object.key, pairs));
+    let all = objects.len();
+    let shadowed = shadowed(&objects);
+    let mut keep = |objects: &mut Vec<Listed>, is_kept: &mut dyn FnMut(&Listed) -> bool| {
+        others.extend(objects.extract_if(.., |object| !is_kept(object)));
+    };
+    keep(&mut objects, &mut |object| {
+        object.key.contains('/') && is_plain(&object.key) && !shadowed.contains(&object.key)
+    });
+    objects.sort_by(|a, b| (quota.kind(&a.key), a.size, &a.key).cmp(&(quota.kind(&b.key), b.size, &b.key)));
+    let mut left = quota.bytes;
+    keep(&mut objects, &mut |object| {
+        let after = left.checked_sub(object.size.max(LEAST));
+        left = after.unwrap_or(left);
+        after.is_some()
+    });
+    Chosen {
+        left_out: all.saturating_sub(objects.len()),
+        objects,
+        of_workers,
+        others,
+    }
+}
+
+/// Takes out the checkpoints of the newest pipeline's workers that belong to pairs without one of their own. As many workers as pairs
+/// share the routes out as the pairs do; with another number each has other routes, and the run begins anew. Each worker has logs.
+fn checkpoints_of_workers(objects: Vec<Listed>, quota: &Quota, pairs: usize) -> (Vec<Listed>, Vec<Listed>) {
+    let workers = objects
+        .iter()
+        .filter_map(|object| of_worker(&object.key).or_else(|| log_of_worker(&object.key)));
+    if workers.max() != Pair::first(pairs).last() {
+        return (Vec::new(), objects);
+    }
+    let own: BTreeSet<String> = objects.iter().map(|object| object.key.clone()).collect();
+    let mut left = quota.bytes;
+    objects.into_iter().partition(|object| {
+        let is_free = of_worker(&object.key).is_some_and(|worker| !own.contains(&checkpoint_path(worker)));
+        let after = left.checked_sub(object.size).filter(|_| is_free);
+        left = after.unwrap_or(left);
+        after.is_some()
+    })
+}
+
+/// The number of the worker whose checkpoint a key is.
+fn of_worker(key: &str) -> Option<Pair> {
+    let worker = key.strip_prefix("agent/partial_agent_results")?.strip_suffix(".json")?;
+    worker.parse().ok()
+}
+
+/// The number of the worker one of whose containers has this log.
+fn log_of_worker(key: &str) -> Option<Pair> {
+    let (container, worker) = key.strip_prefix("logs/")?.strip_suffix(".log")?.split_once('-')?;
+    ["agent", "simulator", "uploader"]
+        .contains(&container)
+        .then(|| worker.parse().ok())?
+}
+
+/// Whether a key is one that the run goes on with.
+fn is_restored(key: &str, pairs: usize) -> bool {
+    // What logcopy makes from the checkpoints it makes again, and evidence is for people.
+    let unread = [&format!("{STATUS_FOLDER}/"), "logcopy/.", EVALAI, REFUSED];
+    key != MERGED && !unread.iter().any(|folder| key.starts_with(folder)) && !is_foreign_agent(key, pairs)
+}
+
+/// S3 can hold `a` next to `a/b`; a volume can't. These are such `a`.
+fn shadowed(objects: &[Listed]) -> BTreeSet<String> {
+    let keys: BTreeSet<&str> = objects.iter().map(|object| object.key.as_str()).collect();
+    let is_shadowed = |key: &&str| {
+        let folder = format!("{key}/");
+        keys.range(folder.as_str()..)
+            .next()
+            .is_some_and(|next| next.starts_with(&folder))
+    };
+    keys.iter().copied().filter(is_shadowed).map(str::to_owned).collect()
+}
+
+/// `agent/agent<n>/…` of a pair this run does not have.
+fn is_foreign_agent(key: &str, pairs: usize) -> bool {
+    let number = key.strip_prefix("agent/agent").and_then(|rest| rest.split_once('/'));
+    number.is_some_and(|(number, _)| !(1..=pairs).any(|pair| pair.to_string() == number))
+}
+
+async fn download_all(
+    archive: &Archive,
+    tree: &Arc<Tree>,
+    objects: Vec<Listed>,
+) -> Result<Vec<Option<(String, Stored)>>, WorkspaceError> {
+    let downloads = futures::stream::iter(objects).map(|object| async move {
+        let key = object.key.clone();
+        download(archive, tree, object, &key).await
+    });
+    downloads.buffer_unordered(AT_ONCE).try_collect().await
+}
+
+async fn download(
+    archive: &Archive,
+    tree: &Arc<Tree>,
+    object: Listed,
+    path: &str,
+) -> Result<Option<(String, Stored)>, WorkspaceError> {
+    let local = |error: TreeError| volume(path, error);
+    let (creating, key) = (Arc::clone(tree), path.to_owned());
+    let created = blocking(move || creating.create(&key)).await;
+    let created = created.map_err(TreeError::from).flatten().map_err(local)?;
+    let mut file = tokio::fs::File::from_std(created);
+    // A little more than the list showed, for an object that was replaced since.
+    let limit = object.size.saturating_mul(2).max(1 << 20);
+    let Some(size) = archive.download(&object.key, &mut file, limit).await? else {
+        return Ok(None);
+    };
+    drop(file);
+    let (reading, key) = (Arc::clone(tree), path.to_owned());
+    let read = blocking(move || fingerprint_of(&reading, &key)).await;
+    let Some((fingerprint, stamp)) = read.map_err(TreeError::from).flatten().map_err(local)? else {
+        return Ok(None);
+    };
+    // Known as stored only if it is what the list showed the tag of.
+    let etag = object.etag.filter(|_| size == object.size);
+    let stored = Stored {
+        fingerprint,
+        stamp: Stamp { size, ..stamp },
+        etag,
+        at: std::time::Duration::ZERO,
+    };
+    Ok(Some((object.key, stored)))
+}
+
+fn fingerprint_of(tree: &Tree, path: &str) -> Result<Option<(String, Stamp)>, TreeError> {
+    let Some((file, stamp)) = tree.file(path)? else {
+        return Ok(None);
+    };
+    Ok(Some((fingerprint(&file, stamp.size)?, stamp)))
+}
+
+fn volume(path: &str, error: TreeError) -> WorkspaceError {
+    WorkspaceError::Volume {
+        path: path.to_owned(),
+        error,
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    const MIB: u64 = 1 << 20;
+
+    fn listed(key: &str, size: u64) -> Listed {
+        Listed {
+            key: key.to_owned(),
+            size,
+            etag: None,
+            stored: None,
+        }
+    }
+
+    fn keys(chosen: &Chosen) -> Vec<&str> {
+        chosen.objects.iter().map(|object| object.key.as_str()).collect()
+    }
+
+    #[test]
+    fn what_belongs_to_the_run_is_restored_and_nothing_else() {
+        let objects = vec![
+            listed("agent/agent1/agent_results.json", 10),
+            listed("agent/agent2/leaderboard.log", 20),
+            listed("agent/agent3/agent_results.json", 10),
+            listed("agent/agent10/agent_results.json", 10),
+            listed("agent/agent01/agent_results.json", 10),
+            listed("agent/agent_results.json", 30),
+            listed("containers-status/agent-1.done", 0),
+            listed("logcopy/report.json", 5),
+            listed("logcopy/owner", 5),
+            listed("evalai/environment_log.txt", 5),
+            listed("evalai/metadata.json", 30),
+            listed("logcopy/refused/agent/agent1/agent_results.json", 5),
+            listed("logcopy/.stored.json", 5),
+            listed("logcopy/logcopy.log", 40),
+        ];
+        let chosen = choose(objects, &Quota::new(MIB, 2), 2);
+        let expected = [
+            "agent/agent1/agent_results.json",
+            "agent/agent2/leaderboard.log",
+            "logcopy/logcopy.log",
+        ];
+        assert_eq!((keys(&chosen), chosen.left_out), (expected.to_vec(), 0));
+    }
+
+    #[test]
+    fn the_checkpoints_of_as_many_workers_as_pairs_are_those_of_the_pairs() {
+        let partial = |worker: &str| format!("agent/partial_agent_results{worker}.json");
+        for (keys, taken) in [
+            (vec![partial("1"), partial("2")], vec![partial("1"), partial("2")]),
+            // The second worker has begun, and has no route yet.
+            (vec![partial("1"), "logs/uploader-2.log".into()], vec![partial("1")]),
+            // Of two pairs and one worker, or three workers, each has other routes.
+            (vec![partial("1")], vec![]),
+            (vec![partial("1"), partial("2"), partial("3")], vec![]),
+            (vec![partial("1"), partial("2"), "logs/agent-3.log".into()], vec![]),
+            // The pair has gone on since.
+            (
+                vec![partial("1"), partial("2"), "agent/agent1/agent_results.json".into()],
+                vec![partial("2")],
+            ),
+            (
+                vec![partial("01"), partial("2"), partial(""), partial("0"), partial("-1")],
+                vec![partial("2")],
+            ),
+        ] {
+            let objects = keys.iter().map(|key| listed(key, 10)).collect();
+            let chosen = choose(objects, &Quota::new(MIB, 2), 2);
+            let found: Vec<_> = chosen.of_workers.iter().map(|object| object.key.clone()).collect();
+            assert_eq!(found, taken, "{keys:?}");
+            assert!(
+                chosen.objects.iter().all(|object| !taken.contains(&object.key)),
+                "{keys:?}"
+            );
+        }
+        let large = vec![listed(&partial("1"), 2 * MIB), listed(&partial("2"), 10)];
+        let chosen = choose(large, &Quota::new(MIB, 2), 2);
+        assert_eq!(chosen.of_workers.len(), 1, "within the limit of the run");
+    }
+
+    #[test]
+    fn keys_that_lead_elsewhere_are_left_out() {
+        let objects = [
+            "../x",
+            "/etc/x",
+            "simulator/../../x",
+            "simulator//x",
+            "plain",
+            "simulator/",
+            "simulator/x",
+        ];
+        let objects = objects.iter().map(|key| listed(key, 1)).collect();
+        let chosen = choose(objects, &Quota::new(MIB, 2), 2);
+        assert_eq!((keys(&chosen), chosen.left_out), (vec!["simulator/x"], 6));
+    }
+
+    #[test]
+    fn a_key_that_is_also_a_folder_is_left_out() {
+        let objects = vec![
+            listed("simulator/a", 1),
+            listed("simulator/a/b", 1),
+            listed("simulator/a-b", 1),
+        ];
+        assert_eq!(
+            keys(&choose(objects, &Quota::new(MIB, 1), 1)),
+            ["simulator/a-b", "simulator/a/b"]
+        );
+    }
+
+    #[test]
+    fn what_is_not_restored_counts_all_the_same() {
+        let objects = vec![
+            listed("agent/agent_results.json", 30),
+            listed("agent/agent3/leaderboard.log", 20),
+            listed("logcopy/refused/agent/agent1/agent_results.json", 5),
+            listed("logcopy/report.json", 5),
+            listed("plain", 6),
+        ];
+        let chosen = choose(objects, &Quota::new(MIB, 2), 2);
+        assert_eq!(keys(&chosen), Vec::<&str>::new());
+        let others: Vec<&str> = chosen.others.iter().map(|object| object.key.as_str()).collect();
+        let expected = [
+            "agent/agent_results.json",
+            "agent/agent3/leaderboard.log",
+            "logcopy/refused/agent/agent1/agent_results.json",
+            "plain",
+        ];
+        assert_eq!((others, chosen.left_out), (expected.to_vec(), 1));
+    }
+
+    #[test]
+    fn the_limit_leaves_out_the_largest_of_the_other_files() {
+        let objects = vec![
+            listed("agent/agent1/a", 0),
+            listed("agent/agent1/agent_results.json", MIB / 2),
+            listed("agent/agent1/leaderboard.log", MIB / 2 - 2 * LEAST),
+            listed("agent/agent1/b", 9),
+            listed("agent/agent1/c", 10),
+        ];
+        let chosen = choose(objects, &Quota::new(MIB, 1), 1);
+        let expected = [
+            "agent/agent1/agent_results.json",
+            "agent/agent1/leaderboard.log",
+            "agent/agent1/a",
+            "agent/agent1/b",
+        ];
+        assert_eq!((keys(&chosen), chosen.left_out), (expected.to_vec(), 1));
+        assert_eq!(chosen.others.len(), 1);
+    }
+}

@@ -1,0 +1,333 @@
+//! What a Leaderboard's status shows, and when it may go: a pure function of what one reconcile has read.
+
+use std::sync::Arc;
+
+use jiff::Timestamp;
+use k8s_openapi::apimachinery::pkg::apis::meta::v1::Time;
+
+use super::refusal::Refusal;
+use super::view::{Claims, EvalaiStanding, Policy, Unreachable};
+use crate::submissions::previous_controller;
+use leaderboard_api::conditions::{self, Truth};
+use leaderboard_api::leaderboard::Counts;
+use leaderboard_api::{
+    Evalai, EvalaiUse, Leaderboard, LeaderboardStatus, ResourceExt, TableUse, TeamUse, Track, TrackStatus, effective,
+    names, reasons,
+};
+use leaderboard_contract::verdict::WorkspaceVerdict;
+
+const CLAIMS_NOT_SERVED: &str = "gpu.mode is Claim, and the API server does not serve resource.k8s.io/v1, which Kubernetes has from 1.34 on. \
+                                 Update the cluster, or choose another gpu.mode.";
+const FIRST_LOOK: &str = "The bucket and whatever else the Leaderboard names are being asked for the first time, and not all have answered yet.";
+/// What the host of a Leaderboard that only observes is to know.
+const OBSERVES: &str = "evalai.mode is Observe: nothing is written to EvalAI.";
+
+/// What one reconcile has read of a Leaderboard.
+#[derive(Clone, Debug)]
+pub struct LeaderboardView {
+    pub now: Timestamp,
+    pub leaderboard: Arc<Leaderboard>,
+    /// All Leaderboards that the operator watches, this one included.
+    pub all: Vec<Arc<Leaderboard>>,
+    pub counts: Counts,
+    /// Its teams that have used the most.
+    pub gpu_use: Vec<TeamUse>,
+    /// Submissions that are live or not yet published and recorded.
+    pub in_use: usize,
+    /// The note about images that several teams lack.
+    pub image_note: Option<String>,
+    /// Its Pods that have not ended, counted while it is being deleted.
+    pub pods: usize,
+    /// How the NetworkPolicy of its Pods stands.
+    pub policy: Policy,
+    /// What the last of its Pods has found of its isolation.
+    pub measured: Option<WorkspaceVerdict>,
+    /// What it names and may not; nothing of it is asked or read then.
+    pub refusal: Option<Refusal>,
+    /// Whether all that follows was looked at as the present spec has it. Until then it is no ground for anything.
+    pub is_looked_at: bool,
+    /// Why its Pods could not be made.
+    pub invalid_pod: Option<String>,
+    /// What its host should know of its Pods all the same.
+    pub pod_notes: Vec<String>,
+    /// How the template of its claims stands.
+    pub claims: Claims,
+    /// What of its bucket, table and queues cannot be reached.
+    pub unreachable: Option<Unreachable>,
+    /// What its host should know of places that it can do without.
+    pub place_notes: Vec<String>,
+    pub evalai: EvalaiStanding,
+    /// Until when nothing is written to EvalAI, because the controller before may still have requests under way.
+    pub evalai_writes_from: Option<Timestamp>,
+    /// How the requests of its token are used.
+    pub usage: Option<EvalaiUse>,
+    /// Rows that have waited for its table for a while.
+    pub rows_waiting: Option<usize>,
+}
+
+/// What a reconcile has to do.
+#[derive(Clone, Debug, PartialEq)]
+pub struct LeaderboardPlan {
+    pub status: LeaderboardStatus,
+    /// Put the finalizer on (`true`) or take it off (`false`).
+    pub finalizer: Option<bool>,
+}
+
+/// Decides one reconcile.
+pub fn decide(view: &LeaderboardView) -> LeaderboardPlan {
+    let leaderboard = &view.leaderboard;
+    let mut status = leaderboard.status.clone().unwrap_or_default();
+    let generation = leaderboard.metadata.generation;
+    if view.is_looked_at {
+        status.observed_generation = generation;
+    }
+    status.counts = Some(view.counts);
+    status.gpu_use.clone_from(&view.gpu_use);
+    status.evalai = view.usage.clone().filter(|_| view.refusal.is_none());
+    status.table = view.rows_waiting.filter(|waiting| *waiting > 0).map(table_use);
+    status.tracks = tracks(leaderboard);
+    let now = Time(view.now);
+    let set = |status: &mut LeaderboardStatus, type_, (truth, reason, message): (Truth, &str, String)| {
+        conditions::set(&mut status.conditions, type_, truth, reason, &message, generation, &now);
+    };
+    if let Some(ready) = ready(view) {
+        set(&mut status, conditions::READY, with_notes(view, ready));
+    }
+    let isolated = crate::leaderboards::isolated::condition(leaderboard, &view.policy, view.measured.as_ref());
+    set(&mut status, conditions::ISOLATED, isolated);
+    let deleting = leaderboard.metadata.deletion_timestamp.is_some();
+    let is_in_use = view.in_use > 0 || view.pods > 0;
+    if deleting && is_in_use {
+        let in_use = (Truth::True, reasons::IN_USE, in_use(view));
+        set(&mut status, conditions::TERMINATING, in_use);
+    }
+    let held = leaderboard
+        .finalizers()
+        .iter()
+        .any(|f| f == names::FINALIZER_LEADERBOARD);
+    let finalizer = match (deleting, held) {
+        (false, false) => Some(true),
+        (true, true) if !is_in_use => Some(false),
+        _ => None,
+    };
+    LeaderboardPlan { status, finalizer }
+}
+
+fn table_use(waiting: usize) -> TableUse {
+    TableUse {
+        waiting: i32::try_from(waiting).unwrap_or(i32::MAX),
+    }
+}
+
+/// What keeps a Leaderboard that is being deleted. With it goes its NetworkPolicy, which has to outlive the last Pod.
+fn in_use(view: &LeaderboardView) -> String {
+    match (view.in_use, view.pods) {
+        (0, pods) => {
+            format!("{pods} Pods still run; the Leaderboard and its NetworkPolicy are removed when they have ended.")
+        }
+        (submissions, _) => {
+            format!("{submissions} submissions are live or unpublished; the Leaderboard is removed when they are done.")
+        }
+    }
+}
+
+/// The first thing that is wrong, the gravest first; what nobody knows comes after what is surely wrong. None: what was shown of an earlier
+/// spec, or by the controller before, stays until the first look has ended.
+fn ready(view: &LeaderboardView) -> Option<(Truth, &'static str, String)> {
+    if let Some(wrong) = of_spec(view) {
+        return Some(wrong);
+    }
+    if view.is_looked_at {
+        return Some(found(view));
+    }
+    let is_new = view.leaderboard.condition(conditions::READY).is_none();
+    is_new.then(|| (Truth::Unknown, reasons::CHECKING, FIRST_LOOK.to_owned()))
+}
+
+/// What the looks at its places and EvalAI have found.
+fn found(view: &LeaderboardView) -> (Truth, &'static str, String) {
+    let unreachable = |truth| view.unreachable.as_ref().filter(|found| found.truth == truth);
+    let (evalai_truth, reason, message) = evalai(&view.evalai);
+    if let Some(found) = unreachable(Truth::False) {
+        return (Truth::False, found.reason, found.message.clone());
+    }
+    match unreachable(Truth::Unknown) {
+        Some(found) if evalai_truth != Truth::False => (Truth::Unknown, found.reason, found.message.clone()),
+        _ => (evalai_truth, reason, message),
+    }
+}
+
+/// A Leaderboard that is ready shows what its host should know all the same: that a new controller waits with its first write to
+/// EvalAI, which runs have no limit, which images several teams lack, and what its Pods give to strangers.
+fn with_notes(view: &LeaderboardView, ready: (Truth, &'static str, String)) -> (Truth, &'static str, String) {
+    let (truth, reason, message) = ready;
+    if truth != Truth::True {
+        return (truth, reason, message);
+    }
+    let spec = &view.leaderboard.spec;
+    let delay = view.evalai_writes_from.filter(|_| spec.evalai.is_some());
+    let observes = spec.observes().then(|| OBSERVES.to_owned());
+    let notes = [
+        observes,
+        delay.map(previous_controller),
+        without_limit(&view.leaderboard),
+    ];
+    let texts = [Some(message)].into_iter().chain(notes).flatten();
+    let texts = texts.chain(view.image_note.clone());
+    let texts = texts.chain(view.pod_notes.iter().chain(&view.place_notes).cloned());
+    let texts: Vec<String> = texts.filter(|text| !text.is_empty()).collect();
+    (truth, reason, texts.join(" "))
+}
+
+/// What is wrong with the Leaderboard as it is written.
+fn of_spec(view: &LeaderboardView) -> Option<(Truth, &'static str, String)> {
+    let no = |reason, message: String| Some((Truth::False, reason, message));
+    if let Some(refusal) = &view.refusal {
+        return no(refusal.reason, refusal.message.clone());
+    }
+    if let Some(older) = phase_conflict(view) {
+        return no(
+            reasons::PHASE_CONFLICT,
+            format!("Leaderboard {older} is older and serves a phase of this one; give each phase to one Leaderboard."),
+        );
+    }
+    if let Some(older) = prefix_conflict(view) {
+        return no(
+            reasons::PREFIX_CONFLICT,
+            format!(
+                "Leaderboard {older} is older, of another namespace or another EvalAI server, and stores below the same bucket and prefix: \
+                 the runs of one could replace those of the other. Make this one anew with a storage.prefix of its own."
+            ),
+        );
+    }
+    if let Some(why) = &view.invalid_pod {
+        return no(reasons::INVALID_POD, why.clone());
+    }
+    match &view.claims {
+        Claims::NotServed => return no(reasons::CLAIMS_NOT_SERVED, CLAIMS_NOT_SERVED.to_owned()),
+        Claims::Missing(why) => return no(reasons::CLAIM_TEMPLATE_MISSING, why.clone()),
+        Claims::NotRequired | Claims::InPlace => {}
+    }
+    match &view.policy {
+        Policy::Refused(why) | Policy::NotApplied(why) => no(reasons::NOT_ISOLATED, why.clone()),
+        Policy::InPlace | Policy::External => None,
+    }
+}
+
+fn evalai(standing: &EvalaiStanding) -> (Truth, &'static str, String) {
+    let no = |reason, message: String| (Truth::False, reason, message);
+    match standing {
+        EvalaiStanding::NoToken(why) => no(reasons::TOKEN_MISSING, why.clone()),
+        EvalaiStanding::TokenRefused(why) => no(reasons::TOKEN_REFUSED, why.clone()),
+        EvalaiStanding::QueueUnread { is_refused: true, why } => no(reasons::QUEUE_UNREACHABLE, why.clone()),
+        EvalaiStanding::QueueUnread { why, .. } => {
+            let message = format!("EvalAI's queue has not been read for minutes: {why}. It is retried each minute.");
+            (Truth::Unknown, reasons::QUEUE_UNREACHABLE, message)
+        }
+        EvalaiStanding::Misfit(why) => no(reasons::LABELS_DIFFER, why.clone()),
+        EvalaiStanding::Unchecked(why) => {
+            let why = why
+                .clone()
+                .unwrap_or_else(|| "EvalAI is being asked for its phases and labels.".into());
+            (Truth::Unknown, reasons::ASKING_EVALAI, why)
+        }
+        EvalaiStanding::Fits { note } => (Truth::True, reasons::READY, note.clone().unwrap_or_default()),
+        EvalaiStanding::NotRequired => (Truth::True, reasons::READY, String::new()),
+    }
+}
+
+/// An older Leaderboard of the same server that serves one of our phases.
+fn phase_conflict(view: &LeaderboardView) -> Option<String> {
+    let mine = &view.leaderboard;
+    let server = server(mine)?;
+    let phases: Vec<i64> = mine.spec.tracks.iter().filter_map(|t| t.phase).collect();
+    let others = others(view).filter(|l| self::server(l).as_deref() == Some(server.as_str()) && is_older(l, mine));
+    others
+        .filter(|l| {
+            l.spec
+                .tracks
+                .iter()
+                .any(|t| t.phase.is_some_and(|p| phases.contains(&p)))
+        })
+        .map(|l| qualified(l))
+        .next()
+}
+
+/// An older Leaderboard below whose prefix ours could come upon runs that it takes for its own: ids of runs are unique in one namespace
+/// for one server.
+fn prefix_conflict(view: &LeaderboardView) -> Option<String> {
+    let mine = &view.leaderboard;
+    let place = |l: &Leaderboard| {
+        (
+            l.spec.storage.bucket.clone(),
+            l.spec.storage.prefix.clone(),
+            l.spec.storage.endpoint.clone(),
+        )
+    };
+    let others = others(view).filter(|l| place(l) == place(mine) && is_older(l, mine));
+    let foreign = |l: &&Arc<Leaderboard>| {
+        let is_of_other_server = matches!((server(l), server(mine)), (Some(a), Some(b)) if a != b);
+        is_of_other_server || l.namespace() != mine.namespace()
+    };
+    others.filter(|l| foreign(l)).map(|l| qualified(l)).next()
+}
+
+fn others(view: &LeaderboardView) -> impl Iterator<Item = &Arc<Leaderboard>> {
+    view.all
+        .iter()
+        .filter(|l| l.uid() != view.leaderboard.uid() && l.metadata.deletion_timestamp.is_none())
+}
+
+fn server(leaderboard: &Leaderboard) -> Option<String> {
+    leaderboard.spec.evalai.as_ref().map(Evalai::server)
+}
+
+fn is_older(one: &Leaderboard, other: &Leaderboard) -> bool {
+    one.seniority() < other.seniority()
+}
+
+fn qualified(leaderboard: &Leaderboard) -> String {
+    format!(
+        "{}/{}",
+        leaderboard.namespace().unwrap_or_default(),
+        leaderboard.name_any()
+    )
+}
+
+fn tracks(leaderboard: &Leaderboard) -> Vec<TrackStatus> {
+    let number = |count| i32::try_from(count).unwrap_or(i32::MAX);
+    let status = |track: &Track| {
+        let shape = effective::shape(&leaderboard.spec, track);
+        TrackStatus {
+            name: track.name.clone(),
+            pairs: number(shape.pairs),
+            routes: number(shape.routes),
+            repetitions: number(shape.repetitions),
+        }
+    };
+    leaderboard.spec.tracks.iter().map(status).collect()
+}
+
+/// Tracks whose runs have no time limit, as a note.
+fn without_limit(leaderboard: &Leaderboard) -> Option<String> {
+    let spec = &leaderboard.spec;
+    let has_none = |track: &&Track| effective::deadlines(spec, Some(*track)).run_seconds.is_none();
+    let names: Vec<&str> = spec
+        .tracks
+        .iter()
+        .filter(has_none)
+        .map(|track| track.name.as_str())
+        .collect();
+    let (runs, names) = match names.as_slice() {
+        [] => return None,
+        [one] => ("Runs of the track", (*one).to_owned()),
+        several => ("Runs of the tracks", several.join(", ")),
+    };
+    Some(format!(
+        "{runs} {names} have no time limit: an agent that does not end keeps its nodes until it is cancelled; set \
+         deadlines.runSeconds."
+    ))
+}
+
+#[cfg(test)]
+mod tests;

@@ -1,0 +1,6 @@
+//! What a Leaderboard's status shows (`decide`), and what it names and may not (`refusal`).
+
+pub mod decide;
+pub mod isolated;
+pub mod refusal;
+pub mod view;

@@ -1,0 +1,211 @@
+//! A report reduced to what decisions and the table need: under 1.5 KB while the run goes on, whatever the report embeds.
+
+use serde_json::{Map, Value};
+
+use leaderboard_api::text::one_line;
+use leaderboard_api::{Attempt, Metric, Progress, Score};
+use leaderboard_contract::report::{ContentId, Logs, Report, ReportError, ReportWorker};
+use leaderboard_contract::run::Stop;
+use leaderboard_evaluation::carla;
+
+/// Largest text that is passed on to EvalAI, in bytes.
+pub const MAX_TEXT: u64 = 4 << 20;
+/// Where logcopy puts the texts for EvalAI, below the run's prefix.
+pub const STDOUT_KEY: &str = "evalai/stdout.txt";
+pub const METADATA_KEY: &str = "evalai/metadata.json";
+/// Longest text of a report that is kept, in characters.
+const LONGEST: usize = 500;
+
+/// What is kept of a report. Its texts are read again when they are published.
+#[derive(Clone, Debug, Default, PartialEq)]
+pub struct ReportDigest {
+    pub id: ContentId,
+    pub attempt: Attempt,
+    /// UID of the Pod that wrote it.
+    pub pod_uid: String,
+    pub done: u32,
+    pub total: u32,
+    pub unit: String,
+    pub workers: Vec<ReportWorker>,
+    pub score: Option<Metric>,
+    /// The numbers that the status shows beside the score.
+    pub metrics: Vec<Metric>,
+    pub is_final: bool,
+    pub eligible: bool,
+    pub entry_status: String,
+    pub stopped: Option<Stop>,
+    /// Why a checkpoint was refused for good.
+    pub why: Option<String>,
+    /// The first warning.
+    pub warning: Option<String>,
+    /// Whether the lines of the run come to CloudWatch.
+    pub logs: Option<Logs>,
+    /// The agents' folders fill the volume of the logs.
+    pub agents_fill_disk: bool,
+    /// The metrics of a final report, for the table.
+    pub accuracies: Option<Box<Map<String, Value>>>,
+    /// Why EvalAI is not sent one of its texts.
+    pub left_out: Option<Box<str>>,
+}
+
+impl ReportDigest {
+    /// Reads a report as hostile text. None: it is of another object.
+    pub fn read(bytes: &[u8], uid: &str) -> Result<Option<Self>, ReportError> {
+        let report = Report::parse(bytes)?;
+        let is_of = report.submission_uid == uid;
+        Ok(is_of.then(|| Self::of(&report, ContentId::of(bytes))))
+    }
+
+    /// Whether the whole run is done, and nothing more comes.
+    pub fn is_complete(&self) -> bool {
+        self.is_final && self.done == self.total && self.total > 0
+    }
+
+    /// Whether it shows how a run came to its own end, whatever becomes of its Job. Of one that was stopped by a person or for its node
+    /// only results that count do: another Job may go on, which stores no report of its own before its first round.
+    pub fn is_verdict(&self) -> bool {
+        let goes_on = matches!(self.stopped, Some(Stop::Interruption | Stop::Cancel));
+        let is_decided = self.is_complete() || (self.is_final && self.why.is_some());
+        is_decided && (self.eligible || !goes_on)
+    }
+
+    pub fn progress(&self) -> Progress {
+        Progress::new(clamp(self.done), clamp(self.total), &self.unit)
+    }
+
+    /// The score so far, or of the whole run.
+    pub fn score(&self, is_final: bool) -> Option<Score> {
+        Some(Score::new(self.score.clone()?, is_final))
+    }
+
+    pub fn of(report: &Report, id: ContentId) -> Self {
+        Self {
+            id,
+            attempt: report.attempt,
+            pod_uid: cut(&report.pod_uid),
+            done: report.done,
+            total: report.total,
+            unit: report.unit.clone(),
+            workers: report.workers.clone(),
+            score: report.score.clone(),
+            metrics: report.metrics.clone(),
+            is_final: report.is_final,
+            eligible: report.eligible,
+            entry_status: cut(&report.entry_status),
+            stopped: report.stopped,
+            why: report.why.as_deref().filter(|_| report.is_final).map(cut),
+            warning: report.warnings.first().map(|warning| cut(warning)),
+            logs: report.logs.as_ref().map(|logs| match logs {
+                Logs::Sent => Logs::Sent,
+                Logs::Refused(why) => Logs::Refused(cut(why)),
+            }),
+            agents_fill_disk: report.agents_fill_disk,
+            accuracies: report.is_final.then(|| accuracies(&report.results)).flatten(),
+            left_out: left_out(report).map(Into::into),
+        }
+    }
+}
+
+/// The metrics that a table has columns for, of either format.
+fn accuracies(results: &str) -> Option<Box<Map<String, Value>>> {
+    let mut parsed: Value = serde_json::from_str(results).ok()?;
+    let all = parsed.get_mut(0)?.get_mut("accuracies")?.as_object_mut()?;
+    let kept = carla::columns().filter_map(|name| all.remove_entry(name));
+    Some(Box::new(kept.collect()))
+}
+
+/// A number of a report as the status has it.
+pub fn clamp(number: u32) -> i32 {
+    i32::try_from(number).unwrap_or(i32::MAX)
+}
+
+fn cut(text: &str) -> String {
+    one_line(text, LONGEST)
+}
+
+#[cfg(test)]
+impl From<&Report> for ReportDigest {
+    fn from(report: &Report) -> Self {
+        Self::of(report, ContentId::of(&serde_json::to_vec(report).unwrap()))
+    }
+}
+
+/// Why a text is left out of what EvalAI is sent of a report, for people.
+pub fn left_out(report: &Report) -> Option<String> {
+    let files = [STDOUT_KEY, METADATA_KEY].map(|key| Some((key, report.files.get(key)?)));
+    let (key, file) = files.into_iter().flatten().find(|(_, file)| file.size > MAX_TEXT)?;
+    let (size, limit) = (file.size, MAX_TEXT >> 20);
+    Some(format!(
+        "{key} was left out: it has {size} bytes, and EvalAI is sent texts of up to {limit} MiB. It is in the bucket."
+    ))
+}
+
+#[cfg(test)]
+mod tests {
+    use serde_json::json;
+
+    use super::*;
+
+    /// A report of a real size: 40 kB of results, two workers.
+    fn report(is_final: bool) -> Vec<u8> {
+        let worker = |id: u32| json!({"id": id, "done": 10, "total": 10, "crashes": 1, "state": "Running"});
+        let accuracies = json!({"Driving score": 43.125, "other": "x".repeat(40_000)});
+        json!({
+            "schema": 1, "submissionUid": "u", "attempt": 1, "podUid": "0a86cbb5-8f3c-4a55-b5a1-9a4ff7a5c9a2", "round": 9,
+            "done": 20, "total": 20, "unit": "routes", "workers": [worker(1), worker(2)],
+            "score": {"name": "Driving score", "value": "43.13"},
+            "metrics": [{"name": "Route completion", "value": "80.00"}, {"name": "Infraction penalty", "value": "0.515"}], "final": is_final, "eligible": is_final,
+            "entryStatus": "Finished", "why": "w".repeat(9_000), "warnings": vec!["v".repeat(9_000); 9],
+            "results": json!([{"accuracies": accuracies}]).to_string(), "partialResults": "p".repeat(40_000),
+            "files": {"evalai/stdout.txt": {"size": 9, "sha256": "0".repeat(64)}},
+        })
+        .to_string()
+        .into_bytes()
+    }
+
+    fn size(digest: &ReportDigest) -> usize {
+        let texts = [
+            Some(&digest.pod_uid),
+            Some(&digest.entry_status),
+            digest.why.as_ref(),
+            digest.warning.as_ref(),
+        ];
+        let workers = digest.workers.len() * size_of::<ReportWorker>();
+        let metric = |metric: &Metric| size_of::<Metric>() + metric.name.capacity() + metric.value.capacity();
+        let metrics: usize = digest.score.iter().chain(&digest.metrics).map(metric).sum();
+        size_of::<ReportDigest>() + workers + metrics + texts.into_iter().flatten().map(String::capacity).sum::<usize>()
+    }
+
+    #[test]
+    fn a_live_report_of_a_real_size_is_kept_in_less_than_one_and_a_half_kilobytes() {
+        let bytes = report(false);
+        assert!(bytes.len() > 80_000);
+        let digest = ReportDigest::read(&bytes, "u").unwrap().unwrap();
+        assert!(size(&digest) < 1536, "{} bytes", size(&digest));
+        assert_eq!((digest.accuracies, digest.why), (None, None));
+        let score = digest.score.map(|score| score.value);
+        assert_eq!(
+            (digest.done, digest.workers.len(), score.as_deref()),
+            (20, 2, Some("43.13"))
+        );
+    }
+
+    #[test]
+    fn a_final_report_keeps_the_metrics_of_the_table_alone() {
+        let digest = ReportDigest::read(&report(true), "u").unwrap().unwrap();
+        let metrics = digest.accuracies.unwrap();
+        assert_eq!(serde_json::to_string(&metrics).unwrap(), r#"{"Driving score":43.125}"#);
+        assert_eq!(digest.why.unwrap().chars().count(), LONGEST);
+    }
+
+    #[test]
+    fn a_report_of_another_object_is_recognized() {
+        assert_eq!(ReportDigest::read(&report(true), "v").unwrap(), None);
+        assert!(
+            ReportDigest::read(b"torn", "u")
+                .unwrap_err()
+                .to_string()
+                .contains("not one of ours")
+        );
+    }
+}

@@ -1,0 +1,319 @@
+//! Acceptance: a Leaderboard, EvalAI's word, a team, a track and an image. Then the plan is pinned: what is run stays as it was accepted,
+//! however the Leaderboard is edited.
+
+use std::time::Duration;
+
+use k8s_openapi::apimachinery::pkg::apis::meta::v1::Time;
+
+use super::end;
+use super::failure::{self, charged};
+use super::gates::{self, Gate};
+use super::plan::{Action, Question};
+use super::status::PlanBuilder;
+use super::waits::Wait;
+use crate::view::Standing;
+use leaderboard_api::conditions::{self, Truth};
+use leaderboard_api::evalai_status::Status;
+use leaderboard_api::text::{LONGEST_NAME, one_line, sentence};
+use leaderboard_api::{
+    Attempt, Failure, ImagePattern, ImageReference, LeaderboardSpec, Repository, RunPlan, Team, TeamStatus, Track,
+    effective, image_pattern, reasons,
+};
+
+/// Whether the plan is pinned, and the submission may go on to its turn. Otherwise the draft shows why not. EvalAI's own end goes before all
+/// that it may wait for, and the look for another program before anything that could end it: an end is written over what that one writes.
+pub(super) fn decide(draft: &mut PlanBuilder<'_>) -> bool {
+    let Some(leaderboard) = draft.leaderboard() else {
+        let message = draft.no_leaderboard();
+        draft.refuse(reasons::LEADERBOARD_NOT_FOUND, &message);
+        return false;
+    };
+    // Before anything of it is looked at: the bucket and the table may be somebody else's.
+    if let Some(why) = &draft.view.not_allowed {
+        let message = gates::leaderboard_not_ready(draft, reasons::NOT_ALLOWED, why);
+        draft.refuse(reasons::LEADERBOARD_NOT_READY, &message);
+        return false;
+    }
+    if !is_wanted(draft) {
+        return false;
+    }
+    take_team(draft);
+    let Some(track) = find_track(draft, leaderboard) else {
+        let message = missing_track(draft, leaderboard);
+        draft.refuse(reasons::TRACK_NOT_FOUND, &message);
+        return false;
+    };
+    draft.status.track = Some(track.name.clone());
+    if gates::closed(draft, &[Gate::OtherProgram, Gate::Phase]).is_some() {
+        return false;
+    }
+    let Some(image) = allowed_image(draft, leaderboard, track) else {
+        return false;
+    };
+    if gates::closed(draft, &[Gate::Leaderboard, Gate::Policy]).is_some() {
+        return false;
+    }
+    pin(draft, leaderboard, track, image);
+    draft.condition(conditions::ACCEPTED, Truth::True, reasons::ACCEPTED, "");
+    true
+}
+
+/// The image, if one is named that the Leaderboard allows. Otherwise the draft shows why not. One that can never run ends the submission: the
+/// plan makes it a row of the table, as any other failure.
+fn allowed_image(draft: &mut PlanBuilder<'_>, leaderboard: &LeaderboardSpec, track: &Track) -> Option<String> {
+    let (image, fault) = match named_image(draft) {
+        Image::Named(image) => {
+            let fault = image_not_allowed(draft, leaderboard, &image);
+            (image, fault)
+        }
+        Image::Invalid { image, what } => (image, Some(failure::image_invalid(&what))),
+        Image::Unknown => {
+            let message = image_unread(draft);
+            draft.stall_with(reasons::IMAGE_MISSING, &message);
+            draft.refuse(reasons::IMAGE_MISSING, &message);
+            return None;
+        }
+    };
+    let Some(found) = fault else { return Some(image) };
+    pin(draft, leaderboard, track, image);
+    draft.condition(conditions::ACCEPTED, Truth::False, &found.reason, &found.message);
+    end::failed(draft, found);
+    None
+}
+
+/// What is shown of a row that has come to its end without us. EvalAI resumes only what has failed, re-runs all but what was deleted,
+/// and counts what was deleted before its end as being processed until it is ended.
+fn ended_in_evalai(status: Status) -> String {
+    let done = if status == Status::Deleted {
+        "`cancelled` is written there"
+    } else {
+        "nothing is reported"
+    };
+    let next = match status {
+        Status::Failed => "Resume it there if it is to run.",
+        Status::Deleted | Status::Ignored | Status::Missing => {
+            "EvalAI takes up nothing that was deleted; the participant can submit again."
+        }
+        _ => "EvalAI resumes only what has failed; re-run it there if it is to run.",
+    };
+    format!("EvalAI shows {status}: nothing is run and {done}. {next}")
+}
+
+/// What is known of the participant's image.
+enum Image {
+    Named(String),
+    /// It could not be asked for yet.
+    Unknown,
+    /// It can never be pulled, and why.
+    Invalid {
+        image: String,
+        what: String,
+    },
+}
+
+/// The image that was pinned, else the object's, else that of the file in EvalAI.
+fn named_image(draft: &PlanBuilder<'_>) -> Image {
+    let info = draft.evalai_info();
+    let pinned = draft.status.plan.as_ref().map(|plan| plan.image.clone());
+    let named = pinned
+        .filter(|image| !image.is_empty())
+        .or_else(|| draft.spec().image.clone())
+        .or_else(|| info.and_then(|i| i.image.clone()));
+    let Some(image) = named else {
+        let problem = info.and_then(|i| i.image_problem.as_deref());
+        return problem.map_or(Image::Unknown, |why| Image::Invalid {
+            image: String::new(),
+            what: sentence(&format!("The submission names no usable image: {why}")),
+        });
+    };
+    match ImageReference::parse(&image) {
+        Ok(_) => Image::Named(image),
+        Err(why) => {
+            let what = sentence(&format!("The submitted image is not a valid image reference: {why}"));
+            Image::Invalid { image, what }
+        }
+    }
+}
+
+/// What is shown while the file in EvalAI cannot be read.
+fn image_unread(draft: &PlanBuilder<'_>) -> String {
+    let error = draft.view.evalai.as_ref().and_then(|view| view.error.as_deref());
+    let why = error.map_or_else(String::new, |e| format!(" The last request failed: {}", sentence(e)));
+    format!(
+        "The image is not known: spec.image is empty, and the file in EvalAI that names it could not be read; it is tried \
+         again.{why} If this lasts, check that EvalAI serves the submission's input_file."
+    )
+}
+
+/// Whether EvalAI wants the submission to run, or need not be asked.
+fn is_wanted(draft: &mut PlanBuilder<'_>) -> bool {
+    if draft.spec().evalai.is_none() {
+        return true;
+    }
+    if let Some(info) = draft.evalai_info() {
+        if info.standing == Standing::Ended {
+            end::close_as(draft, reasons::ENDED_IN_EVALAI, &ended_in_evalai(info.status));
+        }
+        return info.standing != Standing::Ended;
+    }
+    draft.act(Action::Ask(Question::Evalai));
+    let view = draft.view.evalai.as_ref();
+    if draft.waits_quietly(Wait::EVALAI, view.map_or(Duration::ZERO, |evalai| evalai.waited)) {
+        return false;
+    }
+    draft.look_again(Wait::EVALAI);
+    let message = match view.and_then(|view| view.error.as_deref()) {
+        Some(error) => draft.stall(reasons::ASKING_EVALAI, &asking(Some(error))),
+        None => asking(None),
+    };
+    draft.show(reasons::ASKING_EVALAI, message);
+    draft.condition(conditions::ACCEPTED, Truth::Unknown, reasons::ASKING_EVALAI, "");
+    false
+}
+
+fn asking(error: Option<&str>) -> String {
+    let why = error.map(|e| format!(" The last request failed: {}", sentence(e)));
+    format!(
+        "EvalAI is asked whether the submission wants to run.{}",
+        why.unwrap_or_default()
+    )
+}
+
+fn find_track<'a>(draft: &PlanBuilder<'_>, leaderboard: &'a LeaderboardSpec) -> Option<&'a Track> {
+    match (&draft.spec().evalai, &draft.spec().track) {
+        (Some(evalai), _) => leaderboard.tracks.iter().find(|t| t.phase == Some(evalai.phase)),
+        (None, Some(name)) => leaderboard.tracks.iter().find(|t| t.name == *name),
+        (None, None) => None,
+    }
+}
+
+fn missing_track(draft: &PlanBuilder<'_>, leaderboard: &LeaderboardSpec) -> String {
+    let known: Vec<&str> = leaderboard.tracks.iter().map(|t| t.name.as_str()).collect();
+    let what = match (&draft.spec().evalai, &draft.spec().track) {
+        (Some(evalai), _) => format!("No track has the phase {}", evalai.phase),
+        (None, track) => format!("There is no track {}", track.as_deref().unwrap_or("")),
+    };
+    format!(
+        "{what} in Leaderboard {}, whose tracks are {}. Add it there, or cancel this submission.",
+        draft.spec().leaderboard_name,
+        known.join(", ")
+    )
+}
+
+/// A team of a Submission as people see it: anybody who may create one writes its name.
+fn shown(team: &Team) -> Team {
+    let line = |text: &Option<String>| text.as_deref().map(|text| one_line(text, LONGEST_NAME));
+    Team {
+        id: line(&team.id),
+        name: line(&team.name),
+    }
+}
+
+fn take_team(draft: &mut PlanBuilder<'_>) {
+    let info = draft.evalai_info();
+    let given = draft.spec().team.as_ref().map(shown);
+    let is_pinned = draft.status.plan.is_some() && draft.status.team.is_some();
+    if is_pinned {
+        // A row that is edited later changes neither the run's place in line nor its row of the table.
+    } else if let Some(info) = info {
+        let name = given.and_then(|t| t.name).or_else(|| info.team_name.clone());
+        let id = Some(info.team_id.clone());
+        draft.status.team = Some(Team { id, name }.into());
+    } else if given.is_some() {
+        draft.status.team = given.map(TeamStatus::from);
+    }
+    let submitted = info.and_then(|info| info.submitted_at).map(Time);
+    draft.status.times.submitted = draft.status.times.submitted.take().or(submitted);
+    if draft.status.times.submitted.is_none() {
+        draft.status.times.submitted = draft.submission().metadata.creation_timestamp.clone();
+    }
+}
+
+/// Why the Leaderboard does not allow the image.
+fn image_not_allowed(draft: &PlanBuilder<'_>, leaderboard: &LeaderboardSpec, image: &str) -> Option<Failure> {
+    let reference = ImageReference::parse(image).ok().filter(|_| !draft.status.has_run())?;
+    let repository = Repository::of(&reference);
+    let own = leaderboard.host_images();
+    let is_hosts = own
+        .into_iter()
+        .any(|own| ImageReference::parse(own).is_ok_and(|own| Repository::of(&own).is_same(&repository)));
+    let team = draft.status.team.as_ref().and_then(|team| team.id.as_deref());
+    let patterns = image_patterns(draft, leaderboard);
+    let is_allowed = patterns
+        .as_ref()
+        .is_none_or(|all| all.iter().any(|p| p.allows(&repository, team)))
+        || is_check_image(draft, leaderboard, &repository);
+    if is_allowed && !is_hosts {
+        return None;
+    }
+    let what = "The submitted image is not one that your team may submit to this leaderboard.";
+    Some(charged(reasons::IMAGE_NOT_ALLOWED, what))
+}
+
+/// Whether a check runs what its Leaderboard names for that.
+fn is_check_image(draft: &PlanBuilder<'_>, leaderboard: &LeaderboardSpec, repository: &Repository<'_>) -> bool {
+    let named = leaderboard.check.as_ref().filter(|_| draft.spec().check);
+    let named = named.and_then(|check| ImageReference::parse(&check.image).ok());
+    named.is_some_and(|named| Repository::of(&named).is_same(repository))
+}
+
+/// What may be submitted; none: everything.
+fn image_patterns(draft: &PlanBuilder<'_>, leaderboard: &LeaderboardSpec) -> Option<Vec<ImagePattern>> {
+    match &leaderboard.agent.images {
+        Some(images) if images.is_empty() => None,
+        Some(images) => Some(images.clone()),
+        None => {
+            let of_evalai = || vec![ImagePattern(image_pattern::OF_EVALAI.to_owned())];
+            draft.spec().evalai.is_some().then(of_evalai)
+        }
+    }
+}
+
+fn pin(draft: &mut PlanBuilder<'_>, leaderboard: &LeaderboardSpec, track: &Track, image: String) {
+    let info = draft.evalai_info();
+    let resumed = info.is_some_and(|i| i.standing == Standing::Resumed);
+    let plan = if let Some(pinned) = draft.status.plan.take() {
+        again(draft, leaderboard, pinned, image)
+    } else {
+        let resume = resumed || draft.spec().attempt > Attempt::FIRST || draft.is_adopted();
+        let plan = effective::plan(leaderboard, track, draft.submission().run_id(), image, resume);
+        let plan = if draft.spec().check { plan.of_check() } else { plan };
+        RunPlan {
+            earlier_attempts: attempts_before(draft),
+            submission_uid: draft.submission().metadata.uid.clone(),
+            ..plan
+        }
+    };
+    draft.status.results_url = Some(effective::results_url(&plan.storage, &plan.run_id));
+    draft.status.plan = Some(plan);
+    if draft.status.times.accepted.is_none() {
+        draft.status.times.accepted = Some(draft.time());
+    }
+}
+
+/// The plan of a submission that has one. A person who hands it over has it take up what is stored.
+fn again(draft: &PlanBuilder<'_>, leaderboard: &LeaderboardSpec, pinned: RunPlan, image: String) -> RunPlan {
+    let pinned = RunPlan {
+        resume: pinned.resume || draft.is_adopted(),
+        ..pinned
+    };
+    if draft.status.retry > 0 || draft.status.job_name.is_some() {
+        return pinned;
+    }
+    // The host's images belong to the attempt and follow the Leaderboard until its first Job is made; all else belongs to the submission.
+    RunPlan {
+        // The same, unless an earlier attempt had none.
+        image,
+        ..pinned.renewed(leaderboard)
+    }
+}
+
+/// How many attempts the table's row counts before those of an object that was made anew, as EvalAI's row names their Jobs: the table takes
+/// no attempt that is not above its own. An object with a history asks the table alone, since participants can edit EvalAI's row.
+fn attempts_before(draft: &PlanBuilder<'_>) -> i64 {
+    let is_new = draft.spec().attempt == Attempt::FIRST;
+    let resumed = draft
+        .evalai_info()
+        .filter(|info| is_new && info.standing == Standing::Resumed);
+    resumed.and_then(|info| info.last_attempt).map_or(0, |last| last.0)
+}

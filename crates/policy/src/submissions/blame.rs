@@ -1,0 +1,415 @@
+//! Whose fault the last crash of a worker was: one table over both containers. Pure.
+//!
+//! Called by `crashes`. No participant's program runs in the host's container, so its verdict, and what the kubelet reports of it,
+//! decide. An agent's processes can replace or suppress the agent's verdict; it therefore only names the agent's fault more closely.
+//! Both ends are matched by their round. Where the host's end of a round is missing, it is waited for, and then the agent is the
+//! cause.
+
+use std::collections::BTreeSet;
+
+use jiff::Timestamp;
+use k8s_openapi::apimachinery::pkg::apis::meta::v1::Time;
+
+use super::status::PlanBuilder;
+use super::waits::Wait;
+use super::{cause, failure};
+use crate::report_digest::clamp;
+use crate::view::{ContainerView, EndView, PodView};
+use leaderboard_api::{EndReason, Failure, LastEnd, SubmissionStatus, WorkerState, WorkerStatus};
+use leaderboard_protocol::files::{Member, Pair, Side};
+use leaderboard_protocol::verdict::{CODE_NO_PROCESS, CODE_NODE_REFUSED, What};
+
+/// Exit codes of a container that was ended with all others of its Pod, as by a sandbox that is made anew: killed, or lost from sight.
+const FROM_OUTSIDE: [i32; 2] = [137, 255];
+
+/// The kubelet's and the runtime's words where a container cannot be started for want of processes. A Pod has a number of them, and its
+/// agents can use it up.
+const OF_PROCESSES: [&str; 3] = [
+    "resource temporarily unavailable",
+    "connection reset by peer",
+    "failed to create new os thread",
+];
+
+/// The last crash of a worker.
+#[derive(Clone, Copy, Debug, PartialEq, Eq)]
+pub(super) struct Crash {
+    pub(super) cause: EndReason,
+    pub(super) exit_code: i32,
+    pub(super) at: Option<Timestamp>,
+    /// Nothing that may still be seen changes it.
+    pub(super) is_settled: bool,
+}
+
+/// The table. `None`: neither side has crashed; whether their Pod is lost is not judged here.
+pub(super) fn last_crash(host: Option<&ContainerView>, agent: Option<&ContainerView>, now: Timestamp) -> Option<Crash> {
+    if let Some(crash) = from_outside(host, agent) {
+        return Some(crash);
+    }
+    let agent = agent.and_then(|container| {
+        let end = container.last.as_ref()?;
+        let is_its = is_crash(end) || is_false_claim(host, container, end);
+        is_its.then(|| (end, crash(of_agent(container, end), end)))
+    });
+    let own_end = host.and_then(|container| {
+        let end = container.last.as_ref()?;
+        (!lacked_processes(container, end)).then_some(end)
+    });
+    // A host's container that was ended from outside explains its own round, and nothing else.
+    let explains = |end: &&EndView| match what(end) {
+        Some(What::Cancelled) => false,
+        Some(What::Stopped) => agent.is_some_and(|(agent, _)| order(host, end, agent) == Order::SameRound),
+        Some(What::Finished) => true,
+        _ => end.exit_code != 0,
+    };
+    match (own_end.filter(explains), agent) {
+        (None, None) => None,
+        (Some(end), None) if what(end) == Some(What::Finished) => None,
+        (Some(end), None) => Some(of_host_alone(host, end, now)),
+        (None, Some((_, blamed))) => Some(of_agent_alone(host, blamed, now)),
+        (Some(end), Some((agent, blamed))) => Some(match order(host, end, agent) {
+            Order::SameRound => of_both(host, end, blamed),
+            Order::AgentIsLater => of_agent_alone(host, blamed, now),
+            Order::HostIsLater => of_host_alone(host, end, now),
+        }),
+    }
+}
+
+/// Both sides were ended in one round, and by no process of the Pod: its sandbox was made anew, or its node started again. An agent can end
+/// itself in whatever way, but not its host so.
+fn from_outside(host: Option<&ContainerView>, agent: Option<&ContainerView>) -> Option<Crash> {
+    fn ended(container: &ContainerView) -> Option<&EndView> {
+        let end = container.last.as_ref()?;
+        let goes_on = container.running || container.waiting.is_some();
+        let is_it = match what(end) {
+            // In a Pod that is being ended both are asked to end, and neither comes back.
+            Some(What::Stopped) => goes_on,
+            None | Some(What::SilentDeath) => FROM_OUTSIDE.contains(&end.exit_code) && end.reason != "OOMKilled",
+            _ => false,
+        };
+        (is_it && !end.is_start_error()).then_some(end)
+    }
+    let (own, agent) = (ended(host?)?, ended(agent?)?);
+    (by_times_and_rounds(own, agent) == Order::SameRound).then(|| crash(EndReason::EndedFromOutside, own))
+}
+
+/// Whether the kubelet could not start a host's container again that has run in this Pod, for want of processes. That is no failure of its own:
+/// it is waited for, and an agent that ends meanwhile is the cause.
+fn lacked_processes(container: &ContainerView, end: &EndView) -> bool {
+    !is_of_first_life(container) && is_start_without_process(end)
+}
+
+fn is_start_without_process(end: &EndView) -> bool {
+    end.is_start_error() && end.why.as_deref().is_some_and(is_of_processes)
+}
+
+fn is_of_processes(words: &str) -> bool {
+    let words = words.to_lowercase();
+    OF_PROCESSES.iter().any(|sign| words.contains(sign))
+}
+
+/// Whether the last end of a container is that of its first life. The kubelet counts, so no agent changes it.
+fn is_of_first_life(container: &ContainerView) -> bool {
+    container.restarts <= i32::from(container.has_next_life())
+}
+
+/// Whether an end was a crash, and not one that was asked for.
+pub(super) fn is_crash(end: &EndView) -> bool {
+    let is_asked_for = matches!(what(end), Some(What::Stopped | What::Cancelled | What::Finished));
+    end.exit_code != 0 && !is_asked_for
+}
+
+/// Whether an agent reports that it was asked to end, and it was not: its host had to end because of it, or the kubelet starts it
+/// again, which it does in no Pod that is being ended. Where the host was ended from outside, too, the agent may be right.
+fn is_false_claim(host: Option<&ContainerView>, agent: &ContainerView, end: &EndView) -> bool {
+    if end.exit_code == 0 {
+        return false;
+    }
+    let own_end = host.and_then(|container| container.last.as_ref());
+    let goes_on = agent.running || agent.waiting.is_some();
+    match own_end.map(|own| (own, what(own))) {
+        Some((_, Some(What::Stopped | What::Cancelled))) => false,
+        Some((own, Some(What::PeerCrashed))) => goes_on || order(host, own, end) == Order::SameRound,
+        _ => goes_on,
+    }
+}
+
+/// Whether a crash was a failure of the host's container itself, which it was not if its Pod was being ended.
+fn is_hosts_own(host: Option<&ContainerView>, crash: &Crash) -> bool {
+    let was_ended = host.and_then(|container| what(container.last.as_ref()?)) == Some(What::Stopped);
+    let is_its = matches!(
+        crash.cause,
+        EndReason::SimulatorCrashed
+            | EndReason::SimulatorNotReady
+            | EndReason::SimulatorSilent
+            | EndReason::SimulatorNotStarted
+    );
+    is_its && !was_ended
+}
+
+fn what(end: &EndView) -> Option<What> {
+    end.verdict.as_ref().map(|verdict| verdict.what)
+}
+
+/// Which of the two ends belongs to the later round.
+#[derive(Clone, Copy, PartialEq, Eq)]
+enum Order {
+    SameRound,
+    AgentIsLater,
+    HostIsLater,
+}
+
+fn order(host: Option<&ContainerView>, end: &EndView, agent: &EndView) -> Order {
+    // A runner writes a verdict as soon as it begins, so this life never began, and the one that runs now is another.
+    let is_replaced = end.verdict.is_none() && host.is_some_and(|container| container.running);
+    if is_replaced {
+        return Order::AgentIsLater;
+    }
+    by_times_and_rounds(end, agent)
+}
+
+fn by_times_and_rounds(end: &EndView, agent: &EndView) -> Order {
+    // By the kubelet's times, whatever round the agent claims: a life that began after an end is of a later round.
+    if agent.began.zip(end.at).is_some_and(|(began, at)| began > at) {
+        return Order::AgentIsLater;
+    }
+    let round = |end: &EndView| end.verdict.as_ref().and_then(|verdict| verdict.round);
+    match round(end).zip(round(agent)) {
+        Some((host, agent)) if agent > host => Order::AgentIsLater,
+        Some((host, agent)) if agent < host => Order::HostIsLater,
+        // An agent without a round is of an older version, or has replaced its verdict.
+        _ => Order::SameRound,
+    }
+}
+
+fn of_both(host: Option<&ContainerView>, end: &EndView, blamed: Crash) -> Crash {
+    match what(end) {
+        Some(What::PeerCrashed | What::Finished) => blamed,
+        _ => crash(of_host(host, end), end),
+    }
+}
+
+fn of_host_alone(host: Option<&ContainerView>, end: &EndView, now: Timestamp) -> Crash {
+    match what(end) {
+        Some(What::PeerCrashed) => Crash {
+            is_settled: !is_awaited(end.at, now),
+            ..crash(EndReason::Unseen, end)
+        },
+        _ => crash(of_host(host, end), end),
+    }
+}
+
+fn of_agent_alone(host: Option<&ContainerView>, blamed: Crash, now: Timestamp) -> Crash {
+    if host.is_none_or(cannot_be_started) {
+        return Crash {
+            cause: EndReason::SimulatorNotStarted,
+            ..blamed
+        };
+    }
+    Crash {
+        is_settled: !is_awaited(blamed.at, now),
+        ..blamed
+    }
+}
+
+/// Whether the kubelet cannot start it. The pause after a crash is none: its last end counts then. One that has run is not kept away by
+/// its own fault where the Pod lacks processes.
+fn cannot_be_started(host: &ContainerView) -> bool {
+    let is_refused = |(reason, words): &(String, String)| reason != "CrashLoopBackOff" && !is_of_processes(words);
+    let never_ran = host.last.is_none() && host.restarts == 0;
+    !host.running && (never_ran || host.waiting.as_ref().is_some_and(is_refused))
+}
+
+/// Whether the other side's end may still be seen. A clock that was set back does not prolong this.
+fn is_awaited(at: Option<Timestamp>, now: Timestamp) -> bool {
+    at.is_some_and(|at| now.duration_since(at).as_secs().abs() < Wait::PEER.longest)
+}
+
+fn crash(cause: EndReason, end: &EndView) -> Crash {
+    Crash {
+        cause,
+        exit_code: end.exit_code,
+        at: end.at,
+        is_settled: true,
+    }
+}
+
+fn of_host(host: Option<&ContainerView>, end: &EndView) -> EndReason {
+    let is_first = host.is_none_or(is_of_first_life);
+    match what(end) {
+        // The agents can use up the Pod's processes once they run.
+        Some(What::NoProcess) if !is_first => EndReason::NoProcess,
+        Some(What::NotReady) => EndReason::SimulatorNotReady,
+        Some(What::ServerSilent) => EndReason::SimulatorSilent,
+        Some(What::PortTaken) => EndReason::PortTaken,
+        Some(What::NoGpu) => EndReason::NoGPU,
+        Some(What::GraphicsDriverMissing) => EndReason::GraphicsDriverMissing,
+        None if end.is_start_error() => EndReason::SimulatorNotStarted,
+        _ => EndReason::SimulatorCrashed,
+    }
+}
+
+/// What the agent's own end shows; all of it is the agent's fault, but what its node refused its runner before the agent's command ran. The
+/// exit code is the runner's, which no process of the agent has. Processes alone the other agents of the Pod can use up, once they run.
+fn of_agent(container: &ContainerView, end: &EndView) -> EndReason {
+    let is_first = is_of_first_life(container);
+    match end.exit_code {
+        CODE_NODE_REFUSED => return EndReason::NodeCannotStart,
+        CODE_NO_PROCESS if is_first => return EndReason::NodeCannotStart,
+        CODE_NO_PROCESS => return EndReason::NoProcess,
+        _ if !is_first && is_start_without_process(end) => return EndReason::NoProcess,
+        _ => {}
+    }
+    let exit_code = end.verdict.as_ref().and_then(|verdict| verdict.exit_code);
+    match what(end) {
+        Some(
+            What::PeerCrashed
+            | What::NotReady
+            | What::ServerSilent
+            | What::PortTaken
+            | What::NoGpu
+            | What::GraphicsDriverMissing,
+        ) => EndReason::BlamesSimulator,
+        Some(What::Idle) => EndReason::Idle,
+        Some(What::CannotStart) => EndReason::CannotStart,
+        _ if end.reason == "OOMKilled" => EndReason::OutOfMemory,
+        Some(What::Exited) if exit_code == Some(0) => EndReason::Incomplete,
+        Some(What::Exited) => EndReason::Exited,
+        Some(What::SilentDeath) => EndReason::SilentDeath,
+        None if end.is_start_error() => of_start_error(end),
+        _ => EndReason::Killed,
+    }
+}
+
+fn of_start_error(end: &EndView) -> EndReason {
+    if cause::of_start(end.why.as_deref().unwrap_or_default()).is_images() {
+        EndReason::StartError
+    } else {
+        EndReason::NodeCannotStart
+    }
+}
+
+/// Counts the crashes of each worker and remembers the last one: its Pod may be gone when the cause is looked for.
+pub(super) fn note_crashes(status: &mut SubmissionStatus, pod: &PodView, now: Timestamp) {
+    let ids: BTreeSet<i32> = pod.containers.iter().filter_map(|c| pair_of(&c.name)).collect();
+    for id in ids {
+        let its = pod.containers.iter().filter(|c| pair_of(&c.name) == Some(id));
+        let counted = its.map(count_crashes).max().unwrap_or(0);
+        let crash = last_crash_of(pod, id, now);
+        if counted > 0 || crash.is_some() {
+            let host = pair_with(id).and_then(|pair| container(pod, pair.host()));
+            let worker = worker_entry(status, id);
+            worker.environment_failed |= crash.is_some_and(|crash| is_hosts_own(host, &crash));
+            take_crash(worker, counted, crash);
+        }
+    }
+}
+
+/// Takes in what was seen of a pair: how often its containers ended, by whatever, and the last crash.
+fn take_crash(worker: &mut WorkerStatus, counted: i32, crash: Option<Crash>) {
+    if let Some(crash) = crash {
+        let last = LastEnd {
+            reason: crash.cause,
+            exit_code: Some(crash.exit_code),
+            time: crash.at.map(Time),
+        };
+        // The same end is seen in each reconcile. One side's may have been counted as a crash before the other's was seen.
+        if crash.cause == EndReason::EndedFromOutside && worker.last.as_deref() != Some(&last) {
+            worker.ended_from_outside = worker.ended_from_outside.saturating_add(1);
+            worker.crashes = worker.crashes.saturating_sub(1).max(0);
+        }
+        worker.last = Some(Box::new(last));
+    }
+    worker.crashes = worker.crashes.max(counted.saturating_sub(worker.ended_from_outside));
+}
+
+/// Ends of a container that were crashes. One that has ended counts at once, not only when it is started again. The kubelet also counts
+/// how often it could not start a host's container, whose runner knows its rounds.
+fn count_crashes(container: &ContainerView) -> i32 {
+    let Some(last) = container.last.as_ref() else {
+        return container.restarts;
+    };
+    let is_host = Member::parse(&container.name).is_some_and(|member| member.side == Side::Host);
+    if is_host && lacked_processes(container, last) {
+        return 0;
+    }
+    let is_crash = is_crash(last);
+    let ends = container
+        .restarts
+        .saturating_add(i32::from(is_crash && !container.has_next_life()));
+    let round = last.verdict.as_ref().and_then(|verdict| verdict.round);
+    match round.filter(|_| is_host) {
+        Some(round) => ends.min(clamp(round).saturating_add(i32::from(is_crash))),
+        None => ends,
+    }
+}
+
+fn last_crash_of(pod: &PodView, id: i32, now: Timestamp) -> Option<Crash> {
+    let pair = pair_with(id)?;
+    last_crash(container(pod, pair.host()), container(pod, pair.agent()), now)
+}
+
+fn pair_with(id: i32) -> Option<Pair> {
+    u16::try_from(id).ok().and_then(Pair::new)
+}
+
+fn container(pod: &PodView, member: Member) -> Option<&ContainerView> {
+    let name = member.to_string();
+    pod.containers.iter().find(|container| container.name == name)
+}
+
+fn pair_of(container: &str) -> Option<i32> {
+    Some(Member::parse(container)?.pair.get().into())
+}
+
+fn worker_entry(status: &mut SubmissionStatus, id: i32) -> &mut WorkerStatus {
+    if let Some(at) = status.workers.iter().position(|p| p.id == id) {
+        return &mut status.workers[at];
+    }
+    let fresh = WorkerStatus {
+        id,
+        done: 0,
+        total: status.plan.as_ref().map_or(0, |plan| plan.total_of(id)),
+        crashes: 0,
+        state: WorkerState::Waiting,
+        last: None,
+        ended_from_outside: 0,
+        environment_failed: false,
+    };
+    let at = status.workers.partition_point(|p| p.id < id);
+    status.workers.insert(at, fresh);
+    &mut status.workers[at]
+}
+
+/// The failure of a pair that has crashed as often as it may, or cannot start at all. It waits until the cause is settled.
+pub(super) fn too_many(draft: &mut PlanBuilder<'_>) -> Option<Failure> {
+    let limit = draft.retries().per_worker.saturating_add(1);
+    let is_too_many = |worker: &&WorkerStatus| {
+        worker.crashes >= limit || (worker.crashes > 0 && failure::cause_of(worker).is_some_and(is_hopeless))
+    };
+    let node = draft.status.node_name.as_deref();
+    let mut awaited = None;
+    for worker in draft.status.workers.iter().filter(is_too_many) {
+        let Some(cause) = failure::cause_of(worker) else {
+            continue;
+        };
+        let pod = draft.view.pod.as_ref();
+        let crash = pod.and_then(|pod| last_crash_of(pod, worker.id, draft.now()));
+        // Who goes on to fail while the other side's word is waited for puts its end off no further.
+        match crash.filter(|crash| !crash.is_settled && worker.crashes <= limit) {
+            None => return Some(failure::of_worker(worker, cause, node)),
+            Some(crash) => awaited = awaited.or(crash.at),
+        }
+    }
+    if let Some(at) = awaited {
+        draft.requeue_at(Wait::PEER.over_at(at));
+    }
+    None
+}
+
+/// Whether another round in the same Pod would end in the same way.
+fn is_hopeless(cause: EndReason) -> bool {
+    matches!(
+        cause,
+        EndReason::CannotStart | EndReason::StartError | EndReason::NoGPU | EndReason::GraphicsDriverMissing
+    )
+}

@@ -1,0 +1,358 @@
+//! The end of an attempt: which outcome it has, or whether an infrastructure failure gives it another Job.
+//!
+//! Some infrastructure failures an agent can provoke. The first of an attempt gets another Job, on another node where there is one; after a
+//! further one a Job follows only if the Job before it has finished a route.
+
+use k8s_openapi::apimachinery::pkg::apis::meta::v1::Time;
+
+use super::status::PlanBuilder;
+use super::waits::{Wait, after};
+use super::{cause, failure, run, stop};
+use crate::report_digest::{ReportDigest, clamp};
+use crate::view::{JobEnd, ObservedReport, Stage};
+use leaderboard_api::conditions::{self, Truth};
+use leaderboard_api::text::sentence;
+use leaderboard_api::{FailedNode, Failure, FailureClass, MAX_FAILED_NODES, reasons};
+
+/// Shown while the report of an ended run has been asked for and no answer has come, not even a refusal.
+const NO_ANSWER: &str = "its bucket has not answered yet.";
+
+/// Failures of a node, which gets no third Job of the attempt.
+const OF_NODES: [&str; 2] = [reasons::NO_GPU, reasons::NODE_CANNOT_START];
+
+/// The Job is terminal, or gone because we ended it (`None`).
+pub(super) fn decide(draft: &mut PlanBuilder<'_>, job_end: Option<&JobEnd>) {
+    let view = draft.view;
+    // A mark that comes late would stop the next Pod.
+    if let Some(left) = stop::requested_fence_left(draft) {
+        return draft.requeue_in(left);
+    }
+    // Without a plan nobody knows where a report would be.
+    let is_read = run::is_of(draft, Stage::JobEnded) && view.report.stored != ObservedReport::NotRead;
+    if draft.status.plan.is_some() && !is_read {
+        if let Some(left) = run::answer_left(draft) {
+            return draft.requeue_in(left);
+        }
+        if wait_for_bucket(draft, NO_ANSWER) {
+            return;
+        }
+    }
+    let report = match &view.report.stored {
+        ObservedReport::Ours(report) if is_read => Some(report.as_ref()),
+        ObservedReport::Unreadable(why) if wait_for_bucket(draft, why) => return,
+        _ => None,
+    };
+    if let Some(report) = report.filter(|r| r.is_complete() && r.eligible) {
+        return finished(draft, report);
+    }
+    // A cancel is then the higher attempt's, and what else has ended it is forgiven.
+    if draft.is_followed() {
+        run::count_use(draft, view.ended_at().unwrap_or(draft.now()));
+        return draft.restart();
+    }
+    let report = report.filter(|r| run::is_of_present_job(draft, r));
+    if draft.is_cancelled() {
+        return cancelled(draft, "; what it had reached is kept");
+    }
+    let recorded = draft.status.failure.clone();
+    let recorded = recorded.filter(|found| !report.is_some_and(|r| failure::is_refusal(&draft.status, found, r)));
+    let found = recorded.map_or_else(|| cause(draft, report, job_end), |found| *found);
+    if found.class == FailureClass::Infrastructure && may_retry(draft, &found) {
+        return retry(draft, &found);
+    }
+    let found = explained(draft, found);
+    failed(draft, found);
+}
+
+/// Finishes a run whose workers have ended well and whose complete results are stored and count: nothing that its
+/// Pod still does can change them. Returns whether it did. Every other end waits for the Job.
+pub(super) fn of_complete_run(draft: &mut PlanBuilder<'_>) -> bool {
+    let view = draft.view;
+    let Some(pod) = view.pod.as_ref().filter(|pod| pod.run_ended.is_some()) else {
+        return false;
+    };
+    if !run::is_of(draft, Stage::RunEnded) {
+        return false;
+    }
+    let report = view.report.ours().filter(|r| r.pod_uid == pod.uid);
+    let Some(report) = report.filter(|r| r.is_complete() && r.eligible) else {
+        return false;
+    };
+    finished(draft, report);
+    true
+}
+
+/// Whether the end still waits until the bucket can be read.
+fn wait_for_bucket(draft: &mut PlanBuilder<'_>, why: &str) -> bool {
+    let limit = if draft.is_cancelled() {
+        draft.deadlines().cancel_seconds.max(Wait::CANCELLED_REPORT.longest)
+    } else {
+        Wait::REPORT.longest
+    };
+    let message = format!(
+        "The results cannot be read: {} The submission goes on when they can.",
+        sentence(why)
+    );
+    let message = draft.stall(reasons::NOT_STORED, &message);
+    let since = draft.blocked_since(reasons::NOT_STORED).unwrap_or(draft.now());
+    let until = after(since, limit);
+    if draft.now() >= until {
+        return false;
+    }
+    draft.show(reasons::NOT_STORED, message);
+    draft.requeue_at(until);
+    draft.look_again(Wait::REPORT);
+    true
+}
+
+/// Ends as Cancelled; nothing needs to be stopped any more. `when` goes on with the sentence.
+pub(super) fn cancelled(draft: &mut PlanBuilder<'_>, when: &str) {
+    let reason = cancel_reason(draft);
+    let what = if reason == reasons::ENDED_IN_EVALAI {
+        "EvalAI ended the submission"
+    } else {
+        "The submission was cancelled"
+    };
+    close_as(draft, reason, &format!("{what}{when}."));
+}
+
+/// Ends without a failure.
+pub(super) fn close_as(draft: &mut PlanBuilder<'_>, reason: &str, message: &str) {
+    draft.status.failure = None;
+    close(draft, reason, message);
+}
+
+/// Why a cancelled submission was cancelled.
+fn cancel_reason(draft: &PlanBuilder<'_>) -> &'static str {
+    if draft.spec().cancel {
+        reasons::CANCELLED
+    } else if draft.is_deleting() {
+        reasons::DELETED
+    } else if draft.is_ended_in_evalai() {
+        reasons::ENDED_IN_EVALAI
+    } else {
+        reasons::CANCELLED
+    }
+}
+
+fn cause(draft: &PlanBuilder<'_>, report: Option<&ReportDigest>, job_end: Option<&JobEnd>) -> Failure {
+    // A refused checkpoint may still be fixed while the run goes on; only the last one counts.
+    let verdict = report.filter(|r| r.is_verdict());
+    if let Some(why) = verdict.and_then(|r| r.why.as_deref()) {
+        return failure::invalid_results(why);
+    }
+    if let Some(report) = verdict {
+        return failure::not_eligible(report, &draft.status.workers);
+    }
+    match job_end {
+        Some(end) => of_job(draft, end),
+        None => failure::job_deleted(),
+    }
+}
+
+/// The failure of a Job that ended without final results.
+fn of_job(draft: &PlanBuilder<'_>, end: &JobEnd) -> Failure {
+    if let Some(found) = cause::disk_full(draft) {
+        return found;
+    }
+    match end {
+        JobEnd::Complete { .. } => failure::results_not_stored(),
+        // Without a limit on the run the deadline is not ours.
+        JobEnd::Failed { reason, .. } if reason == "DeadlineExceeded" && draft.deadlines().run_seconds.is_some() => {
+            failure::charged(
+                reasons::TIME_LIMIT,
+                "The Pod reached its time limit; finished routes are kept.",
+            )
+        }
+        JobEnd::Failed { reason, message, .. } => failure::worst(&draft.status).unwrap_or_else(|| {
+            let what = format!("The Job failed with {reason}: {}", sentence(message));
+            failure::infrastructure(reasons::JOB_FAILED, &what)
+        }),
+    }
+}
+
+/// Failures that a second try may fix.
+fn may_retry(draft: &PlanBuilder<'_>, found: &Failure) -> bool {
+    const FINAL: [&str; 4] = [
+        reasons::GRAPHICS_DRIVER_MISSING,
+        reasons::JOB_DELETED,
+        reasons::JOB_EXPIRED,
+        reasons::SCHEDULE_DEADLINE,
+    ];
+    let can_recover = !FINAL.contains(&found.reason.as_str());
+    let is_left = stop::is_interruption(found)
+        || (leaves_a_job(draft, found) && stop::other_failures(&draft.status) < draft.retries().infrastructure);
+    can_recover && is_left
+}
+
+fn retry(draft: &mut PlanBuilder<'_>, found: &Failure) {
+    let failures = stop::other_failures(&draft.status);
+    let (delay, next) = if stop::is_interruption(found) {
+        let next = "A new Job resumes from the results in S3; this costs neither an attempt nor a retry.";
+        (0, next.to_owned())
+    } else {
+        let delay = (Wait::RETRY.again << failures.clamp(0, 16)).min(Wait::RETRY.longest);
+        (
+            delay,
+            format!("The submission is tried again in {delay} s; this costs no attempt."),
+        )
+    };
+    let at = after(draft.now(), delay);
+    run::count_use(draft, draft.view.ended_at().unwrap_or(draft.now()));
+    if stop::is_interruption(found) {
+        stop::note_interruption(draft);
+    }
+    note_provoked(draft, found);
+    draft.status.retry += 1;
+    draft.status.job_name = None;
+    let is_of_node = OF_NODES.contains(&found.reason.as_str());
+    let node = draft.status.node_name.take();
+    if let Some(node) = node.filter(|_| is_of_node || is_provoked(found)) {
+        note_failed_node(&mut draft.status.failed_nodes, node, i32::from(is_of_node));
+    }
+    draft.status.failure = None;
+    draft.status.recreated = 0;
+    draft.status.next_retry_time = Some(Time(at));
+    run::restart_clock(draft);
+    draft.status.times.stopping = None;
+    for worker in &mut draft.status.workers {
+        worker.crashes = 0;
+        worker.ended_from_outside = 0;
+        worker.last = None;
+    }
+    let what = &found.message;
+    let message = format!("{what} {next}");
+    draft.moves();
+    draft.condition(conditions::RUNNING, Truth::False, &found.reason, what);
+    draft.show(reasons::REPLACING, message);
+    draft.requeue_at(at);
+}
+
+/// Remembers a node on which a Job has failed; `jobs` is 1 if by its fault. If there are too many nodes, the oldest is forgotten.
+pub(super) fn note_failed_node(nodes: &mut Vec<FailedNode>, node_name: String, jobs: i32) {
+    if let Some(known) = nodes.iter_mut().find(|known| known.node_name == node_name) {
+        known.jobs = known.jobs.saturating_add(jobs);
+        return;
+    }
+    if nodes.len() >= MAX_FAILED_NODES {
+        nodes.remove(0);
+    }
+    nodes.push(FailedNode { node_name, jobs });
+}
+
+fn finished(draft: &mut PlanBuilder<'_>, report: &ReportDigest) {
+    // Without its Job nobody has taken it in yet.
+    run::take_report(draft, report);
+    let score = draft.status.score.as_ref();
+    let score = score.map_or_else(String::new, |score| format!(", {} {}", score.name, score.text));
+    let message = format!("{} of {} {}{score}.", report.done, report.total, report.unit);
+    close_as(draft, reasons::FINISHED, &message);
+}
+
+/// Ends as Failed; nothing needs to be stopped any more.
+pub(super) fn failed(draft: &mut PlanBuilder<'_>, found: Failure) {
+    let found = failure::at_the_end(found);
+    let (reason, message) = (found.reason.clone(), found.message.clone());
+    draft.status.failure = Some(Box::new(found));
+    close(draft, &reason, &message);
+}
+
+fn close(draft: &mut PlanBuilder<'_>, reason: &str, message: &str) {
+    run::count_attempts(draft);
+    let ended = draft.view.ended_at().unwrap_or(draft.now());
+    let ended = ended.min(draft.now());
+    if !draft.is_finished() {
+        run::count_use(draft, ended);
+    }
+    draft.status.times.finished = Some(Time(ended));
+    let started = draft.status.times.started.as_ref();
+    draft.status.duration = started.map(|started| duration(ended.duration_since(started.0).as_secs()));
+    draft.status.waiting = None;
+    draft.status.next_retry_time = None;
+    let stored = draft.view.report.ours().is_some_and(|r| r.is_final);
+    let (truth, why) = if stored {
+        (Truth::True, reasons::STORED)
+    } else {
+        (Truth::False, reasons::NOT_STORED)
+    };
+    draft.condition(conditions::ARCHIVED, truth, why, "");
+    draft.condition(conditions::RUNNING, Truth::False, reason, "");
+    draft.moves();
+    draft.condition(conditions::FINISHED, Truth::True, reason, message);
+    if draft.spec().evalai.is_some() {
+        draft.condition(conditions::PUBLISHED, Truth::False, reasons::WAITING, "");
+    }
+    if draft.view.record.is_some() {
+        draft.condition(conditions::RECORDED, Truth::False, reasons::WAITING, "");
+    }
+    draft.show(reason, message);
+}
+
+/// A time span in its two largest units.
+fn duration(seconds: i64) -> String {
+    let minutes = seconds.max(0) / 60;
+    match (minutes / 1440, minutes / 60 % 24, minutes % 60) {
+        (0, 0, 0) => format!("{}s", seconds.max(0)),
+        (0, 0, minutes) => format!("{minutes}m"),
+        (0, hours, minutes) => format!("{hours}h{minutes}m"),
+        (days, hours, _) => format!("{days}d{hours}h"),
+    }
+}
+
+/// An announced end of a node is `NodeInterrupted`, which no agent can provoke.
+const REASONS: [&str; 8] = [
+    reasons::SIMULATION_CRASHED,
+    reasons::RESULTS_NOT_STORED,
+    reasons::JOB_FAILED,
+    reasons::CANNOT_START,
+    reasons::NODE_CANNOT_START,
+    reasons::NODE_LOST,
+    reasons::DISK_FULL,
+    reasons::IMAGE_PULL,
+];
+
+/// Added to the words of a failure that gets no further Job because of the rule.
+const NO_ROUTE: &str =
+    "The attempt had such an end before, and this Job has finished no route, so no further Job follows.";
+
+/// Whether an agent can have provoked a failure.
+fn is_provoked(found: &Failure) -> bool {
+    // A pull of the hosts' own images belongs to no worker.
+    let is_of_hosts = found.reason == reasons::IMAGE_PULL && found.worker.is_none();
+    found.class == FailureClass::Infrastructure && !is_of_hosts && REASONS.contains(&found.reason.as_str())
+}
+
+/// Whether the rule leaves another Job: `before` has the units that were stored when the failed Job was due, None for the attempt's first
+/// such failure; `stored` those that are stored by now.
+pub(super) fn may_go_on(found: &Failure, before: Option<i32>, stored: i32) -> bool {
+    !is_provoked(found) || before.is_none_or(|before| stored > before)
+}
+
+/// The same for the present Job.
+fn leaves_a_job(draft: &PlanBuilder<'_>, found: &Failure) -> bool {
+    may_go_on(found, draft.status.done_before, stored_routes(draft))
+}
+
+/// Notes what the next Job begins with.
+fn note_provoked(draft: &mut PlanBuilder<'_>, found: &Failure) {
+    if is_provoked(found) || draft.status.done_before.is_some() {
+        draft.status.done_before = Some(stored_routes(draft));
+    }
+}
+
+/// A failure that ends its attempt, with the rule if that is why.
+fn explained(draft: &PlanBuilder<'_>, found: Failure) -> Failure {
+    if leaves_a_job(draft, &found) {
+        return found;
+    }
+    Failure {
+        message: format!("{} {NO_ROUTE}", found.message),
+        ..found
+    }
+}
+
+/// Units of the attempt that are stored. What an earlier attempt has reached counts among them.
+fn stored_routes(draft: &PlanBuilder<'_>) -> i32 {
+    let reached = draft.status.progress.as_ref().map_or(0, |progress| progress.done);
+    draft.view.report.ours().map_or(reached, |report| clamp(report.done))
+}

@@ -1,0 +1,432 @@
+//! Failures: a class, a reason, one sentence and the next step for hosts and for participants; and which log explains one.
+//!
+//! No text for a participant names a file, an object or a machine of the hosts.
+
+use crate::report_digest::{ReportDigest, clamp};
+use crate::view::{ContainerView, LogAt, LogPlace, ObservedNode, PodView};
+use leaderboard_api::text::sentence;
+use leaderboard_api::{EndReason, Failure, FailureClass, SubmissionStatus, WorkerStatus, names, reasons};
+use leaderboard_contract::keys::agent_log;
+use leaderboard_contract::run::{Stop, console};
+use leaderboard_protocol::files::Pair;
+
+/// A failure that is the participant's: `what` happened, in one sentence, and what each reader does about it.
+pub(super) fn participant(reason: &str, what: &str, next: &Steps) -> Failure {
+    let message = format!("{what} {}", next.hosts);
+    let for_participants = format!("{what} {}", next.participant);
+    Failure {
+        class: FailureClass::Participant,
+        reason: reason.into(),
+        participant_message: Some(for_participants).filter(|text| *text != message),
+        message,
+        next_step: Some(next.hosts.clone()),
+        worker: None,
+    }
+}
+
+/// The same with the next step of the table of reasons, which both readers can take.
+pub(super) fn charged(reason: &str, what: &str) -> Failure {
+    participant(reason, what, &for_both(&of_participant(reason)))
+}
+
+/// A failure that is not: `what` happened, in one sentence for hosts. As long as another Job may follow there is no next step.
+pub(super) fn infrastructure(reason: &str, what: &str) -> Failure {
+    Failure {
+        class: FailureClass::Infrastructure,
+        reason: reason.into(),
+        message: what.to_owned(),
+        next_step: None,
+        participant_message: Some(infrastructure_for_participants(reason)),
+        worker: None,
+    }
+}
+
+/// A failure that ends its submission: with what a host does about it.
+pub(super) fn at_the_end(found: Failure) -> Failure {
+    match found.class {
+        FailureClass::Participant => found,
+        FailureClass::Infrastructure => {
+            let step = of_infrastructure(&found.reason);
+            Failure {
+                message: format!("{} {step}", found.message).trim_end().to_owned(),
+                next_step: Some(step.to_owned()).filter(|step| !step.is_empty()),
+                ..found
+            }
+        }
+    }
+}
+
+/// What was submitted names no image that could ever be pulled.
+pub(super) fn image_invalid(what: &str) -> Failure {
+    charged(reasons::IMAGE_INVALID, what)
+}
+
+pub(super) fn job_deleted() -> Failure {
+    infrastructure(reasons::JOB_DELETED, "The Job was deleted repeatedly by somebody else.")
+}
+
+pub(super) fn job_expired() -> Failure {
+    infrastructure(
+        reasons::JOB_EXPIRED,
+        "The Job ended and was removed after its time to live, and nobody had read its end; what was stored is kept.",
+    )
+}
+
+pub(super) fn node_lost(node: Option<&str>, node_state: ObservedNode) -> Failure {
+    let node = node.map_or_else(|| "The node of the Pod".to_owned(), |node| format!("Node {node}"));
+    let what = if node_state == ObservedNode::Reports {
+        "did not end its Pod within its grace"
+    } else {
+        "was lost and its Pod with it"
+    };
+    infrastructure(reasons::NODE_LOST, &format!("{node} {what}; finished routes are kept."))
+}
+
+pub(super) fn time_limit(seconds: i64) -> Failure {
+    let what = format!("The run took longer than {seconds} s and was stopped; finished routes are kept.");
+    charged(reasons::TIME_LIMIT, &what)
+}
+
+pub(super) fn results_not_stored() -> Failure {
+    infrastructure(
+        reasons::RESULTS_NOT_STORED,
+        "The Pod ended before its final results were stored; what was stored is kept.",
+    )
+}
+
+pub(super) fn invalid_results(why: &str) -> Failure {
+    let what = format!("The results cannot be used: {}", sentence(why));
+    Failure {
+        worker: pair_named(why),
+        ..charged(reasons::INVALID_RESULTS, &what)
+    }
+}
+
+/// The pair whose checkpoint logcopy speaks of: `pair 2: …` or `pair 2, record …`.
+fn pair_named(why: &str) -> Option<i32> {
+    let (number, _) = why.strip_prefix("pair ")?.split_once([':', ','])?;
+    number.parse().ok()
+}
+
+/// Results that are complete but do not count.
+pub(super) fn not_eligible(report: &ReportDigest, workers: &[WorkerStatus]) -> Failure {
+    if report.entry_status == "Crashed" {
+        return named_crash(report, workers);
+    }
+    let what = format!("The run ended as {}, so its results do not count.", report.entry_status);
+    charged(reasons::NOT_ELIGIBLE, &what)
+}
+
+/// Results that name a crash of the simulation. The agent writes them, and knows its score by then, so a crash that no host's container had is
+/// its own. Evaluators repeat the route of a crash; one that does not keeps its record over the Jobs of an attempt.
+fn named_crash(report: &ReportDigest, workers: &[WorkerStatus]) -> Failure {
+    let named = report.workers.iter().filter(|worker| worker.names_crash);
+    let mut named = named.map(|worker| clamp(worker.id));
+    let first = named.clone().next();
+    let has_failed = |id: i32| {
+        workers
+            .iter()
+            .any(|worker| worker.id == id && worker.environment_failed)
+    };
+    if let Some(id) = named.find(|id| !has_failed(*id)) {
+        let what = format!("The results of pair {id} name a crash of the simulation that its simulator did not have.");
+        return Failure {
+            worker: Some(id),
+            ..charged(reasons::INVALID_RESULTS, &what)
+        };
+    }
+    // One of an older operator's Pod names no pair.
+    Failure {
+        worker: first,
+        ..infrastructure(
+            reasons::SIMULATION_CRASHED,
+            "The simulation crashed during a route, so the results do not count.",
+        )
+    }
+}
+
+/// The stop that a failure calls for, or a higher attempt.
+pub(super) fn stop_of(failure: Option<&Failure>) -> Stop {
+    match failure.map(|failure| failure.reason.as_str()) {
+        Some(reasons::TIME_LIMIT) => Stop::RunDeadline,
+        // Without a failure it is stopped for a higher attempt.
+        Some(reasons::NODE_INTERRUPTED) | None => Stop::Interruption,
+        _ => Stop::Retries,
+    }
+}
+
+/// The failure of the pair that has crashed most.
+pub(super) fn worst(status: &SubmissionStatus) -> Option<Failure> {
+    let crashed = status.workers.iter().filter(|p| p.crashes > 0 && p.last.is_some());
+    let worker = crashed.max_by_key(|p| p.crashes)?;
+    Some(of_worker(worker, cause_of(worker)?, status.node_name.as_deref()))
+}
+
+/// Whether what looked like crashes were runs to the end whose checkpoint is refused: an agent that ends by itself without
+/// results that can be read is tried again as one that crashed.
+pub(super) fn is_refusal(status: &SubmissionStatus, found: &Failure, report: &ReportDigest) -> bool {
+    let by_itself = |worker: &WorkerStatus| matches!(cause_of(worker), Some(EndReason::Exited | EndReason::Incomplete));
+    let is_of_results = [reasons::AGENT_CRASHED, reasons::INVALID_RESULTS].contains(&found.reason.as_str());
+    is_of_results && status.workers.iter().any(by_itself) && report.is_verdict() && report.why.is_some()
+}
+
+pub(super) fn cause_of(worker: &WorkerStatus) -> Option<EndReason> {
+    worker.last.as_ref().map(|last| last.reason)
+}
+
+pub(super) fn of_worker(worker: &WorkerStatus, cause: EndReason, node: Option<&str>) -> Failure {
+    let id = worker.id;
+    let times = match worker.crashes {
+        1 => "once".to_owned(),
+        crashes => format!("{crashes} times"),
+    };
+    let failure = if let Some((reason, what)) = of_node(id, &times, cause, node) {
+        infrastructure(reason, &what)
+    } else if let Some(what) = of_host(cause) {
+        let what = format!("The simulator of pair {id} failed {times}: {what}.");
+        infrastructure(reasons::SIMULATION_CRASHED, &what)
+    } else {
+        let (reason, what, next) = of_agent(id, &times, cause);
+        participant(reason, &what, &next)
+    };
+    Failure {
+        worker: Some(id),
+        ..failure
+    }
+}
+
+/// What the node lacked: to draw, or to start an agent.
+fn of_node(id: i32, times: &str, cause: EndReason, node: Option<&str>) -> Option<(&'static str, String)> {
+    let node = node.map_or_else(|| "the node".to_owned(), |node| format!("node {node}"));
+    match cause {
+        EndReason::NoGPU => Some((
+            reasons::NO_GPU,
+            format!(
+                "Pair {id} lacks a GPU on {node}, although the Leaderboard gives it one: its simulator or its agent saw none. The \
+                 simulator's log says which."
+            ),
+        )),
+        EndReason::GraphicsDriverMissing => Some((
+            reasons::GRAPHICS_DRIVER_MISSING,
+            format!(
+                "Simulator {id} had a GPU and could not draw: the NVIDIA driver of {node} has no Vulkan/OpenGL part \
+                 (nvidia_icd.json)."
+            ),
+        )),
+        EndReason::NodeCannotStart => Some((
+            reasons::NODE_CANNOT_START,
+            format!(
+                "The container of agent {id} could not be started {times} on {node}; nothing of its image is the cause."
+            ),
+        )),
+        EndReason::EndedFromOutside => Some((
+            reasons::JOB_FAILED,
+            format!("The containers of pair {id} were ended from outside the Pod on {node}."),
+        )),
+        _ => None,
+    }
+}
+
+/// What the host's container did, if it was the cause.
+fn of_host(cause: EndReason) -> Option<&'static str> {
+    match cause {
+        EndReason::SimulatorCrashed => Some("it crashed"),
+        EndReason::SimulatorNotReady => Some("it was not ready in time"),
+        EndReason::SimulatorSilent => Some("its server did not answer any more"),
+        EndReason::SimulatorNotStarted => Some("its container could not be started"),
+        _ => None,
+    }
+}
+
+fn of_agent(id: i32, times: &str, cause: EndReason) -> (&'static str, String, Steps) {
+    match cause {
+        EndReason::OutOfMemory => (
+            reasons::OUT_OF_MEMORY,
+            format!("Agent {id} crashed {times}, the last time for lack of memory."),
+            smaller(),
+        ),
+        EndReason::Idle => (
+            reasons::IDLE,
+            format!("Agent {id} ended too early {times}, the last time because it printed nothing for too long."),
+            in_the_log_of(id),
+        ),
+        EndReason::Incomplete => (
+            reasons::INVALID_RESULTS,
+            format!(
+                "Agent {id} ended by itself {times} without complete results: its checkpoint is missing, malformed or has \
+                 no global record."
+            ),
+            in_the_log_of(id),
+        ),
+        EndReason::CannotStart | EndReason::StartError => (
+            reasons::CANNOT_START,
+            format!("Agent {id} could not be started: its command is missing in the image or not for this machine."),
+            for_both(&of_participant(reasons::CANNOT_START)),
+        ),
+        EndReason::NoProcess => (
+            reasons::AGENT_CRASHED,
+            format!("Pair {id} failed {times}: the agents left the Pod no process to start it again."),
+            for_both("Let the agents start fewer processes and threads, and submit again."),
+        ),
+        EndReason::BlamesSimulator => (
+            reasons::AGENT_CRASHED,
+            format!("Agent {id} ended {times} and blamed its simulator, which had not failed."),
+            for_both("Leave the files of the evaluator's runner alone, and submit again."),
+        ),
+        EndReason::PortTaken => (
+            reasons::AGENT_CRASHED,
+            format!("Another container of the Pod listened on the port of simulator {id}, which failed {times}."),
+            for_both("Let the agents listen on no port of a simulator, and submit again."),
+        ),
+        _ => (
+            reasons::AGENT_CRASHED,
+            format!("Agent {id} crashed {times}."),
+            in_the_log_of(id),
+        ),
+    }
+}
+
+/// The next step after a participant failure, for each of its two readers.
+#[derive(Clone, Debug, PartialEq, Eq)]
+pub(super) struct Steps {
+    pub(super) hosts: String,
+    pub(super) participant: String,
+}
+
+/// Both can do the same.
+pub(super) fn for_both(step: &str) -> Steps {
+    Steps {
+        hosts: step.to_owned(),
+        participant: step.to_owned(),
+    }
+}
+
+/// The log of an agent explains what happened. Only hosts can read it.
+fn in_the_log_of(agent: i32) -> Steps {
+    Steps {
+        hosts: of_participant(reasons::AGENT_CRASHED).replace("<n>", &agent.to_string()),
+        participant:
+            "Reproduce it on routes of your own, fix the agent and submit again; the challenge's hosts have its log."
+                .to_owned(),
+    }
+}
+
+/// An agent needs more memory than there is.
+fn smaller() -> Steps {
+    Steps {
+        hosts: of_participant(reasons::OUT_OF_MEMORY),
+        participant: "Reduce the memory it uses and submit again; ask the challenge's hosts for the limit.".to_owned(),
+    }
+}
+
+/// The next step of the table of reasons.
+fn of_participant(reason: &str) -> String {
+    reasons::of(reason).map_or_else(String::new, |reason| reasons::plain(reason.next_step))
+}
+
+/// What a host does about a failure of the infrastructure that no retry has ended.
+fn of_infrastructure(reason: &str) -> &'static str {
+    match reason {
+        // The text of `workspace` has the step before this one.
+        reasons::NOT_ISOLATED => "Then resume the submission.",
+        _ => reasons::after_failure(reason).unwrap_or("Fix this, then resume the submission."),
+    }
+}
+
+/// All that a participant reads of a failure of the infrastructure.
+fn infrastructure_for_participants(reason: &str) -> String {
+    let what = match reason {
+        reasons::IMAGE_PULL => "An image could not be pulled.",
+        reasons::NODE_LOST => "The machine that ran the submission was lost.",
+        reasons::NODE_INTERRUPTED => "The machine that ran the submission was taken away.",
+        reasons::RESULTS_NOT_STORED => "The results could not be stored.",
+        reasons::SIMULATION_CRASHED => "The simulator crashed.",
+        reasons::NO_GPU => "The machine that ran the submission had no GPU for it.",
+        reasons::NODE_CANNOT_START => "The machine that was to run the submission could not start it.",
+        reasons::DISK_FULL => "The run's disk was full.",
+        reasons::GRAPHICS_DRIVER_MISSING => "The machine that ran the submission could not run the simulator.",
+        reasons::START_DEADLINE => "The run could not be started in time.",
+        reasons::SCHEDULE_DEADLINE => "No machine was free for the submission in time.",
+        reasons::JOB_DELETED | reasons::JOB_EXPIRED | reasons::JOB_FAILED => "The cluster ended the run.",
+        reasons::PHASE_DIFFERS => "The submission's phase in EvalAI is not the one it was submitted to.",
+        reasons::NOT_ISOLATED => "The run could not be isolated from the network.",
+        _ => "The run could not be set up.",
+    };
+    format!("{what} Your agent is not the cause. Ask the challenge's hosts to resume the submission, or submit again.")
+}
+
+pub(super) fn is_on_node(place: &LogPlace) -> bool {
+    matches!(place.at, LogAt::Node { .. })
+}
+
+/// The places of the log that explains the failure of a status.
+pub(super) fn log_places(status: &SubmissionStatus, pod: Option<&PodView>) -> Vec<LogPlace> {
+    let Some(failure) = &status.failure else {
+        return Vec::new();
+    };
+    let id = failure.worker.unwrap_or_else(|| unfinished(status));
+    let Some(pair) = u16::try_from(id).ok().and_then(Pair::new) else {
+        return Vec::new();
+    };
+    let (agent, host) = (pair.agent().to_string(), pair.host().to_string());
+    let on_node = |container: &str| pod.and_then(|pod| on_node(pod, container));
+    let found = match failure.reason.as_str() {
+        reasons::SIMULATION_CRASHED => vec![on_node(&host), Some(stored(&host, console(pair)))],
+        reasons::START_DEADLINE => vec![pod.and_then(failing_before_agents).and_then(on_node)],
+        reasons::RESULTS_NOT_STORED | reasons::JOB_FAILED => vec![
+            on_node(names::CONTAINER_LOGCOPY),
+            Some(stored(
+                names::CONTAINER_LOGCOPY,
+                leaderboard_contract::keys::OWN_LOG.into(),
+            )),
+        ],
+        // It never ran.
+        reasons::IMAGE_INVALID
+        | reasons::IMAGE_NOT_FOUND
+        | reasons::IMAGE_PLATFORM
+        | reasons::IMAGE_PULL
+        | reasons::IMAGE_CHANGED
+        | reasons::CONTAINER_CONFIG => Vec::new(),
+        reasons::DISK_FULL => vec![Some(stored(&agent, agent_log(pair))), on_node(&agent)],
+        _ if failure.class == FailureClass::Participant => vec![Some(stored(&agent, agent_log(pair))), on_node(&agent)],
+        _ => Vec::new(),
+    };
+    found.into_iter().flatten().collect()
+}
+
+/// The container before the agents that fails.
+fn failing_before_agents(pod: &PodView) -> Option<&str> {
+    let is_failing = |c: &&ContainerView| c.is_before_agents() && c.last.as_ref().is_some_and(|l| l.exit_code != 0);
+    pod.containers.iter().find(is_failing).map(|c| c.name.as_str())
+}
+
+/// The first worker that has not done all its work: a failure of the whole run is most likely explained by its log.
+fn unfinished(status: &SubmissionStatus) -> i32 {
+    let mut workers = status.workers.iter();
+    workers
+        .find(|worker| worker.done < worker.total)
+        .map_or(1, |worker| worker.id)
+}
+
+fn stored(container: &str, key: String) -> LogPlace {
+    LogPlace {
+        container: container.into(),
+        at: LogAt::Bucket { key },
+    }
+}
+
+/// None for a container that never ran: it has no log.
+fn on_node(pod: &PodView, container: &str) -> Option<LogPlace> {
+    let found = pod.containers.iter().find(|c| c.name == container)?;
+    if !found.running && found.last.is_none() {
+        return None;
+    }
+    let at = LogAt::Node {
+        pod: pod.name.clone(),
+        previous: found.running && found.last.is_some(),
+    };
+    Some(LogPlace {
+        container: container.into(),
+        at,
+    })
+}

@@ -1,0 +1,424 @@
+//! What other systems get of an end: EvalAI first, then the table's row.
+//!
+//! The cancel race: EvalAI's own end wins until our result is answered (`amend`), and stands after it (`note_late_cancel`).
+
+use std::time::Duration;
+
+use jiff::Timestamp;
+use k8s_openapi::apimachinery::pkg::apis::meta::v1::Time;
+
+use super::plan::{Action, EvalaiUpdate, TableUpdate};
+use super::run::{self, Reading};
+use super::status::PlanBuilder;
+use super::waits::{Wait, after};
+use super::{failure, gates, leave, stop};
+use crate::view::{EvalaiEnd, EvalaiView, ObservedLog};
+use leaderboard_api::conditions::{self, Truth};
+use leaderboard_api::evalai_status::Status;
+use leaderboard_api::text::sentence;
+use leaderboard_api::{State, SubmissionStatus, reasons};
+
+const SENT_AGAIN: &str = "EvalAI may have lost its own end of this submission: one of our requests may have overwritten it, or \
+                           the submission was deleted before its end. EvalAI is read again, and `cancelled` is written if \
+                           needed.";
+
+/// Decides for a submission in a terminal state.
+pub(super) fn decide(draft: &mut PlanBuilder<'_>) {
+    leave::leave_job(draft);
+    leave::show_refused_attempt(draft);
+    // Before EvalAI has the end, since its hosts read it there.
+    let log_left = keep_at_end(draft);
+    let published = publish(draft, log_left);
+    // The row follows EvalAI's word, which may still turn the end into Cancelled; a refusal is a word too.
+    let recorded = match published {
+        Delivery::Waiting => {
+            follow_evalai(draft);
+            false
+        }
+        Delivery::Answered(at) => record(draft, draft.now() >= shown_by(at)) == Delivery::Done,
+        Delivery::Done | Delivery::Refused => record(draft, true) == Delivery::Done,
+    };
+    if let Delivery::Answered(at) = published {
+        show_published(draft, at, recorded);
+    }
+    if let Some(left) = log_left {
+        draft.requeue_in(left);
+    }
+    let is_published = matches!(published, Delivery::Done | Delivery::Answered(_));
+    let complete = is_published && recorded && log_left.is_none();
+    if complete {
+        draft.act(Action::Forget);
+        leave::delete_in_time(draft);
+    } else {
+        draft.look_again(Wait::DELIVERY);
+    }
+    if complete {
+        leave::remove_job_in_time(draft);
+    }
+    leave::release(draft, complete);
+}
+
+/// How far another system is with the end.
+#[derive(Clone, Copy, PartialEq, Eq)]
+pub(super) enum Delivery {
+    /// It knows the end, or need not.
+    Done,
+    /// It has answered so at this time, which the status does not show yet.
+    Answered(Timestamp),
+    /// It will not take it.
+    Refused,
+    Waiting,
+}
+
+/// Shows that EvalAI has the end. The table's answer is waited for, so that both are one write.
+fn show_published(draft: &mut PlanBuilder<'_>, at: Timestamp, recorded: bool) {
+    let until = shown_by(at);
+    if !recorded && draft.now() < until {
+        return draft.requeue_at(until);
+    }
+    draft.status.times.published = Some(Time(at));
+    let team = draft.view.evalai.as_ref().and_then(|evalai| evalai.team_id.clone());
+    published(draft, team.as_deref());
+}
+
+fn shown_by(at: Timestamp) -> Timestamp {
+    Wait::TOGETHER.shown_at(at)
+}
+
+fn is_not_wanted(draft: &PlanBuilder<'_>, type_: &str) -> bool {
+    let known = draft.status.condition(type_);
+    known.is_some_and(|c| c.reason == reasons::NOT_REQUIRED)
+}
+
+/// A Leaderboard that is gone can't show what is wanted: what was decided before stands, and what never ran needs nothing.
+fn without_leaderboard(draft: &mut PlanBuilder<'_>, type_: &str) -> Delivery {
+    if is_not_wanted(draft, type_) {
+        return Delivery::Done;
+    }
+    let message = draft.no_leaderboard();
+    draft.condition(type_, Truth::False, reasons::LEADERBOARD_NOT_FOUND, &message);
+    if draft.status.plan.is_none() {
+        Delivery::Done
+    } else {
+        Delivery::Waiting
+    }
+}
+
+fn publish(draft: &mut PlanBuilder<'_>, log_left: Option<Duration>) -> Delivery {
+    let end = draft.status.condition(conditions::FINISHED);
+    let is_evalais = end.is_some_and(|c| c.reason == reasons::ENDED_IN_EVALAI);
+    let is_overtaken = is_evalais && is_overtaken(draft);
+    // One that was deleted before its end is ended there all the same: EvalAI counts it against its team until then.
+    let is_ours = draft.spec().evalai.is_some() && (is_overtaken || !is_of_another_phase(draft));
+    let is_held = is_ours && draft.is_held();
+    if !is_ours || is_held || (is_evalais && !is_overtaken) || draft.observes() {
+        let message = if is_held { gates::NOT_WRITTEN } else { "" };
+        draft.condition(conditions::PUBLISHED, Truth::False, reasons::NOT_REQUIRED, message);
+        return Delivery::Done;
+    }
+    if draft.status.is_delivered(conditions::PUBLISHED) {
+        note_late_cancel(draft);
+        return Delivery::Done;
+    }
+    if draft.leaderboard().is_none() {
+        return without_leaderboard(draft, conditions::PUBLISHED);
+    }
+    let view = draft.view.evalai.clone().unwrap_or_default();
+    match view.end {
+        Some(EvalaiEnd::Published { at }) => Delivery::Answered(at),
+        Some(EvalaiEnd::Ended(status)) => amend(draft, status),
+        Some(EvalaiEnd::Refused { message }) => {
+            refused(draft, &message);
+            Delivery::Refused
+        }
+        None => {
+            send_end(draft, view, is_overtaken, log_left);
+            Delivery::Waiting
+        }
+    }
+}
+
+/// Shows that EvalAI has cancelled a result that it had, as a host's re-run does. State, score and row stay.
+fn note_late_cancel(draft: &mut PlanBuilder<'_>) {
+    let listed = draft.view.evalai.as_ref().and_then(|evalai| evalai.cancelled_as_of);
+    let (Some(listed), Some(published)) = (listed, draft.status.times.published.as_ref()) else {
+        return;
+    };
+    if !draft.is_successful() || !draft.status.is_true(conditions::PUBLISHED) {
+        return;
+    }
+    // The status has whole seconds. An older list shows what the result has replaced, and the next one wakes for no id a second time.
+    if listed > after(published.0, 1) {
+        draft.condition(conditions::PUBLISHED, Truth::False, reasons::CANCELLED_IN_EVALAI, "");
+    } else {
+        draft.look_again(Wait::DELIVERY);
+    }
+}
+
+/// Sends the end with all that belongs to it, once that is there. Returns why it cannot be read.
+fn send_result(draft: &mut PlanBuilder<'_>, log_left: Option<Duration>) -> Option<String> {
+    match run::report_of_end(draft) {
+        Reading::Waits(why) => return why,
+        Reading::Done if log_left.is_some() => {}
+        Reading::Done => draft.act(Action::UpdateEvalai(match draft.status.state_of_conditions() {
+            State::Finished => EvalaiUpdate::Finished,
+            State::Cancelled => EvalaiUpdate::Cancelled,
+            _ => EvalaiUpdate::Failed,
+        })),
+    }
+    None
+}
+
+/// Sends the end, and shows that EvalAI does not have it yet.
+fn send_end(draft: &mut PlanBuilder<'_>, evalai: EvalaiView, is_overtaken: bool, log_left: Option<Duration>) {
+    let why = send_result(draft, log_left).or(evalai.unread);
+    let unread = why.map(|why| cannot_be_read(draft, conditions::PUBLISHED, &why));
+    let failed = evalai
+        .error
+        .map(|e| format!("The last request failed: {}", sentence(&e)));
+    let failed = failed.or(unread);
+    let (reason, message) = if is_overtaken {
+        (
+            reasons::CONCURRENT_UPDATE,
+            failed.or_else(|| Some(SENT_AGAIN.to_owned())),
+        )
+    } else if let Some(until) = evalai.writes_from {
+        draft.requeue_at(until);
+        (
+            reasons::WAITING_FOR_PREVIOUS_CONTROLLER,
+            Some(previous_controller(until)),
+        )
+    } else {
+        (reasons::WAITING, failed)
+    };
+    let message = message.unwrap_or_default();
+    draft.condition(conditions::PUBLISHED, Truth::False, reason, &message);
+}
+
+/// EvalAI has the end. Its row may by now be another team's, to whom EvalAI shows the result: participants can edit it.
+fn published(draft: &mut PlanBuilder<'_>, team: Option<&str>) {
+    let ours = draft.status.team.as_ref().and_then(|team| team.id.as_deref());
+    let moved = ours.zip(team).filter(|(ours, theirs)| ours != theirs);
+    let message = moved.map(|(ours, theirs)| {
+        format!(
+            "The submission was moved to team {theirs} in EvalAI, which shows the result there; it was run and recorded for team \
+             {ours}. Set the team back in EvalAI, or correct the table."
+        )
+    });
+    let left_out = draft.view.report.ours().and_then(|report| report.left_out.as_deref());
+    let shown = message.as_deref().or(left_out).unwrap_or_default().to_owned();
+    draft.condition(conditions::PUBLISHED, Truth::True, reasons::PUBLISHED, &shown);
+    if let Some(message) = message {
+        draft.event(true, reasons::TEAM_DIFFERS, message);
+    }
+}
+
+/// Whether it was taken back before it was ever accepted, because EvalAI's row is another phase's: the row is not ours to end.
+fn is_of_another_phase(draft: &PlanBuilder<'_>) -> bool {
+    let accepted = draft.status.condition(conditions::ACCEPTED);
+    let differs = accepted.is_some_and(|c| c.reason == reasons::PHASE_DIFFERS);
+    differs && draft.status.plan.is_none() && draft.status.state_of_conditions() == State::Cancelled
+}
+
+/// Why nothing is written to EvalAI for a moment. A request of a controller that ended without an answer may still be worked on.
+pub fn previous_controller(until: Timestamp) -> String {
+    format!(
+        "Nothing is written to EvalAI before {} UTC: the previous controller did not confirm its last requests, and they may \
+         still be running. Nothing to do.",
+        until.strftime("%H:%M:%S")
+    )
+}
+
+/// What keeps an end from being published. The first text stands: another one for the same would be a write each time.
+fn cannot_be_read(draft: &PlanBuilder<'_>, type_: &str, why: &str) -> String {
+    const BEGINS: &str = "The stored result cannot be read:";
+    let known = draft.status.condition(type_).map(|c| c.message.to_string());
+    let known = known.filter(|message| message.starts_with(BEGINS));
+    known.unwrap_or_else(|| {
+        format!(
+            "{BEGINS} {} It is published when it can; look at the bucket.",
+            sentence(why)
+        )
+    })
+}
+
+/// Whether EvalAI's own end may have been undone by a write of ours that was under way. The condition remembers it.
+fn is_overtaken(draft: &PlanBuilder<'_>) -> bool {
+    let published = draft.status.condition(conditions::PUBLISHED);
+    draft.view.evalai.as_ref().is_some_and(|e| e.overtaken)
+        || published.is_some_and(|c| c.reason == reasons::CONCURRENT_UPDATE)
+}
+
+fn refused(draft: &mut PlanBuilder<'_>, message: &str) {
+    let message = format!(
+        "EvalAI does not take the result: {} Compare its metrics with the leaderboard of the phase; it is tried again \
+         from time to time.",
+        sentence(message)
+    );
+    let known = draft.status.condition(conditions::PUBLISHED);
+    let is_new = known.is_none_or(|c| c.reason != reasons::REFUSED);
+    draft.condition(conditions::PUBLISHED, Truth::False, reasons::REFUSED, &message);
+    if is_new {
+        draft.event(true, reasons::REFUSED, message);
+    }
+}
+
+/// EvalAI had ended it first: its cancel wins until our result is answered, so that all systems agree.
+fn amend(draft: &mut PlanBuilder<'_>, status: Status) -> Delivery {
+    draft.condition(conditions::PUBLISHED, Truth::False, reasons::NOT_REQUIRED, "");
+    if draft.status.state_of_conditions() == State::Cancelled {
+        keep_evalais_end(draft, status);
+        return Delivery::Done;
+    }
+    draft.status.failure = None;
+    let message = format!("EvalAI shows {status}, so the result is not published.");
+    draft.condition(conditions::FINISHED, Truth::True, reasons::ENDED_IN_EVALAI, &message);
+    draft.show(reasons::ENDED_IN_EVALAI, message);
+    // While EvalAI refused the result, the table was handed the outcome that no longer holds; the status may not show that yet.
+    let is_written = draft.view.record.as_ref().is_some_and(|row| row.end_written);
+    if !is_written && !draft.status.is_true(conditions::RECORDED) && superseded(draft).is_none() {
+        return Delivery::Done;
+    }
+    draft.condition(conditions::RECORDED, Truth::False, reasons::WAITING, "");
+    record_end(draft);
+    Delivery::Waiting
+}
+
+/// A cancel of what EvalAI calls finished: that is kept, and the object says whose end holds.
+fn keep_evalais_end(draft: &mut PlanBuilder<'_>, status: Status) {
+    let end = draft.status.condition(conditions::FINISHED);
+    let is_ours = end.is_some_and(|end| end.reason != reasons::ENDED_IN_EVALAI);
+    if is_ours && status == Status::Finished {
+        let message = format!("EvalAI showed {status} before the submission was run here; that is kept.");
+        draft.condition(conditions::FINISHED, Truth::True, reasons::ENDED_IN_EVALAI, &message);
+        draft.show(reasons::ENDED_IN_EVALAI, message);
+    }
+}
+
+/// Requests the log of a run that has failed, until EvalAI's answer to the end is known: its hosts read it there. Returns how
+/// long EvalAI waits for it.
+fn keep_at_end(draft: &mut PlanBuilder<'_>) -> Option<Duration> {
+    let before = draft.view.submission.status.as_ref();
+    let has_just_ended = !before.is_some_and(SubmissionStatus::has_ended);
+    let is_published = before.is_some_and(|s| s.is_delivered(conditions::PUBLISHED));
+    let is_answered = draft.view.evalai.as_ref().is_some_and(|e| e.end.is_some());
+    let is_awaited = draft.spec().evalai.is_some() && !is_published && !is_answered;
+    if is_awaited || (has_just_ended && !is_answered) {
+        let places = failure::log_places(&draft.status, draft.view.pod.as_ref());
+        if !places.is_empty() {
+            draft.act(Action::KeepLog { places });
+            // What is known is of the time before the end.
+            let log = if has_just_ended {
+                ObservedLog::NotRequested
+            } else {
+                draft.view.log
+            };
+            return stop::log_left(log, Wait::LOG.left(Duration::ZERO));
+        }
+    }
+    stop::log_left(draft.view.log, None).filter(|_| !has_just_ended)
+}
+
+/// How the message begins of an end that is settled without a row: another try would be refused again.
+const SUPERSEDED: &str = "The table keeps another row of this run";
+
+/// Shown while the row may still turn out otherwise.
+const FOLLOWS_EVALAI: &str = "The table's row is written when EvalAI has answered, since EvalAI may still have cancelled the submission. The \
+                              condition Published shows what EvalAI is waited for.";
+
+/// Shown while the row is on its way.
+const IN_LINE: &str = "The row waits for the table, which takes one row after the other.";
+
+/// Writes the row of an end on which EvalAI has had its word. `is_shown`: the status shows that word. Until then its text about the row stays,
+/// which saves a write.
+fn record(draft: &mut PlanBuilder<'_>, is_shown: bool) -> Delivery {
+    if draft.status.is_true(conditions::RECORDED) {
+        return Delivery::Done;
+    }
+    if draft.leaderboard().is_none() {
+        return without_leaderboard(draft, conditions::RECORDED);
+    }
+    if let Some(message) = why_without_row(draft) {
+        draft.condition(conditions::RECORDED, Truth::False, reasons::NOT_REQUIRED, &message);
+        return Delivery::Done;
+    }
+    let view = draft.view.record.clone().unwrap_or_default();
+    if view.end_written {
+        draft.condition(conditions::RECORDED, Truth::True, reasons::RECORDED, "");
+        return Delivery::Done;
+    }
+    let mut unread = None;
+    match row_of_end(draft) {
+        Reading::Waits(why) => unread = why.map(|why| cannot_be_read(draft, conditions::RECORDED, &why)),
+        Reading::Done => record_end(draft),
+    }
+    let (reason, message) = match view.error {
+        Some(error) => (
+            reasons::REFUSED,
+            format!(
+                "The last write failed: {} It is tried again; look at the table and the operator's rights.",
+                sentence(&error)
+            ),
+        ),
+        None => (
+            reasons::WAITING,
+            unread.unwrap_or_else(|| (if is_shown { IN_LINE } else { FOLLOWS_EVALAI }).to_owned()),
+        ),
+    };
+    draft.condition(conditions::RECORDED, Truth::False, reason, &message);
+    Delivery::Waiting
+}
+
+/// Why the end has no row of its own; none if it has one, or will.
+fn why_without_row(draft: &PlanBuilder<'_>) -> Option<String> {
+    if draft.view.record.is_none() {
+        Some(String::new())
+    } else if draft.is_held() {
+        Some(gates::NOT_WRITTEN.to_owned())
+    } else if draft.status.plan.is_none() {
+        Some("The submission was never accepted, so the table has no row for it.".to_owned())
+    } else if !draft.has_row() {
+        Some(
+            "The row needs a team: give spec.team.id to a submission that is not EvalAI's. A check has none."
+                .to_owned(),
+        )
+    } else {
+        superseded(draft)
+    }
+}
+
+fn record_end(draft: &mut PlanBuilder<'_>) {
+    draft.act(Action::Record(TableUpdate::End));
+}
+
+/// Whether all that the row shows is there: only that of a finished submission has metrics.
+fn row_of_end(draft: &mut PlanBuilder<'_>) -> Reading {
+    if draft.is_successful() {
+        run::report_of_end(draft)
+    } else {
+        Reading::Done
+    }
+}
+
+/// Shows that the row waits for EvalAI, where there will be one.
+fn follow_evalai(draft: &mut PlanBuilder<'_>) {
+    let known = draft.status.condition(conditions::RECORDED);
+    let is_waiting = known.is_some_and(|known| known.reason == reasons::WAITING);
+    if is_waiting && draft.leaderboard().is_some() && why_without_row(draft).is_none() {
+        draft.condition(conditions::RECORDED, Truth::False, reasons::WAITING, FOLLOWS_EVALAI);
+    }
+}
+
+/// Shows that the table keeps another row than that of this end: the recorder knows until it has forgotten the end, then the status.
+fn superseded(draft: &PlanBuilder<'_>) -> Option<String> {
+    if let Some(kept) = draft.view.record.as_ref().and_then(|row| row.superseded_by) {
+        let next = kept.saturating_add(1);
+        return Some(format!(
+            "{SUPERSEDED}, of attempt {kept}, and this end was not written there. Raise spec.attempt to {next} if the submission is to \
+             go on. Correct the row by hand if this end is the one that counts."
+        ));
+    }
+    let shown = draft.status.condition(conditions::RECORDED)?;
+    let is_shown = shown.reason == reasons::NOT_REQUIRED && shown.message.starts_with(SUPERSEDED);
+    is_shown.then(|| shown.message.to_string())
+}

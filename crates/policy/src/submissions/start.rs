@@ -1,0 +1,449 @@
+//! From the Job's creation to its running agents: what its Pod waits for, and when that has taken too long.
+//!
+//! Also of a Pod that replaces a lost one: the submission then keeps its state, with the reason `Replacing`. Pulls of images have a deadline
+//! apart from all the rest. The kubelet's events are not watched, and no condition covers images, so a pull is known by its containers: the
+//! kubelet starts them in order, and one that was never started, has no error and is next is waiting for its image.
+
+use jiff::Timestamp;
+
+use super::cause::{self, Cause, Trouble};
+use super::failure::{self, infrastructure};
+use super::plan::Action;
+use super::run;
+use super::status::PlanBuilder;
+use super::waits::{Wait, after};
+use crate::view::{ContainerView, JobView, ObservedJob, ObservedNode, PodView, ScaleUp};
+use leaderboard_api::conditions::{self, Truth};
+use leaderboard_api::text::sentence;
+use leaderboard_api::{Deadlines, Failure, names, reasons};
+use leaderboard_pod_spec::job as job_spec;
+use leaderboard_protocol::files::Member;
+
+/// The message for a Pod that starts as it should.
+const PREPARED: &str = "The Pod is being prepared.";
+
+/// The kubelet's reason where a device plugin does not give the devices on which the scheduler counted.
+const NOT_ADMITTED: &str = "UnexpectedAdmissionError";
+
+const LOST: &str = "The Pod was lost. A new Pod will resume from the results in S3.";
+
+/// The minutes of silence that are reported: a count of every one would be a write each.
+const REPORTED_MINUTES: [i64; 6] = [2, 5, 10, 20, 30, 60];
+
+pub(super) fn start_job(draft: &mut PlanBuilder<'_>) {
+    let view = draft.view;
+    let name = draft.job_name();
+    draft.status.waiting = None;
+    draft.status.next_retry_time = None;
+    draft.status.job_name = Some(name);
+    note_gpus(draft);
+    draft.act(Action::CreateJob(draft.status.job_number()));
+    if let ObservedJob::Absent { refused: Some(words) } = &view.job {
+        job_refused(draft, words);
+    } else if draft.is_running() {
+        draft.waits(reasons::PREPARING);
+        let message = "The Job was deleted by somebody else. A new Job will resume from the results in S3.";
+        draft.replacing(message);
+    } else {
+        draft.waits(reasons::PREPARING);
+        draft.condition(conditions::RUNNING, Truth::False, reasons::PREPARING, "");
+        draft.show(reasons::PREPARING, PREPARED);
+    }
+    run::update_evalai(draft);
+    run::record_progress(draft);
+    draft.look_again(Wait::JOB);
+}
+
+/// How many GPUs the next Job has: the Leaderboard may be another one when it ends.
+fn note_gpus(draft: &mut PlanBuilder<'_>) {
+    let (Some(spec), Some(plan)) = (draft.leaderboard(), draft.status.plan.as_ref()) else {
+        return;
+    };
+    let track = spec.tracks.iter().find(|track| track.name == plan.track);
+    let gpus = job_spec::gpus(spec, track, plan);
+    if gpus > 0 || draft.status.usage.is_some() {
+        draft.status.usage.get_or_insert_default().gpus = gpus;
+    }
+}
+
+/// An older object of the same name still has the Job.
+pub(super) fn name_taken(draft: &mut PlanBuilder<'_>) {
+    let message = format!(
+        "The Job {} belongs to an older object of this name and is going away. If it stays, delete it.",
+        draft.job_name()
+    );
+    let message = draft.stall(reasons::JOB_NAME_TAKEN, &message);
+    draft.show(reasons::JOB_NAME_TAKEN, message);
+    draft.look_again(Wait::JOB_NAME);
+}
+
+/// Reports how far a Job's Pod is, and fails the attempt when a start has taken too long.
+pub(super) fn watch(draft: &mut PlanBuilder<'_>, job: &JobView) {
+    let view = draft.view;
+    let Some(pod) = &view.pod else {
+        return without_pod(draft, job);
+    };
+    if let Some((reason, words)) = &pod.ended_by_node {
+        return ended_by_node(draft, pod, reason, words);
+    }
+    if pod.delete_by.is_some() {
+        draft.moves();
+        return draft.replacing(LOST);
+    }
+    if let Some(message) = left_by_node(draft, pod) {
+        draft.moves();
+        return draft.replacing(&message);
+    }
+    if let Some(words) = &pod.unschedulable {
+        return unschedulable(draft, job, words, pod.scale_up.as_ref());
+    }
+    let since = pod.scheduled.or(job.created).unwrap_or(draft.now());
+    let found = cause::trouble_of(pod);
+    let stalled = found
+        .as_ref()
+        .map(|found| draft.blocked_since(found.reason).unwrap_or(draft.now()));
+    // Until the scheduler has spoken there is no node that could be late.
+    let limit = limit(pod, &draft.deadlines(), stalled);
+    let over = limit.filter(|limit| draft.now() >= limit.at);
+    let lasted = found.as_ref().and_then(|found| lasts(draft, found));
+    let has_started = pod.agent_started.is_some();
+    match (found, over) {
+        (Some(found), _) if found.is_hopeless => draft.fail(cause::failure_of(&found, pod, 0)),
+        (Some(found), Some(over)) if found.is_start => draft.fail(cause::failure_of(&found, pod, over.seconds)),
+        (Some(found), _) => {
+            if let Some(seconds) = lasted {
+                return draft.fail(cause::failure_of(&found, pod, seconds));
+            }
+            show_trouble(draft, &found, has_started);
+            if let Some(limit) = limit.filter(|_| found.is_start) {
+                draft.requeue_at(limit.at);
+            }
+        }
+        (None, _) if has_started => show_running(draft),
+        (None, Some(over)) => draft.fail(start_deadline(pod, over)),
+        (None, None) => {
+            show_preparing(draft, pod, since);
+            if let Some(limit) = limit {
+                draft.requeue_at(limit.at);
+            }
+        }
+    }
+}
+
+/// The kubelet ended the Pod as a whole. The Job makes another, unless the node has not even admitted this one: it would not admit the
+/// next one either, and looks free to the scheduler.
+fn ended_by_node(draft: &mut PlanBuilder<'_>, pod: &PodView, reason: &str, words: &str) {
+    let node = cause::node_of(pod);
+    if reason == NOT_ADMITTED {
+        let what = sentence(&format!(
+            "On {node} the kubelet did not admit the Pod ({reason}): {words}"
+        ));
+        return draft.fail(infrastructure(reasons::NODE_CANNOT_START, &what));
+    }
+    let what = sentence(&format!("On {node} the kubelet ended the Pod ({reason}): {words}"));
+    draft.moves();
+    draft.replacing(&format!("{what} A new Pod will resume from the results in S3."));
+}
+
+/// For how many seconds a node has not started a container again in mid-run, if that is too long: such a container has no end that would
+/// count as a crash. If it is not yet, it is looked at again then.
+fn lasts(draft: &mut PlanBuilder<'_>, found: &Trouble) -> Option<i64> {
+    if found.is_start || found.cause != Cause::Node {
+        return None;
+    }
+    let seconds = draft.deadlines().start_seconds;
+    let since = draft.blocked_since(found.reason).unwrap_or(draft.now());
+    let until = after(since, seconds);
+    draft.requeue_at(until);
+    (draft.now() >= until).then_some(seconds)
+}
+
+/// The message for a run whose node is away, before Kubernetes has given its Pod up.
+fn left_by_node(draft: &PlanBuilder<'_>, pod: &PodView) -> Option<String> {
+    let node = pod.node.as_deref().filter(|_| draft.is_running())?;
+    match draft.view.node.state {
+        ObservedNode::Gone => Some(format!(
+            "Node {node} is gone, and the Pod with it. A new Pod will resume from the results in S3."
+        )),
+        ObservedNode::Silent { since } => Some(format!(
+            "Node {node} has been silent since {since:.0}. If that lasts, the Pod is given up, and a new Pod will resume from the results in S3."
+        )),
+        ObservedNode::Reports | ObservedNode::Unknown => None,
+    }
+}
+
+fn show_running(draft: &mut PlanBuilder<'_>) {
+    let reason = if draft.status.is_resumed() {
+        reasons::RESUMED
+    } else {
+        reasons::RUNNING
+    };
+    let progress = draft.status.progress.as_ref();
+    let message = progress
+        .map(|p| format!("{} {} done.", p.text, p.unit))
+        .unwrap_or_default();
+    draft.moves();
+    draft.condition(conditions::RUNNING, Truth::True, reason, "");
+    draft.show(reason, message);
+}
+
+/// Shows what a Pod waits for whose agents have not started.
+fn show_wait(draft: &mut PlanBuilder<'_>, reason: &str, message: &str) {
+    if draft.is_running() {
+        draft.replacing(&format!("The Pod was lost, and the new one waits. {message}"));
+    } else {
+        draft.show(reason, message);
+    }
+}
+
+fn show_trouble(draft: &mut PlanBuilder<'_>, found: &Trouble, has_started: bool) {
+    draft.stall_with(found.reason, &found.message);
+    if has_started {
+        draft.show(found.reason, found.message.clone());
+    } else {
+        show_wait(draft, found.reason, &found.message);
+    }
+}
+
+fn show_preparing(draft: &mut PlanBuilder<'_>, pod: &PodView, since: Timestamp) {
+    draft.moves();
+    let silent = draft.now().duration_since(since).as_secs();
+    let mut told = [Wait::PREPARATION.silent]
+        .into_iter()
+        .chain(REPORTED_MINUTES.map(|minutes| minutes * 60));
+    if let Some(next) = told.find(|at| silent < *at) {
+        draft.requeue_at(after(since, next));
+    }
+    let message = if silent < Wait::PREPARATION.silent {
+        PREPARED.to_owned()
+    } else {
+        let told = REPORTED_MINUTES.iter().rev().find(|m| silent >= **m * 60);
+        let long = told.map_or_else(String::new, |m| format!(", for over {m} min"));
+        let node = pod.node.as_deref().map(|n| format!(" on {n}")).unwrap_or_default();
+        format!("The Pod is being prepared{node}: {}{long}.", stage(pod))
+    };
+    if draft.is_running() {
+        draft.replacing(&format!("The Pod was lost. {message}"));
+    } else {
+        draft.show(reasons::PREPARING, message);
+    }
+}
+
+fn stage(pod: &PodView) -> &'static str {
+    let ended = |name: &str| {
+        let end = pod
+            .containers
+            .iter()
+            .find(|c| c.name == name)
+            .and_then(|c| c.last.as_ref());
+        end.is_some_and(|l| l.exit_code == 0)
+    };
+    if pod.logcopy_running {
+        "images are pulled, its containers start"
+    } else if ended(names::CONTAINER_CONTENTS) {
+        "logcopy starts"
+    } else if ended(names::CONTAINER_WORKSPACE) {
+        "contents are pulled and copied"
+    } else {
+        "the operator's image is pulled and the workspace is filled"
+    }
+}
+
+fn without_pod(draft: &mut PlanBuilder<'_>, job: &JobView) {
+    let had_pod = draft.status.times.scheduled.is_some();
+    if let Some(words) = &job.failed_create {
+        if settles(draft, job) {
+            return;
+        }
+        let (reason, message) = refused("Pod", words);
+        if !is_late(draft, job, reason, &message) {
+            draft.stall_with(reason, &message);
+            show_wait(draft, reason, &message);
+        }
+    } else if had_pod {
+        draft.replacing(LOST);
+    } else if let Some(at) = job.created.map(|at| Wait::POD.shown_at(at)) {
+        if draft.now() < at {
+            return draft.requeue_at(at);
+        }
+        let message = "The Job has not created a Pod and no event explains why. Look at the Job, and check that the \
+                       cluster's controller manager runs.";
+        draft.stall_with(reasons::PREPARING, message);
+        show_wait(draft, reasons::PREPARING, message);
+    }
+}
+
+/// Shows why the API server does not make the Job; each next try asks it again.
+fn job_refused(draft: &mut PlanBuilder<'_>, words: &str) {
+    let (reason, message) = refused("Job", words);
+    draft.stall_with(reason, &message);
+    if draft.is_running() {
+        draft.replacing(&message);
+    } else {
+        draft.condition(conditions::RUNNING, Truth::False, reason, "");
+        draft.show(reason, message);
+    }
+}
+
+/// A reason and what to show of an object that the API server refuses.
+fn refused(what: &str, words: &str) -> (&'static str, String) {
+    let is_quota = words.contains("exceeded quota") || words.contains("failed quota");
+    let (reason, what) = if is_quota {
+        let what = format!("The namespace's quota does not allow the {what}");
+        (reasons::QUOTA_EXCEEDED, what)
+    } else {
+        (reasons::POD_REFUSED, format!("The API server refuses the {what}"))
+    };
+    (reason, sentence(&format!("{what}: {words}")))
+}
+
+/// Shows nothing yet of a Job that is new.
+fn settles(draft: &mut PlanBuilder<'_>, job: &JobView) -> bool {
+    let settled = job.created.map(|at| Wait::NODE.shown_at(at));
+    let Some(settled) = settled.filter(|at| draft.now() < *at) else {
+        return false;
+    };
+    draft.requeue_at(settled);
+    true
+}
+
+fn unschedulable(draft: &mut PlanBuilder<'_>, job: &JobView, words: &str, scale_up: Option<&ScaleUp>) {
+    if settles(draft, job) {
+        return;
+    }
+    let of_nodes = match scale_up {
+        Some(ScaleUp::Coming(words)) => format!(" A node is on its way: {}", sentence(words)),
+        Some(ScaleUp::Refused(words)) => format!(" The autoscaler adds no node: {}", sentence(words)),
+        None => String::new(),
+    };
+    let (reason, message) = (reasons::UNSCHEDULABLE, sentence(words) + &of_nodes);
+    if is_late(draft, job, reason, &message) {
+        return;
+    }
+    if matches!(scale_up, Some(ScaleUp::Coming(_))) {
+        draft.waits_since(reason, &message);
+    } else {
+        draft.stalls_after(Wait::NODE, reason, &message);
+    }
+    show_wait(draft, reason, &message);
+}
+
+/// Whether no node has had the Pod for as long as `scheduleSeconds` allows: then the attempt fails.
+fn is_late(draft: &mut PlanBuilder<'_>, job: &JobView, reason: &str, message: &str) -> bool {
+    let Some(limit) = draft.deadlines().schedule_seconds else {
+        return false;
+    };
+    let had_pod = draft.status.times.scheduled.is_some();
+    let since = if had_pod {
+        draft.blocked_since(reason)
+    } else {
+        job.created
+    };
+    let deadline = after(since.unwrap_or(draft.now()), limit);
+    if draft.now() >= deadline {
+        let what = format!("No node accepted the Pod within {limit} s: {message}");
+        draft.fail(infrastructure(reasons::SCHEDULE_DEADLINE, &what));
+        return true;
+    }
+    draft.requeue_at(deadline);
+    false
+}
+
+fn start_deadline(pod: &PodView, over: Limit) -> Failure {
+    let node = pod.node.as_deref().unwrap_or("the node");
+    let seconds = over.seconds;
+    let what = if over.is_of_pulls {
+        let names = waiting(pod).join(", ");
+        format!("The images of the Pod were not pulled within {seconds} s on {node}; these containers wait: {names}.")
+    } else {
+        format!(
+            "The Pod did not start within {seconds} s, and {node} reports no reason: {}.",
+            stage(pod)
+        )
+    };
+    failure::infrastructure(reasons::START_DEADLINE, &what)
+}
+
+/// How a container waits that the kubelet has not come to yet.
+const NOT_BEGUN: [&str; 3] = ["", "ContainerCreating", "PodInitializing"];
+
+/// When a start has taken too long.
+#[derive(Clone, Copy, Debug, PartialEq, Eq)]
+pub(super) struct Limit {
+    pub(super) at: Timestamp,
+    /// The deadline that is over then.
+    pub(super) seconds: i64,
+    pub(super) is_of_pulls: bool,
+}
+
+/// The limit of a start; none before the Pod has a node. `stalled` is since when a container of it does not start, and that is known.
+pub(super) fn limit(pod: &PodView, deadlines: &Deadlines, stalled: Option<Timestamp>) -> Option<Limit> {
+    let scheduled = pod.scheduled?;
+    let pulled_by = after(after(scheduled, run_seconds(pod)), deadlines.pull_seconds);
+    if stalled.is_none() && !waiting(pod).is_empty() {
+        return Some(Limit {
+            at: pulled_by,
+            seconds: deadlines.pull_seconds,
+            is_of_pulls: true,
+        });
+    }
+    let since = stalled.or_else(|| last_begun(pod)).unwrap_or(scheduled);
+    // Causes that take turns put the end off no further.
+    let latest = after(pulled_by, deadlines.start_seconds);
+    Some(Limit {
+        at: after(since.max(scheduled), deadlines.start_seconds).min(latest),
+        seconds: deadlines.start_seconds,
+        is_of_pulls: false,
+    })
+}
+
+/// The containers that wait for an image, if the Pod is at a pull.
+pub(super) fn waiting(pod: &PodView) -> Vec<&str> {
+    // Ours before the agents go one by one. Those of an overlay hold them up, wherever they stand.
+    let mut before = pod.containers.iter().filter(|container| container.is_before_agents());
+    match before.find(|container| !is_through(container)) {
+        Some(next) if is_before_its_pull(next) => vec![&next.name],
+        Some(_) => Vec::new(),
+        None => {
+            let of_workers = pod
+                .containers
+                .iter()
+                .filter(|container| Member::parse(&container.name).is_some());
+            let waiting = of_workers.filter(|container| is_before_its_pull(container));
+            waiting.map(|container| container.name.as_str()).collect()
+        }
+    }
+}
+
+/// Seconds in which containers before the agents have run: no pull was under way then.
+fn run_seconds(pod: &PodView) -> i64 {
+    let before = pod.containers.iter().filter(|container| container.is_before_agents());
+    before
+        .filter_map(|container| {
+            let end = container.last.as_ref().filter(|end| end.exit_code == 0)?;
+            Some(end.at?.duration_since(end.began?).as_secs().max(0))
+        })
+        .fold(0, i64::saturating_add)
+}
+
+/// When the kubelet came to a container last. A restart is none of its pulls.
+fn last_begun(pod: &PodView) -> Option<Timestamp> {
+    let first_lives = pod.containers.iter().filter(|container| container.restarts == 0);
+    let begun = first_lives.filter_map(|container| container.began.or_else(|| container.last.as_ref()?.began));
+    begun.max()
+}
+
+/// Whether the kubelet goes on to the next one.
+fn is_through(container: &ContainerView) -> bool {
+    let has_ended_well = container.last.as_ref().is_some_and(|end| end.exit_code == 0);
+    let stays = container.running && container.name == names::CONTAINER_LOGCOPY;
+    stays || (has_ended_well && !container.running)
+}
+
+fn is_before_its_pull(container: &ContainerView) -> bool {
+    let waits = container
+        .waiting
+        .as_ref()
+        .is_some_and(|(reason, _)| NOT_BEGUN.contains(&reason.as_str()));
+    waits && container.restarts == 0 && container.last.is_none()
+}

@@ -1,0 +1,143 @@
+//! How long the start of a Pod may take: its pulls apart from all the rest.
+
+use jiff::Timestamp;
+use leaderboard_api::Deadlines;
+
+use super::super::start::{limit, waiting};
+use crate::view::{ContainerView, EndView, PodView};
+
+fn at(second: i64) -> Timestamp {
+    Timestamp::from_second(second).unwrap()
+}
+
+fn waits(name: &str, reason: &str) -> ContainerView {
+    ContainerView {
+        name: name.into(),
+        waiting: Some((reason.into(), String::new())),
+        ..ContainerView::default()
+    }
+}
+
+fn runs(name: &str, since: i64) -> ContainerView {
+    ContainerView {
+        name: name.into(),
+        running: true,
+        began: Some(at(since)),
+        ..ContainerView::default()
+    }
+}
+
+fn ran(name: &str, from: i64, to: i64) -> ContainerView {
+    ContainerView {
+        name: name.into(),
+        last: Some(EndView {
+            began: Some(at(from)),
+            at: Some(at(to)),
+            ..EndView::default()
+        }),
+        ..ContainerView::default()
+    }
+}
+
+fn pod(containers: Vec<ContainerView>) -> PodView {
+    PodView {
+        scheduled: Some(at(0)),
+        containers,
+        ..PodView::default()
+    }
+}
+
+fn deadlines() -> Deadlines {
+    Deadlines {
+        pull_seconds: 5400,
+        start_seconds: 1800,
+        ..Deadlines::default()
+    }
+}
+
+fn init(name: &str) -> ContainerView {
+    waits(name, "PodInitializing")
+}
+
+/// A Pod that starts: what has been, and who waits for its turn.
+fn starts(first: Vec<ContainerView>, later: &[&str]) -> Vec<ContainerView> {
+    first.into_iter().chain(later.iter().map(|name| init(name))).collect()
+}
+
+/// The containers of a pair, once everything before them is there.
+fn pair(containers: [ContainerView; 2]) -> Vec<ContainerView> {
+    let first = [
+        ran("contents", 2000, 3000),
+        ran("workspace", 3010, 3020),
+        runs("logcopy", 3030),
+    ];
+    first.into_iter().chain(containers).collect()
+}
+
+const PAIR: [&str; 2] = ["simulator-1", "agent-1"];
+
+/// What a Pod that starts goes through, with who waits for an image, and by when it has to be further.
+fn stages() -> [(&'static str, Vec<ContainerView>, &'static [&'static str], i64); 9] {
+    const WORKSPACE: [&str; 4] = ["workspace", "logcopy", "simulator-1", "agent-1"];
+    const ALL: [&str; 5] = ["contents", "workspace", "logcopy", "simulator-1", "agent-1"];
+    let contents = ran("contents", 2000, 3000);
+    let copying = starts(vec![runs("contents", 2000)], &WORKSPACE);
+    let no_reason = pair(PAIR.map(|name| waits(name, "")));
+    let simulator = || runs("simulator-1", 4000);
+    let odd = pair([simulator(), waits("agent-1", "Odd")]);
+    let one = pair([simulator(), waits("agent-1", "ContainerCreating")]);
+    [
+        ("nothing is known of it", Vec::new(), &[], 1800),
+        ("the contents are pulled", starts(Vec::new(), &ALL), &["contents"], 5400),
+        ("the contents are copied", copying, &[], 2000 + 1800),
+        (
+            "the operator's image is pulled",
+            starts(vec![contents], &WORKSPACE),
+            &["workspace"],
+            1000 + 5400,
+        ),
+        (
+            "the images of the pairs are pulled",
+            pair(PAIR.map(init)),
+            &PAIR,
+            1010 + 5400,
+        ),
+        ("one of them is there", one, &["agent-1"], 1010 + 5400),
+        ("a new kubelet gives no reason", no_reason, &PAIR, 1010 + 5400),
+        (
+            "all are there",
+            pair([simulator(), runs("agent-1", 4700)]),
+            &[],
+            4700 + 1800,
+        ),
+        ("another reason is no pull", odd, &[], 4000 + 1800),
+    ]
+}
+
+#[test]
+fn pulls_and_the_rest_of_a_start_have_deadlines_of_their_own() {
+    for (what, containers, names, second) in stages() {
+        let pod = pod(containers);
+        assert_eq!(waiting(&pod), names, "{what}");
+        let limit = limit(&pod, &deadlines(), None).unwrap();
+        assert_eq!((limit.at, limit.is_of_pulls), (at(second), !names.is_empty()), "{what}");
+        assert_eq!(limit.seconds, if names.is_empty() { 1800 } else { 5400 }, "{what}");
+    }
+}
+
+#[test]
+fn what_does_not_start_has_its_time_from_when_it_was_seen_and_never_more_than_all_deadlines() {
+    let failing = || {
+        let mut contents = ran("contents", 4000, 4010);
+        contents.restarts = 3;
+        contents.last.as_mut().unwrap().exit_code = 3;
+        pod(vec![contents, waits("workspace", "PodInitializing")])
+    };
+    assert!(waiting(&failing()).is_empty(), "a restart pulls nothing");
+    for (stalled, second) in [(None, 1800), (Some(3900), 5700), (Some(9000), 5400 + 1800)] {
+        let found = limit(&failing(), &deadlines(), stalled.map(at)).unwrap();
+        assert_eq!((found.at, found.is_of_pulls), (at(second), false), "{stalled:?}");
+    }
+    let unscheduled = PodView::default();
+    assert_eq!(limit(&unscheduled, &deadlines(), None), None, "there is no node yet");
+}

@@ -1,0 +1,170 @@
+//! When what has ended is deleted.
+
+use std::time::Duration;
+
+use super::builders::*;
+use super::foreign;
+use crate::submissions::{Action, Plan};
+use crate::view::EvalaiEnd;
+use leaderboard_api::State::{Failed, Finished};
+use leaderboard_api::conditions::{FINISHED, PUBLISHED, RECORDED};
+use leaderboard_api::{Attempt, reasons};
+
+/// What a host keeps, in seconds.
+const KEPT: i64 = 3600;
+
+/// A run that has just ended well, kept for [`KEPT`].
+fn ended_well() -> World {
+    let mut world = World::evalai().running();
+    world.leaderboard().retention.finished_seconds = KEPT;
+    world.submission().metadata.resource_version = Some("7".into());
+    world.complete();
+    world.report(final_report());
+    world.pass_to(Finished, reasons::FINISHED);
+    let end = world.view.now;
+    world.job().end = Some(crate::view::JobEnd::Complete { at: Some(end) });
+    world
+}
+
+/// The same, known to every system.
+fn known_to_all() -> World {
+    let mut world = ended_well();
+    world.published();
+    world.pass();
+    world.recorded();
+    world.pass();
+    world
+}
+
+fn deletes(plan: &Plan) -> bool {
+    has(plan, |action| matches!(action, Action::DeleteSubmission { .. }))
+}
+
+#[test]
+fn it_is_deleted_when_its_time_is_over_and_not_before() {
+    let mut world = known_to_all();
+    world.wait(KEPT - 1);
+    let plan = world.pass();
+    assert!(!deletes(&plan));
+    assert_eq!(
+        plan.requeue,
+        Some(Duration::from_millis(1050)),
+        "it comes back at that time"
+    );
+    world.wait(1);
+    let deletion = Action::DeleteSubmission {
+        uid: UID.into(),
+        resource_version: "7".into(),
+    };
+    assert!(world.pass().actions.contains(&deletion));
+    // The first try may have met a change.
+    world.wait(30);
+    assert!(world.pass().actions.contains(&deletion));
+}
+
+#[test]
+fn what_is_far_from_its_end_is_decided_on_again_within_the_hour() {
+    let mut world = ended_well();
+    world.leaderboard().retention.finished_seconds = 30 * 86_400;
+    world.published();
+    world.pass();
+    world.recorded();
+    assert_eq!(world.pass().requeue, Some(Duration::from_hours(1)));
+}
+
+/// What is changed of a world that is known to all, and what it is.
+type Keeps = (&'static str, fn(&mut World));
+
+#[test]
+fn nothing_else_is_ever_deleted() {
+    let cases: [Keeps; 7] = [
+        ("retention is off", |w| w.leaderboard().retention.finished_seconds = 0),
+        ("its Leaderboard is gone", |w| w.view.leaderboard = None),
+        ("a person deletes it", World::delete),
+        ("its Job has not ended", |w| w.job().end = None),
+        ("EvalAI does not have its end", |w| w.forget(PUBLISHED)),
+        ("the table does not have its end", |w| w.forget(RECORDED)),
+        ("another attempt is requested", |w| {
+            let conditions = &mut w.submission().status.as_mut().unwrap().conditions;
+            let end = conditions.iter_mut().find(|c| c.type_ == FINISHED).unwrap();
+            end.reason = reasons::CANCELLED.into();
+            w.submission().spec.attempt = Attempt(2);
+        }),
+    ];
+    let mut last = known_to_all();
+    last.wait(KEPT);
+    assert!(deletes(&last.pass()), "the world that the cases change");
+    for (why, change) in cases {
+        let mut world = last.clone();
+        change(&mut world);
+        let plan = crate::submissions::decide(&world.view);
+        assert!(!deletes(&plan), "{why}: {:?}", plan.actions);
+    }
+}
+
+#[test]
+fn a_finished_one_goes_although_another_attempt_was_asked_for_while_it_ran() {
+    let mut world = known_to_all();
+    world.submission().spec.attempt = Attempt(2);
+    world.wait(KEPT);
+    assert!(deletes(&world.pass()));
+}
+
+#[test]
+fn an_end_that_evalai_refuses_is_kept() {
+    let mut world = ended_well();
+    let message = "No.".to_owned();
+    world.in_evalai().end = Some(EvalaiEnd::Refused { message });
+    world.recorded();
+    world.pass();
+    world.wait(10 * KEPT);
+    assert!(!deletes(&world.pass()));
+}
+
+#[test]
+fn a_running_one_is_never_deleted() {
+    let mut world = World::local().running();
+    world.leaderboard().retention.finished_seconds = 1;
+    world.wait(KEPT);
+    assert!(!deletes(&world.pass()));
+}
+
+#[test]
+fn a_failed_one_goes_with_its_end_published_and_its_log_kept() {
+    let mut world = World::evalai().running();
+    world.leaderboard().retention.finished_seconds = KEPT;
+    world.submission().metadata.resource_version = Some("7".into());
+    world.see(ended("agent-1", 3, "exited", 1, 100));
+    world.pass();
+    world.complete();
+    world.pass_to(Failed, reasons::AGENT_CRASHED);
+    world.wait(KEPT);
+    assert!(!deletes(&world.pass()), "EvalAI has no end yet");
+    world.published();
+    world.pass();
+    world.recorded();
+    world.pass();
+    assert!(deletes(&world.pass()));
+}
+
+#[test]
+fn a_resume_of_a_deleted_one_counts_on_in_the_table() {
+    for (standing, attempt, jobs, earlier) in [
+        (crate::view::Standing::Resumed, 1, Some(3), 3),
+        (crate::view::Standing::Resumed, 4, Some(3), 0),
+        (crate::view::Standing::Resumed, 1, None, 0),
+        (crate::view::Standing::Wanted, 1, Some(3), 0),
+    ] {
+        let mut world = World::evalai();
+        world.submission().spec.attempt = Attempt(attempt);
+        world.view.row = foreign::free(attempt);
+        let info = world.in_evalai().info.as_mut().unwrap();
+        (info.standing, info.last_attempt) = (standing, jobs.map(Attempt));
+        world.pass();
+        let plan = world.pass().status.plan.unwrap();
+        assert_eq!(
+            plan.earlier_attempts, earlier,
+            "{standing:?}, attempt {attempt}, {jobs:?}"
+        );
+    }
+}
