@@ -12,6 +12,8 @@ END = "<!-- end -->"
 OPERATOR = "src/cli"
 RUNNER = "crates/runner/src"
 PROTOCOL = "crates/protocol/src/files.rs"
+# Exit codes that the controller knows as well.
+VERDICT = "crates/protocol/src/verdict.rs"
 # The pages of its help, which the plugin's own tests compare with the program.
 PLUGIN = "crates/kubectl-leaderboard/src/tests/shown/help.txt"
 TEXT = r"((?: *///[^\n]*\n)+)"
@@ -43,7 +45,7 @@ def page(text: str, repository: Path) -> str:
     plugin = (repository / PLUGIN).read_text()
     tables = {
         f"the status files, from {PROTOCOL}": status_files(protocol),
-        f"the exit codes of leaderboard-runner, from {RUNNER}": runner(sources(repository / RUNNER)),
+        f"the exit codes of leaderboard-runner, from {RUNNER}": runner(sources(repository / RUNNER) + (repository / VERDICT).read_text()),
         f"the exit codes of leaderboard-operator, from {OPERATOR}": operator(repository),
         f"the exit codes of kubectl leaderboard, from {PLUGIN}": rows(helps(plugin)),
     }
