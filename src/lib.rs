@@ -1,12 +1,24 @@
 //! Runs the submissions of an AI challenge on Kubernetes and keeps EvalAI, S3 and DynamoDB in sync.
 //!
-//! The modules and what each may import are drawn in docs/architecture.md.
+//! The folders show the way of an event: `bridge` reads SQS, `intake` makes a Submission of a message or of EvalAI's own queue, `runtime`
+//! (watches, Lease, queues) reconciles Leaderboards by `leaderboards` and Submissions by `submissions` (observe, decide, act). Both ask
+//! `slots` whose turn it is, and `ask` what other services know. What is decided is in crates/policy. docs/architecture.md draws it.
 
 pub mod ask;
 pub mod bridge;
 pub mod cli;
-pub mod controller;
 pub mod crds;
+pub mod intake;
 pub mod kubernetes;
+pub mod leaderboards;
+pub mod metrics;
 pub mod observability;
 pub mod page;
+pub mod runtime;
+pub mod slots;
+pub mod submissions;
+
+#[cfg(test)]
+mod tests;
+#[cfg(test)]
+pub(crate) use tests::fixtures;

@@ -11,8 +11,8 @@ from pathlib import Path
 
 # Program -> the folders whose code it alone runs.
 PROGRAMS: Mapping[str, tuple[str, ...]] = {
-    "controller": ("src/controller", "crates/evalai"),
-    "bridge": ("src/bridge",),
+    "controller": ("src/runtime", "src/leaderboards", "src/submissions", "src/ask", "crates/evalai"),
+    "bridge": ("src/bridge", "src/intake"),
     "submission-worker": ("crates/pod",),
 }
 # The crate with a module for each service.

@@ -8,7 +8,7 @@ from pathlib import Path
 from .errors import LabError
 
 # The folder whose files register all metrics.
-FOLDER = Path("src/observability/metrics")
+FOLDER = Path("src/metrics")
 # What Prometheus adds to every sample of a target.
 TARGET_LABELS = frozenset({"namespace", "job", "pod", "container", "instance", "endpoint"})
 SUFFIXES = {

@@ -7,7 +7,7 @@ from .errors import LabError
 from .marks import between
 
 PAGE = Path("docs/metrics.md")
-BEGIN = "<!-- made from src/observability/metrics by `make chart-docs`: edit those files -->"
+BEGIN = "<!-- made from src/metrics by `make chart-docs`: edit those files -->"
 END = "<!-- end of the metrics -->"
 
 

@@ -221,7 +221,7 @@ class Policies(unittest.TestCase):
             small = awscalls.Source(Path(folder), operations)
             small.texts = {
                 "crates/aws/src/archive.rs": "pub async fn get(&self) { x.get_object() }\nfn put(&self) { x.put_object() }",
-                "src/controller/a.rs": "archive.get(key); client.list_buckets()",
+                "src/submissions/a.rs": "archive.get(key); client.list_buckets()",
                 "src/bridge/a.rs": "client.receive_message()",
                 "crates/pod/a.rs": "use aws_sigv4::sign;",
             }

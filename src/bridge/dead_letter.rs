@@ -2,7 +2,7 @@
 
 use serde_json::{Map, Value, json};
 
-use super::source::Received;
+use crate::intake::source::Received;
 use leaderboard_policy::intake::route::DeadReason;
 
 /// Longest text of an attribute, in characters.

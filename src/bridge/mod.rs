@@ -4,14 +4,9 @@
 //! a message to one of them. `route` holds the policy. The controller has a `source` of its own for EvalAI's queues, and `ingest` for its
 //! sweep.
 
-pub mod ages;
 mod dead_letter;
-pub mod ingest;
-mod leaderboards;
-mod poller;
-pub mod pollers;
+pub mod leaderboards;
 pub mod queue;
-pub mod source;
 mod sqs;
 
 use std::sync::{Arc, Mutex};
@@ -20,6 +15,7 @@ use kube::Client;
 use kube::runtime::events::{Recorder, Reporter};
 use kube::runtime::watcher::Config;
 
+use crate::intake::pollers::{Problems, Shared, follow};
 use crate::kubernetes::{Clients, Namespaces, Shape, spawn_watch};
 use crate::observability::Observability;
 use leaderboard_api::Leaderboard;
@@ -27,7 +23,6 @@ use leaderboard_aws::clients::Aws;
 use leaderboard_base::tasks::TaskFailed;
 use leaderboard_policy::allowed::Allowed;
 use leaderboard_policy::intake::route;
-use pollers::{Problems, Shared, follow};
 use sqs::{Connection, Pulse, SqsQueue, desired};
 
 /// Which Leaderboards are served, and which queues they may name.

@@ -15,7 +15,7 @@ use aws_sdk_sqs::types::{
 use thiserror::Error;
 
 use super::dead_letter::{self, DeadLetter};
-use super::source::Received;
+use crate::intake::source::Received;
 use leaderboard_aws::fault::{self, Fault};
 use leaderboard_aws::metered::Metered;
 use leaderboard_base::meter::Meter;

@@ -10,7 +10,7 @@ use kube::api::ListParams;
 use tokio::time::Instant;
 
 use super::queue::{Reader, batch_size};
-use super::source::{Received, SetAside, Source, named};
+use crate::intake::source::{Received, SetAside, Source, named};
 use crate::kubernetes::{Namespaces, call_within};
 use crate::observability::liveness::Liveness;
 use leaderboard_api::{Leaderboard, reasons};

@@ -12,7 +12,7 @@ use tower_test::mock::{Handle, pair};
 
 use super::sqs::{PULSE_AGE, PULSE_LIMIT};
 use super::*;
-use crate::observability::metrics::Program;
+use crate::metrics::Program;
 use leaderboard_base::shutdown::Stop;
 
 type Server = Handle<Request<Body>, Response<Body>>;

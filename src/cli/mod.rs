@@ -15,9 +15,9 @@ use std::sync::LazyLock;
 
 use clap::{Args, Parser, Subcommand};
 
-use crate::controller::runtime::leader::{self, Identity};
 use crate::observability::REVISION;
 use crate::observability::logging::Format;
+use crate::runtime::leader::{self, Identity};
 use leaderboard_aws::clients as aws;
 use leaderboard_policy::allowed::Allowed;
 

@@ -11,10 +11,10 @@ use tokio::time::{Instant, sleep};
 
 use super::rights::Rights;
 use super::serve;
-use crate::controller::runtime::KINDS;
 use crate::kubernetes::Namespaces;
 use crate::kubernetes::preflight::{access_missing, kinds_missing};
 use crate::observability::logging::Format;
+use crate::runtime::KINDS;
 use leaderboard_api::client_errors;
 
 /// What the exit code means.

@@ -10,17 +10,17 @@ use kube::{Client, Config};
 
 use super::{Controller, InPod, Server};
 use crate::bridge;
-use crate::controller::runtime as run;
-use crate::controller::runtime::leader::{self, Identity};
-use crate::controller::settings::Settings;
 use crate::kubernetes::{Clients, Namespaces, watch_client};
+use crate::metrics::Program;
 use crate::observability::health::HealthServer;
 use crate::observability::logging::{self, Format};
-use crate::observability::metrics::Program;
 #[cfg(feature = "otel")]
 use crate::observability::traces::otlp;
 use crate::observability::{Observability, REVISION};
 use crate::page::Page;
+use crate::runtime as run;
+use crate::runtime::leader::{self, Identity};
+use crate::runtime::settings::Settings;
 use leaderboard_api::client_errors;
 use leaderboard_api::names::OPERATOR;
 use leaderboard_aws::clients::Aws;

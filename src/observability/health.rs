@@ -14,7 +14,8 @@ use tokio::net::TcpListener;
 use tokio::sync::oneshot;
 use tokio::task::JoinHandle;
 
-use super::{Observability, metrics};
+use super::Observability;
+use crate::metrics;
 
 /// Why there is no health server.
 #[derive(Debug, thiserror::Error)]

@@ -7,16 +7,15 @@ pub mod health;
 mod json_lines;
 pub mod liveness;
 pub mod logging;
-pub mod metrics;
 pub mod readiness;
 pub mod traces;
 
 use std::sync::Arc;
 
+use crate::metrics::{Metrics, Program};
 use leaderboard_base::shutdown::Stop;
 use leaderboard_base::tasks::Tasks;
 use liveness::Liveness;
-use metrics::{Metrics, Program};
 use readiness::Readiness;
 use traces::Traces;
 

@@ -15,8 +15,7 @@ mod routes;
 mod rows;
 
 #[cfg(test)]
-#[path = "tests/samples.rs"]
-mod samples;
+mod samples_tests;
 
 use std::net::{Ipv4Addr, SocketAddr};
 

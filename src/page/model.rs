@@ -304,5 +304,4 @@ fn failures<'a>(ended: impl Iterator<Item = &'a Submission>, now: Timestamp) -> 
 }
 
 #[cfg(test)]
-#[path = "model_tests.rs"]
 mod tests;

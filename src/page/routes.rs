@@ -110,5 +110,4 @@ fn is_loopback(host: &str) -> bool {
 }
 
 #[cfg(test)]
-#[path = "routes_tests.rs"]
 mod tests;

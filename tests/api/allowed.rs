@@ -5,7 +5,7 @@ use kube::Api;
 use kube::api::{Patch, PatchParams};
 use kube::runtime::wait::await_condition;
 use leaderboard_api::{Leaderboard, conditions, reasons};
-use leaderboard_operator::controller::settings::Settings;
+use leaderboard_operator::runtime::settings::Settings;
 use serde_json::{Value, json};
 use tokio::time::timeout;
 

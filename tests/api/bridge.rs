@@ -25,10 +25,10 @@ use leaderboard_base::shutdown::Stop;
 use leaderboard_base::tasks::TaskFailed;
 use leaderboard_evalai::Swept;
 use leaderboard_operator::bridge;
-use leaderboard_operator::bridge::ingest::{self, Incoming, Source};
+use leaderboard_operator::intake::ingest::{self, Incoming, Source};
 use leaderboard_operator::kubernetes::{Clients, Namespaces};
+use leaderboard_operator::metrics::Program;
 use leaderboard_operator::observability::Observability;
-use leaderboard_operator::observability::metrics::Program;
 use leaderboard_policy::allowed::Allowed;
 use leaderboard_policy::intake::route::Outcome;
 

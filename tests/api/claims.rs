@@ -13,7 +13,7 @@ use super::objects::{Kind, create};
 use super::operator::Operator;
 use crate::support::apiserver::server;
 use leaderboard_api::{Leaderboard, Submission, conditions, reasons};
-use leaderboard_operator::controller::leaderboards::claims::{keep, remove_others};
+use leaderboard_operator::leaderboards::claims::{keep, remove_others};
 use leaderboard_pod_spec::gpu_claims::{resource, template};
 use leaderboard_policy::leaderboards::view::Claims;
 

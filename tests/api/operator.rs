@@ -9,12 +9,12 @@ use tokio::task::JoinHandle;
 use crate::support::apiserver::server;
 use leaderboard_aws::clients::Aws;
 use leaderboard_base::shutdown::Stop;
-use leaderboard_operator::controller::runtime as run;
-use leaderboard_operator::controller::runtime::leader::{self, Identity, Timing};
-use leaderboard_operator::controller::runtime::{Clients, RunError};
-use leaderboard_operator::controller::settings::Settings;
 use leaderboard_operator::kubernetes::{Namespaces, watch_client};
 use leaderboard_operator::observability::Observability;
+use leaderboard_operator::runtime as run;
+use leaderboard_operator::runtime::leader::{self, Identity, Timing};
+use leaderboard_operator::runtime::settings::Settings;
+use leaderboard_operator::runtime::{Clients, RunError};
 use leaderboard_pod_spec::job::OwnImage;
 use leaderboard_policy::allowed::Allowed;
 

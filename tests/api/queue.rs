@@ -10,7 +10,7 @@ use leaderboard_aws::clients::Aws;
 use leaderboard_aws::fault::Fault;
 use leaderboard_base::meter::Meter;
 use leaderboard_operator::bridge::queue::Reader;
-use leaderboard_operator::bridge::source::Received;
+use leaderboard_operator::intake::source::Received;
 use leaderboard_policy::intake::route::DeadReason;
 
 use super::bridge::{LIMIT, StandIn};

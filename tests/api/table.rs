@@ -18,7 +18,7 @@ use leaderboard_base::shutdown::Stop;
 use leaderboard_base::spans::LogSpan;
 use leaderboard_base::tasks::Tasks;
 use leaderboard_operator::ask::Asker;
-use leaderboard_operator::controller::submissions::records::{self, Record};
+use leaderboard_operator::submissions::records::{self, Record};
 
 fn client(stand_in: &StandIn) -> aws_sdk_dynamodb::Client {
     stand_in.aws.dynamodb(None, Some(&stand_in.endpoint))

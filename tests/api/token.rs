@@ -2,7 +2,7 @@
 
 use super::bridge::StandIn;
 use leaderboard_evalai::token::{Scheme, TokenError};
-use leaderboard_operator::controller::leaderboards::token::TokenSource;
+use leaderboard_operator::leaderboards::token::TokenSource;
 
 impl StandIn {
     fn token(&self, name: &str, key: &str) -> TokenSource {

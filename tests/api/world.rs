@@ -20,12 +20,13 @@ use leaderboard_api::{
 };
 use leaderboard_aws::archive::Archive;
 use leaderboard_base::shutdown::Stop;
-use leaderboard_operator::controller::runtime::leader::{self, Identity};
-use leaderboard_operator::controller::runtime::{self as run, Clients};
-use leaderboard_operator::controller::settings::Settings;
 use leaderboard_operator::kubernetes::Namespaces;
 use leaderboard_operator::observability::Observability;
 use leaderboard_operator::page::Page;
+use leaderboard_operator::runtime as run;
+use leaderboard_operator::runtime::Clients;
+use leaderboard_operator::runtime::leader::{self, Identity};
+use leaderboard_operator::runtime::settings::Settings;
 use leaderboard_pod::workspace::WorkspaceError;
 use leaderboard_pod_spec::job::OwnImage;
 use leaderboard_policy::allowed::Allowed;

@@ -14,7 +14,7 @@ use tokio::sync::{mpsc, oneshot};
 use tokio::task::JoinHandle;
 
 use super::{Kind, Span, Traces, Value};
-use crate::observability::metrics::Metrics;
+use crate::metrics::Metrics;
 use leaderboard_api::names::OPERATOR;
 use leaderboard_base::tasks::Tasks;
 
@@ -227,5 +227,4 @@ fn data(span: Span, scope: &InstrumentationScope) -> SpanData {
 }
 
 #[cfg(test)]
-#[path = "otlp_tests.rs"]
 mod tests;

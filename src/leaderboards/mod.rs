@@ -1,0 +1,239 @@
+//! The reconcile of one Leaderboard: the policy of its Pods, its token and checks, its status and finalizer.
+//!
+//! Does nothing for a Leaderboard that another installation drives. Applies the policy before all else, since no Job is made without
+//! it. Asks for its token, its bucket, table and queues and its Pods by `probe`, whose answers wake it. It waits for the API server alone,
+//! and gives the way to EvalAI to `external`. `decide` and `reach` are pure.
+
+pub mod claims;
+pub mod isolation;
+pub mod operator;
+mod places;
+mod priority;
+pub mod probe;
+mod reach;
+pub mod standing;
+pub mod state;
+pub mod token;
+mod tried_pods;
+
+use std::sync::Arc;
+use std::time::Duration;
+
+use jiff::Timestamp;
+use kube::runtime::events::Recorder;
+use kube::runtime::reflector::ObjectRef;
+
+use super::slots::Slots;
+use crate::kubernetes::{CallError, Writer};
+use crate::metrics::leader::{self, Gauge, Samples};
+use crate::runtime::objects::{key_of, uid_of, version, version_number};
+use crate::runtime::settings::Settings;
+use crate::runtime::writes::{apply_status, set_finalizer};
+use crate::submissions::external::ExternalSystems;
+use crate::submissions::records;
+use isolation::Policies;
+use leaderboard_api::{Leaderboard, names};
+use leaderboard_policy::ask::Service;
+use leaderboard_policy::census::Census;
+use leaderboard_policy::leaderboards::decide::{LeaderboardPlan, LeaderboardView, decide};
+use leaderboard_policy::leaderboards::refusal;
+use leaderboard_policy::leaderboards::view::Policy;
+use probe::{Asks, Looked};
+use state::{COUNTS_EVERY, LeaderboardState, RESYNC, SOONEST};
+
+/// The first look at a spec gets so long before the status shows that it is under way: mostly it takes less, and saves a write.
+const FIRST_LOOK: Duration = Duration::from_secs(2);
+
+/// What a reconcile of a Leaderboard uses.
+#[derive(Clone, Copy)]
+pub struct Uses<'a> {
+    pub policies: Policies<'a>,
+    pub writer: &'a Writer,
+    pub recorder: &'a Recorder,
+    pub settings: &'a Settings,
+    pub slots: &'a Slots,
+    pub external: &'a ExternalSystems,
+    pub asks: &'a Asks,
+}
+
+/// What a reconcile came to.
+pub enum Reconciled {
+    /// When to look again.
+    Done(Duration),
+    /// Another installation of the operator drives it; when to look again.
+    LeftAlone(Duration),
+}
+
+/// One reconcile.
+pub async fn reconcile(leaderboard: Arc<Leaderboard>, uses: Uses<'_>) -> Result<Reconciled, CallError> {
+    let Policies { client, state, .. } = uses.policies;
+    match operator::ours(
+        client,
+        uses.recorder,
+        state,
+        Arc::clone(&leaderboard),
+        &uses.settings.operator,
+    )
+    .await?
+    {
+        Ok(ours) => drive(ours, uses).await.map(Reconciled::Done),
+        Err(wait) => {
+            uses.external.retire(&leaderboard);
+            Ok(Reconciled::LeftAlone(wait))
+        }
+    }
+}
+
+/// One reconcile of a Leaderboard that this installation drives.
+async fn drive(leaderboard: Arc<Leaderboard>, uses: Uses<'_>) -> Result<Duration, CallError> {
+    let now = Timestamp::now();
+    let (writer, Policies { stores, state, .. }) = (uses.writer, uses.policies);
+    // One that is being deleted keeps it too: its submissions may still run.
+    let policy = isolation::keep(uses.policies, &leaderboard, now).await;
+    let refusal = refusal::of(&uses.settings.allowed, &leaderboard);
+    // Where a Leaderboard names what it may not, nothing is asked.
+    let looked = match refusal {
+        Some(_) => Looked::default(),
+        None => uses.asks.ask(&leaderboard, is_refused(uses, &leaderboard)),
+    };
+    let view = LeaderboardView {
+        is_looked_at: looked.waits().is_none(),
+        refusal,
+        ..observe(uses, &leaderboard, policy, &looked, now)
+    };
+    let plan = decide(&view);
+    if let Some(found) = &view.measured {
+        isolation::remember(state, &leaderboard, found);
+    }
+    serve(uses, &view, &plan, &looked);
+    let mut version = leaderboard.metadata.resource_version.clone();
+    if let Some(wanted) = plan.finalizer {
+        version = set_finalizer(writer, leaderboard.as_ref(), names::FINALIZER_LEADERBOARD, wanted).await?;
+    }
+    if plan.finalizer == Some(false) {
+        return Ok(RESYNC);
+    }
+    let left = looked.waits().map(|waited| FIRST_LOOK.saturating_sub(waited));
+    let again = match left.filter(|left| !left.is_zero()) {
+        Some(left) => left,
+        None => write_status(writer, state, &leaderboard, version.as_deref(), &plan, now).await?,
+    };
+    let patience = looked.reach.patience().unwrap_or(RESYNC);
+    let policy = isolation::again(&view.policy, stores.shows_policy(&view.leaderboard));
+    Ok(policy.min(patience).max(SOONEST).min(again))
+}
+
+/// Shows what a Leaderboard has left: its slots, the time of its token, and what lies in its queues. Nothing is shown of what is not known.
+pub fn show_limits(samples: &mut Samples, uses: Uses<'_>, leaderboard: &Arc<Leaderboard>) {
+    let name = key_of(leaderboard.as_ref()).to_string();
+    let mut show = |gauge: &Gauge<1>, value: Option<i64>| {
+        if let Some(value) = value {
+            samples.set(gauge, [&name], value);
+        }
+    };
+    show(&leader::SLOTS_LIMIT, leaderboard.spec.concurrency.total.map(i64::from));
+    let rows = rows_waiting(uses, leaderboard).map(|rows| i64::try_from(rows).unwrap_or(i64::MAX));
+    show(&leader::ROWS_WAITING, rows);
+    if refusal::of(&uses.settings.allowed, leaderboard).is_none() {
+        uses.asks.known(leaderboard).show(leaderboard, show);
+    }
+}
+
+/// Hands the way to EvalAI to `external`. Of a Leaderboard that goes, or names what it may not, nothing more is sent there.
+fn serve(uses: Uses<'_>, view: &LeaderboardView, plan: &LeaderboardPlan, looked: &Looked) {
+    let leaderboard = &view.leaderboard;
+    if view.refusal.is_some() || plan.finalizer == Some(false) {
+        uses.external.retire(leaderboard);
+    } else if let Some(target) = looked.target(leaderboard) {
+        uses.external.serve(leaderboard, target);
+    }
+}
+
+/// True while EvalAI refuses the token that is used now.
+fn is_refused(uses: Uses<'_>, leaderboard: &Leaderboard) -> bool {
+    uses.external.hub.token_refused(&key_of(leaderboard)).is_some()
+}
+
+fn observe(
+    uses: Uses<'_>,
+    leaderboard: &Arc<Leaderboard>,
+    policy: Policy,
+    looked: &Looked,
+    now: Timestamp,
+) -> LeaderboardView {
+    let (stores, hub) = (uses.policies.stores, &uses.external.hub);
+    let key = key_of(leaderboard.as_ref());
+    let submissions = stores.submissions_for(&ObjectRef::from_obj(leaderboard.as_ref()));
+    let tried = looked.pods();
+    let census = Census::of(submissions.iter().map(AsRef::as_ref));
+    LeaderboardView {
+        now,
+        leaderboard: Arc::clone(leaderboard),
+        all: stores.leaderboards.state(),
+        counts: census.counts,
+        gpu_use: census.gpu_use(),
+        in_use: census.in_use,
+        image_note: census.image_note(),
+        pods: isolation::pods_left(stores, leaderboard),
+        policy,
+        measured: isolation::measured(uses.policies.state, leaderboard),
+        refusal: None,
+        is_looked_at: true,
+        invalid_pod: tried.refused,
+        pod_notes: tried.notes,
+        claims: tried.claims,
+        unreachable: looked.reach.unreachable(),
+        place_notes: looked.reach.notes(),
+        evalai: standing::standing(hub, leaderboard, looked.token(leaderboard), now),
+        evalai_writes_from: hub.writes_from(),
+        usage: hub.usage(&key).map(standing::evalai_use),
+        rows_waiting: rows_waiting(uses, leaderboard),
+    }
+}
+
+/// None without a table.
+fn rows_waiting(uses: Uses<'_>, leaderboard: &Leaderboard) -> Option<usize> {
+    let table = leaderboard.spec.table.as_ref()?;
+    let (service, longer) = (Service::table(table), records::ON_ITS_WAY);
+    Some(uses.external.records.waiting(&service, longer))
+}
+
+/// Writes the status if it shows something new; returns when to look again. On top of a status that the cache does not show yet
+/// nothing is written: conditions would get the time of the second write.
+async fn write_status(
+    writer: &Writer,
+    state: &LeaderboardState,
+    leaderboard: &Leaderboard,
+    version_now: Option<&str>,
+    plan: &LeaderboardPlan,
+    now: Timestamp,
+) -> Result<Duration, CallError> {
+    let uid = uid_of(leaderboard);
+    if state.awaits_write(&uid, version(leaderboard), now) {
+        return Ok(SOONEST);
+    }
+    let old = leaderboard.status.clone().unwrap_or_default();
+    if old == plan.status {
+        return Ok(RESYNC);
+    }
+    let only_numbers = leaderboard_api::LeaderboardStatus {
+        counts: old.counts,
+        evalai: old.evalai.clone(),
+        table: old.table.clone(),
+        gpu_use: old.gpu_use.clone(),
+        ..plan.status.clone()
+    } == old;
+    if only_numbers && !state.is_older(&uid, now, COUNTS_EVERY) {
+        return Ok(COUNTS_EVERY);
+    }
+    // The number of requests moves with each of them; alone it is worth a write a minute.
+    if only_numbers && old.counts == plan.status.counts && !state.is_older(&uid, now, RESYNC) {
+        return Ok(RESYNC);
+    }
+    let made = apply_status(writer, leaderboard, version_now, &plan.status).await?;
+    state.change(&uid, |entry| entry.written = Some((now, version_number(&made))));
+    Ok(RESYNC)
+}
+
+#[cfg(test)]
+mod tests;

@@ -1,0 +1,173 @@
+//! Whether a Leaderboard's Pods would be taken, by our own rules and by a dry run of its first track's Job, before anybody submits.
+//! Also keeps the template of their claims.
+
+use std::sync::Arc;
+use std::time::Duration;
+
+use jiff::Timestamp;
+use kube::api::{ApiResource, DynamicObject, PostParams};
+use kube::{Api, Client, ResourceExt};
+
+use super::claims;
+use super::priority;
+use crate::ask::Asked;
+use crate::kubernetes::call;
+use crate::runtime::objects::key_of;
+use crate::runtime::settings::Settings;
+use leaderboard_api::{Dns, JobNumber, Leaderboard, Submission, Track, effective};
+use leaderboard_aws::endpoints;
+use leaderboard_pod_spec::job as job_spec;
+use leaderboard_pod_spec::job::JobInput;
+use leaderboard_pod_spec::notes as pod_notes;
+use leaderboard_pod_spec::notes::{TrackPods, notes};
+use leaderboard_pod_spec::overlay as pod_overlay;
+use leaderboard_policy::ask::{Ask, Failure, Service};
+use leaderboard_policy::leaderboards::view::Claims;
+
+/// Classes and templates that are as they should be are looked at again after this long.
+const AGAIN: Duration = Duration::from_mins(5);
+/// What is wrong may be corrected at any moment.
+const SOON: Duration = Duration::from_secs(15);
+
+/// Asks for the Pods of a Leaderboard. An edit of the Leaderboard asks anew.
+#[derive(Clone, Debug)]
+pub(super) struct Pods(pub(super) Arc<Leaderboard>);
+
+impl PartialEq for Pods {
+    fn eq(&self, other: &Self) -> bool {
+        self.0.metadata.generation == other.0.metadata.generation
+    }
+}
+
+impl Ask for Pods {
+    type Answer = TriedPods;
+    const AT_ONCE: usize = 16;
+    const AT_ONCE_OF_A_SERVICE: usize = 16;
+    const LONGEST: Duration = Duration::from_mins(2);
+
+    fn service(&self) -> Service {
+        Service::api_server()
+    }
+
+    fn again(&self, result: &Result<TriedPods, Failure>, _failures: u32, _waited: Duration) -> Option<Duration> {
+        match result {
+            Ok(pods) if pods.refused.is_none() && pods.claims.is_good() => pods.may_change.then_some(AGAIN),
+            Ok(_) | Err(_) => Some(SOON),
+        }
+    }
+}
+
+/// What was found of a Leaderboard's Pods.
+#[derive(Clone, Debug, Default, PartialEq, Eq)]
+pub(super) struct TriedPods {
+    /// Why they would be refused.
+    pub(super) refused: Option<String>,
+    /// What their host should know all the same.
+    pub(super) notes: Vec<String>,
+    /// How the template of their claims stands.
+    pub(super) claims: Claims,
+    /// They depend on objects that may change.
+    may_change: bool,
+}
+
+/// Whether Pods of this Leaderboard would be refused, and what is to be noted. Puts the template of their claims in place.
+pub(super) async fn try_pods(client: &Client, settings: &Settings, asked: &Asked<Pods>) -> TriedPods {
+    let leaderboard = asked.question.0.as_ref();
+    let tried = try_templates(client, settings, leaderboard).await;
+    let claims = claims::keep(client, leaderboard).await;
+    // Right after an edit a Job of the spec before may be on its way.
+    let is_edited = asked.last.as_ref().is_none_or(|last| last.question != asked.question);
+    if !is_edited
+        && claims == Claims::InPlace
+        && let Err(error) = claims::remove_others(client, leaderboard).await
+    {
+        tracing::warn!(leaderboard = %key_of(leaderboard), %error, "old ResourceClaimTemplates are not removed");
+    }
+    TriedPods {
+        may_change: tried.may_change || claims != Claims::NotRequired,
+        claims,
+        ..tried
+    }
+}
+
+/// What our own rules and the API server say of its Pods.
+async fn try_templates(client: &Client, settings: &Settings, leaderboard: &Leaderboard) -> TriedPods {
+    if let Err(error) = pod_overlay::validate(&leaderboard.spec) {
+        return TriedPods {
+            refused: Some(error.to_string()),
+            ..TriedPods::default()
+        };
+    }
+    let tracks = leaderboard.spec.tracks.iter();
+    let jobs: Vec<(&Track, DynamicObject)> = tracks
+        .filter_map(|track| Some((track, sample_job(settings, leaderboard, track)?)))
+        .collect();
+    let template = |job: &DynamicObject| job.data.pointer("/spec/template").cloned().unwrap_or_default();
+    let pods = jobs.iter().map(|(track, job)| TrackPods {
+        track: track.name.clone(),
+        template: template(job),
+    });
+    let pods: Vec<TrackPods> = pods.collect();
+    let hosts = match leaderboard.spec.network.dns {
+        Dns::None => endpoints::of_pods(&leaderboard.spec, settings.own.region.as_deref()).await,
+        Dns::Cluster => Ok(Vec::new()),
+    };
+    let mut templates = jobs.iter().map(|(_, job)| template(job));
+    let unclear = templates.find_map(|template| job_spec::unclear(&leaderboard.spec, &template));
+    let refused = match (unclear, jobs.first()) {
+        (Some(unclear), _) => Some(unclear),
+        (None, Some((_, job))) => refused_job(client, leaderboard, job).await,
+        (None, None) => None,
+    };
+    let asked = priority::asked(&leaderboard.spec.tracks, &pods);
+    let classes = priority::look(client, &asked).await;
+    let notes = notes(&pods).into_iter().chain(pod_notes::unnamed(&pods, hosts));
+    TriedPods {
+        refused: refused.or(classes.refused),
+        notes: notes.chain(classes.notes).collect(),
+        claims: Claims::default(),
+        may_change: !asked.is_empty(),
+    }
+}
+
+async fn refused_job(client: &Client, leaderboard: &Leaderboard, job: &DynamicObject) -> Option<String> {
+    let namespace = leaderboard.namespace().unwrap_or_default();
+    let resource = ApiResource::erase::<k8s_openapi::api::batch::v1::Job>(&());
+    let api: Api<DynamicObject> = Api::namespaced_with(client.clone(), &namespace, &resource);
+    let params = PostParams {
+        dry_run: true,
+        ..PostParams::default()
+    };
+    let error = call(
+        "a dry run of the Job",
+        &leaderboard.name_any(),
+        api.create(&params, job),
+    )
+    .await
+    .err()?;
+    let status = error.status().filter(|status| [400, 422].contains(&status.code))?;
+    Some(status.message.clone())
+}
+
+fn sample_job(settings: &Settings, leaderboard: &Leaderboard, track: &Track) -> Option<DynamicObject> {
+    let spec = serde_json::json!({ "leaderboardName": leaderboard.name_any(), "track": track.name, "image": "example/agent:1" });
+    let mut sample = Submission::new("sample", serde_json::from_value(spec).ok()?);
+    sample.metadata.namespace = leaderboard.namespace();
+    sample.metadata.uid = leaderboard.uid();
+    let plan = effective::plan(
+        &leaderboard.spec,
+        track,
+        sample.run_id(),
+        "example/agent:1".into(),
+        false,
+    );
+    Some(job_spec::build_object(&JobInput {
+        submission: &sample,
+        leaderboard,
+        plan: &plan,
+        number: JobNumber::default(),
+        own: &settings.own,
+        failed_nodes: &[],
+        now: Timestamp::now(),
+    }))
+}

@@ -1,0 +1,391 @@
+//! Wires the controller: watches, lease, services, reconciles. Called by the command line; decides nothing.
+//!
+//! Standbys keep warm caches and are ready. A process that has led and no longer does ends with an error, and so does one
+//! that has lost one of its tasks: the kubelet starts it again with empty hands.
+
+pub mod backoff;
+pub mod context;
+mod events;
+mod gauges;
+pub mod leader;
+pub mod objects;
+mod queue;
+mod reconciles;
+pub mod settings;
+pub mod stores;
+mod watches;
+pub mod writes;
+
+use crate::intake::inbox;
+use crate::intake::sweep;
+use std::sync::Arc;
+use std::time::Duration;
+
+use jiff::Timestamp;
+use kube::Client;
+use kube::runtime::events::Recorder;
+use kube::runtime::reflector::ObjectRef;
+use kube::runtime::watcher::Config;
+use tokio::sync::mpsc;
+use tokio::task::JoinHandle;
+use tokio::time::Instant;
+
+use super::leaderboards::probe::Asks;
+use super::leaderboards::state::LeaderboardState;
+use super::leaderboards::{isolation, operator};
+use super::slots::Slots;
+use crate::bridge::{self, Scope};
+use crate::intake::pollers;
+use crate::kubernetes::objects::Event;
+use crate::kubernetes::preflight::{self, await_kinds};
+use crate::kubernetes::{Writer, spawn_uncached};
+use crate::observability::Observability;
+use crate::observability::readiness::Readiness;
+use crate::page::Page;
+use crate::runtime::objects::{Wake, by_key};
+use crate::runtime::settings::Settings;
+use crate::submissions::external::ExternalSystems;
+use crate::submissions::memory::Memory;
+use crate::submissions::observe::causes::{Causes, OF_JOBS, OF_PODS, Objects};
+use crate::submissions::observe::node;
+use crate::submissions::observe::workers::Workers;
+use crate::submissions::payloads;
+use crate::submissions::records;
+use backoff::BackoffMap;
+use context::Context;
+use leader::{Leader, Leadership};
+use leaderboard_api::Leaderboard;
+use leaderboard_aws::clients::Aws;
+use leaderboard_base::object_key::ObjectKey;
+use leaderboard_base::tasks::TaskFailed;
+use leaderboard_evalai::{Changed, Hub, Options, PayloadReader, SweepRow, Timeouts, Timing};
+use leaderboard_policy::phases::Phase;
+use queue::{Class, urgency};
+use reconciles::Queues;
+use watches::Watches;
+
+/// Reconciles under way may take this long to end after a stop.
+const DRAIN: Duration = Duration::from_secs(20);
+
+/// Plurals of the kinds that it works on.
+pub const KINDS: [&str; 2] = ["leaderboards", "submissions"];
+
+/// Why the controller ended.
+#[derive(thiserror::Error, Debug)]
+pub enum RunError {
+    #[error("this process no longer leads: {0}")]
+    LostLease(String),
+    #[error(transparent)]
+    TaskFailed(#[from] TaskFailed),
+}
+
+/// What all reconciles share.
+pub(super) struct Shared {
+    context: Arc<Context>,
+    queues: Queues,
+    backoff: BackoffMap,
+    telemetry: Observability,
+}
+
+impl Shared {
+    /// Drops everything that is remembered of an object that is gone.
+    fn forget(&self, key: &ObjectKey) {
+        self.context.forget(key);
+        self.backoff.forget(&key.uid);
+    }
+}
+
+/// Runs until the stop, or until it no longer leads.
+pub async fn run(
+    clients: Clients,
+    lease: leader::Settings,
+    settings: Settings,
+    aws: Aws,
+    page: Option<Page>,
+    telemetry: Observability,
+) -> Result<(), RunError> {
+    preflight::register(&telemetry);
+    let tasks = telemetry.tasks.clone();
+    let work = Box::pin(async move {
+        if !await_kinds(&clients.api, &KINDS, &telemetry).await {
+            return Ok(());
+        }
+        let watches = Watches::start(&clients.watch, &settings, &telemetry);
+        telemetry.readiness.registered();
+        let leader = leader::start(clients.lease, lease, &telemetry);
+        if let Some(page) = page {
+            page.start(watches.for_page(&leader), &telemetry);
+        }
+        let parts = Parts {
+            client: clients.api,
+            watch_client: clients.watch,
+            settings,
+            aws: aws.counted_by(telemetry.metrics.meter()),
+            watches,
+            telemetry,
+        };
+        if parts.lead(&leader).await? {
+            leader.release().await;
+        } else {
+            tracing::warn!(
+                "EvalAI has not answered all requests: the Lease is left to expire, and the next leader waits for that"
+            );
+        }
+        Ok(())
+    });
+    tokio::select! {
+        biased;
+        failed = tasks.failed() => Err(failed.into()),
+        result = work => result,
+    }
+}
+
+/// One client for calls, one whose dead connections end for watches, one without retries for the lease.
+pub struct Clients {
+    pub api: Client,
+    pub watch: Client,
+    pub lease: Client,
+}
+
+/// What one process is made of.
+struct Parts {
+    client: Client,
+    watch_client: Client,
+    settings: Settings,
+    aws: Aws,
+    watches: Watches,
+    telemetry: Observability,
+}
+
+impl Parts {
+    /// Until the stop. Returns whether EvalAI has answered all that was written to it.
+    async fn lead(self, leader: &Leader) -> Result<bool, RunError> {
+        if !await_lead(leader, &self.telemetry).await? {
+            return Ok(true);
+        }
+        tokio::select! { () = self.watches.synced() => {}, () = self.telemetry.stop.wait() => return Ok(true) }
+        // Prometheus sees no increase in a sample that begins with 1.
+        for phase in Phase::ALL {
+            self.telemetry.metrics.submissions.phases.of([phase.as_str()]);
+        }
+        let queues = Queues::new(self.settings.concurrency, &self.telemetry.metrics);
+        let (evalai, changed) = mpsc::unbounded_channel();
+        let external = self.external(&leader.fence(), evalai, &queues);
+        let hub = external.hub.clone();
+        let shared = Arc::new(Shared {
+            context: Arc::new(self.context(&leader.fence(), external, &queues)),
+            queues,
+            backoff: BackoffMap::default(),
+            telemetry: self.telemetry.clone(),
+        });
+        self.keep_policies(&shared.context);
+        let walked = Arc::clone(&shared);
+        let walk = move || gauges::walk(&walked, Timestamp::now());
+        let gauges = gauges::keep(gauges::EVERY, walk, self.telemetry.clone());
+        self.telemetry.tasks.stay("gauges", gauges);
+        let of_submissions = events::of_submissions(&self.watches, changed, &shared);
+        let of_leaderboards = events::of_leaderboards(&self.watches, &shared);
+        let reconciles = reconciles::run(of_submissions, of_leaderboards, shared);
+        let reconciles = self.telemetry.tasks.stay("reconciles", reconciles);
+        let (stop, lost) = (self.telemetry.stop.wait(), lost(leader.leadership()));
+        end(reconciles, stop, hub.drain(), lost).await
+    }
+
+    /// The services, and what counts them.
+    fn external(
+        &self,
+        fence: &leader::Fence,
+        evalai: mpsc::UnboundedSender<Changed>,
+        queues: &Queues,
+    ) -> ExternalSystems {
+        let telemetry = &self.telemetry;
+        let payloads = payloads::reader(self.aws.clone());
+        let hub = hub(fence, evalai, self.sweep(), payloads, telemetry);
+        let inbox = inbox::read(self.inbox(), hub.clone(), self.settings.operator.clone());
+        telemetry.tasks.stay("inbox", inbox);
+        let fence = fence.clone();
+        let wake = by_key(events::waking(&queues.submissions, &self.watches.submissions.store));
+        let records = records::start(&self.aws, move || fence.may_write(), &telemetry.tasks, wake);
+        ExternalSystems::new(hub, records, self.settings.allowed.clone())
+    }
+
+    /// Where the sweep's finds go.
+    fn sweep(&self) -> mpsc::UnboundedSender<SweepRow> {
+        let (sweep, rows) = mpsc::unbounded_channel();
+        let leaderboards = self.watches.leaderboards.store.clone();
+        let swept = sweep::into_cluster(self.client.clone(), leaderboards, rows);
+        self.telemetry.tasks.until_stop("sweep", swept);
+        sweep
+    }
+
+    /// What messages of EvalAI's queues are taken in with. A queue that cannot be read shows in its Leaderboards' `Ready`.
+    fn inbox(&self) -> Arc<pollers::Shared> {
+        Arc::new(pollers::Shared {
+            client: self.client.clone(),
+            scope: Scope {
+                namespaces: self.settings.namespaces.clone(),
+                allowed: self.settings.allowed.clone(),
+            },
+            leaderboards: self.watches.leaderboards.clone(),
+            recorder: events(&self.client),
+            telemetry: self.telemetry.clone(),
+            problems: pollers::Problems::new(Readiness::default()),
+        })
+    }
+
+    /// What all reconciles share.
+    fn context(&self, fence: &leader::Fence, external: ExternalSystems, queues: &Queues) -> Context {
+        let fence = fence.clone();
+        let (aws, client, tasks) = (&self.aws, &self.client, &self.telemetry.tasks);
+        let submissions = &self.watches.submissions.store;
+        let answered = || events::waking(&queues.submissions, submissions);
+        let turned = events::waking_as(urgency::of_submission, &queues.submissions, submissions);
+        let board = || -> Wake<Leaderboard> {
+            let boards = Arc::clone(&queues.leaderboards);
+            Box::new(move |board: ObjectRef<Leaderboard>| boards.add(&board, Class::Refresh))
+        };
+        let context = Context {
+            client: client.clone(),
+            writer: Writer::new(client.clone(), move || fence.may_write()),
+            settings: self.settings.clone(),
+            stores: self.watches.stores(),
+            memory: Memory::default(),
+            workers: Workers::start(aws, client, tasks, answered),
+            causes: self.causes(queues),
+            slots: Arc::new(Slots::new(self.watches.stores(), turned)),
+            leaderboards: LeaderboardState::default(),
+            asks: Asks::start(client, aws, &self.settings, tasks, || by_key(board())),
+            external,
+            recorder: events(client),
+            metrics: Arc::clone(&self.telemetry.metrics),
+            traces: self.telemetry.traces.clone(),
+            wake: board(),
+        };
+        let slots = Arc::clone(&context.slots);
+        tasks.stay("slots", async move { slots.keep().await });
+        for pod in context.stores.pods.state() {
+            context.measured(&pod);
+        }
+        if let Some(nodes) = &self.watches.nodes {
+            let woken = node::wake(nodes.subscribe(), context.stores.pods.clone(), answered());
+            tasks.stay("nodes", woken);
+        }
+        context
+    }
+
+    /// Why Jobs have no Pod and Pods no node, as events show. Without the right to them no reason is shown, and the log names it.
+    fn causes(&self, queues: &Queues) -> Causes {
+        let causes = Causes::default();
+        let objects = Objects {
+            jobs: self.watches.jobs.store.clone(),
+            pods: self.watches.pods.store.clone(),
+        };
+        for (name, selector) in [("events of Jobs", OF_JOBS), ("events of Pods", OF_PODS)] {
+            let wake = events::waking(&queues.submissions, &self.watches.submissions.store);
+            let take = causes.taking(objects.clone(), wake);
+            let apis = self.settings.namespaces.apis::<Event>(&self.watch_client);
+            spawn_uncached(name, apis, Config::default().fields(selector), &self.telemetry, take);
+        }
+        causes
+    }
+
+    /// Restores the policies next to the reconciles.
+    fn keep_policies(&self, context: &Arc<Context>) {
+        let context = Arc::clone(context);
+        let keep = move |board| {
+            let context = Arc::clone(&context);
+            async move {
+                let known = context.stores.leaderboards.get(&board);
+                if known.is_some_and(|known| operator::is_ours(&known, &context.settings.operator)) {
+                    isolation::keep_missing(context.policies(), &board).await;
+                }
+            }
+        };
+        let watches = &self.watches;
+        let restored = isolation::restore(watches.policies.subscribe(), watches.leaderboards.subscribe(), keep);
+        self.telemetry.tasks.stay("policies", restored);
+    }
+}
+
+/// After the stop, what reconciles have begun is finished, and given up when that takes too long; then `drain` is waited for and
+/// answered. A leader that has lost its Lease drops all of it, at any moment.
+async fn end<T>(
+    mut reconciles: JoinHandle<T>,
+    stop: impl Future<Output = ()>,
+    drain: impl Future<Output = bool>,
+    lost: impl Future<Output = String>,
+) -> Result<bool, RunError> {
+    let finished = async {
+        stop.await;
+        let _ = tokio::time::timeout(DRAIN, &mut reconciles).await;
+        drain.await
+    };
+    let result = tokio::select! {
+        biased;
+        why = lost => Err(RunError::LostLease(why)),
+        is_answered = finished => Ok(is_answered),
+    };
+    reconciles.abort();
+    result
+}
+
+fn events(client: &Client) -> Recorder {
+    bridge::events(client, "controller")
+}
+
+/// Waits to become the leader. False if the stop comes before.
+async fn await_lead(leader: &Leader, telemetry: &Observability) -> Result<bool, RunError> {
+    let mut leadership = leader.leadership();
+    loop {
+        match &*leadership.borrow_and_update() {
+            Leadership::Leader { .. } => return Ok(true),
+            Leadership::Lost { why } => return Err(RunError::LostLease(why.clone())),
+            Leadership::Standby => {}
+        }
+        tokio::select! {
+            () = telemetry.stop.wait() => return Ok(false),
+            // The task of the Lease has failed, which ends the process.
+            changed = leadership.changed() => if changed.is_err() { telemetry.stop.wait().await },
+        }
+    }
+}
+
+async fn lost(mut leadership: tokio::sync::watch::Receiver<Leadership>) -> String {
+    let why = {
+        let ended = leadership.wait_for(|l| !matches!(l, Leadership::Leader { .. })).await;
+        ended.map(|leadership| match &*leadership {
+            Leadership::Lost { why } => why.clone(),
+            _ => "the Lease was released".into(),
+        })
+    };
+    match why {
+        Ok(why) => why,
+        // The task of the Lease has failed, and ends the process by its name.
+        Err(_) => std::future::pending().await,
+    }
+}
+
+fn hub(
+    fence: &leader::Fence,
+    changed: mpsc::UnboundedSender<Changed>,
+    sweep: mpsc::UnboundedSender<SweepRow>,
+    payloads: PayloadReader,
+    telemetry: &Observability,
+) -> Hub {
+    let not_before = fence.evalai_not_before().unwrap_or_else(Instant::now);
+    let writes = fence.clone();
+    Hub::new(Options {
+        write_guard: Arc::new(move || writes.may_write()),
+        payloads,
+        not_before,
+        changed,
+        sweep,
+        timing: Timing::default(),
+        timeouts: Timeouts::default(),
+        meter: telemetry.metrics.meter(),
+        tasks: telemetry.tasks.clone(),
+    })
+}
+
+#[cfg(test)]
+mod tests;

@@ -1,0 +1,130 @@
+//! Reads the world of one submission into a `View`: caches and memory. Decides nothing.
+
+pub mod causes;
+pub mod job;
+pub mod node;
+pub mod pod;
+pub mod workers;
+
+use std::sync::Arc;
+
+use jiff::Timestamp;
+use kube::ResourceExt;
+use kube::runtime::reflector::ObjectRef;
+
+use super::external::ExternalSystems;
+use super::memory::Memory;
+use super::{failure_log, fences, reports};
+use crate::kubernetes::objects::Job;
+use crate::runtime::objects::uid;
+use crate::runtime::stores::Stores;
+use crate::slots::Slots;
+use causes::Causes;
+use leaderboard_api::{Leaderboard, Submission, SubmissionStatus};
+use leaderboard_policy::submissions::job_name;
+use leaderboard_policy::view::{EvalaiView, NodeView, ObservedJob, PodView, View};
+use workers::Workers;
+
+/// What reading the world of a submission uses.
+#[derive(Clone, Copy)]
+pub struct Uses<'a> {
+    pub stores: &'a Stores,
+    pub memory: &'a Memory,
+    pub workers: &'a Workers,
+    pub slots: &'a Slots,
+    pub causes: &'a Causes,
+    pub external: &'a ExternalSystems,
+}
+
+/// Reads everything a reconcile may depend on. `is_policy_in_place` returns whether the NetworkPolicy of a Leaderboard is.
+pub fn observe(uses: Uses<'_>, submission: Arc<Submission>, is_policy_in_place: impl Fn(&Leaderboard) -> bool) -> View {
+    let workers = uses.workers;
+    let submission = uses.memory.with_own_status(submission);
+    let now = Timestamp::now();
+    let leaderboard = uses.stores.leaderboard_for(&submission);
+    let (job, pod) = children(uses, &submission);
+    let status = submission.status.as_ref();
+    let is_over = status.is_some_and(SubmissionStatus::has_ended);
+    let pod_uid = pod.as_ref().map(|pod| pod.uid.as_str());
+    let (key, number) = (uid(submission.as_ref()), status.map(SubmissionStatus::job_number));
+    let number = number.unwrap_or_default();
+    View {
+        now,
+        // Comparing it takes longer than reading the rest.
+        is_policy_in_place: may_create(&job) && leaderboard.as_deref().is_some_and(is_policy_in_place),
+        not_allowed: leaderboard.as_deref().and_then(|board| uses.external.refusal(board)),
+        row: workers.rows.get(key),
+        turn: uses.slots.turn(&submission, leaderboard.as_deref()),
+        node: node(uses, pod.as_ref()),
+        report: reports::seen(&workers.reports.get(key), number, pod_uid),
+        fence: fences::seen(&workers.fences.get(key), number),
+        log: failure_log::seen(&workers.logs.get(key), number, is_over),
+        evalai: uses
+            .external
+            .evalai_view(leaderboard.as_deref(), &submission)
+            .map(|evalai| EvalaiView {
+                waited: uses.memory.evalai_waited(&submission),
+                ..evalai
+            }),
+        record: leaderboard
+            .as_deref()
+            .and_then(|board| uses.external.record_view(board, &submission)),
+        written_ago: uses.memory.since_write(&submission),
+        submission,
+        leaderboard,
+        job,
+        pod,
+    }
+}
+
+/// Whether a Job may be made now.
+fn may_create(job: &ObservedJob) -> bool {
+    matches!(job, ObservedJob::Absent { .. } | ObservedJob::Foreign)
+}
+
+/// The Job that the present attempt should have, and its newest Pod.
+fn children(uses: Uses<'_>, submission: &Submission) -> (ObservedJob, Option<PodView>) {
+    let namespace = submission.namespace().unwrap_or_default();
+    let nothing = SubmissionStatus::default();
+    let status = submission.status.as_ref().unwrap_or(&nothing);
+    let name = job_name(&submission.name_any(), status);
+    let reference = ObjectRef::<Job>::new(&name).within(&namespace);
+    let Some(found) = uses.stores.jobs.get(&reference) else {
+        let is_awaited = uses.memory.awaits_job(submission, &name);
+        let job = if is_awaited {
+            ObservedJob::Created
+        } else {
+            ObservedJob::Absent {
+                refused: uses.memory.refusal(submission, &name),
+            }
+        };
+        return (job, None);
+    };
+    if !is_owned_by(&found, submission) {
+        return (ObservedJob::Foreign, None);
+    }
+    uses.memory.forget_job(submission);
+    let pod = uses.stores.newest_pod(&found);
+    let mut job = job::view(&found, pod.as_deref());
+    let Some(pod) = pod else {
+        job.failed_create = uses.causes.refusal(&job.uid).filter(|_| job.end.is_none());
+        return (ObservedJob::Ours(job), None);
+    };
+    uses.causes.has_pod(&job.uid);
+    let mut pod = pod::view(&pod);
+    if pod.unschedulable.is_some() {
+        pod.scale_up = uses.causes.scale_up(&pod.uid);
+    }
+    (ObservedJob::Ours(job), Some(pod))
+}
+
+/// The node of a Pod that has not ended.
+fn node(uses: Uses<'_>, pod: Option<&PodView>) -> NodeView {
+    let name = pod.filter(|pod| pod.needs_node()).and_then(|pod| pod.node.as_deref());
+    name.map(|name| node::watched(uses.stores, name)).unwrap_or_default()
+}
+
+fn is_owned_by(job: &Job, submission: &Submission) -> bool {
+    job.metadata
+        .is_owned_by(submission.metadata.uid.as_deref().unwrap_or_default())
+}
