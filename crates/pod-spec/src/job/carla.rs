@@ -3,8 +3,7 @@
 //! What they see is the original's, version by version.
 
 use super::display;
-use super::workload::{Asked, Contents, Mount, Role, Workload};
-use crate::layout::{AGENT, CONTENTS_VOLUMES, SAVED};
+use super::workload::{Asked, Contents, ContentsVolume, Mount, Reserved, Role, Workload};
 use leaderboard_api::{LeaderboardVersion, SimulatorContainer};
 use leaderboard_contract::keys::agent_folder;
 use leaderboard_contract::run::console_name;
@@ -19,6 +18,48 @@ const CHECKPOINT: &str = "/tmp/agent/agent_results.json";
 const LIVE_RESULTS: &str = "/tmp/agent/live_results.txt";
 /// A server prints little; one that floods must not fill the disk. In bytes.
 const SIMULATOR_LOG_LIMIT: u64 = 64 << 20;
+/// An agent's own folder of results and log.
+const AGENT: &str = "/tmp/agent";
+/// What a simulator keeps.
+const SAVED: &str = "/home/carla/CarlaUE4/Saved";
+const CONTENTS_VOLUMES: [ContentsVolume; 3] = [
+    ContentsVolume {
+        name: "leaderboard",
+        written: "/tmp/leaderboard",
+        read: LEADERBOARD_ROOT,
+    },
+    ContentsVolume {
+        name: "scenario-runner",
+        written: "/tmp/scenario_runner",
+        read: SCENARIO_RUNNER_ROOT,
+    },
+    ContentsVolume {
+        name: "carla-python-api",
+        written: "/tmp/CARLA",
+        read: CARLA_ROOT,
+    },
+];
+/// They follow from the plan.
+const FIXED_ENV: [&str; 12] = [
+    "CARLA_PORT",
+    "CARLA_TM_PORT",
+    "CHALLENGE_TRACK_CODENAME",
+    "ROUTES",
+    "ROUTES_SUBSET",
+    "SCENARIOS",
+    "REPETITIONS",
+    "RESUME",
+    "CHECKPOINT_ENDPOINT",
+    "CARLA_ROOT",
+    "SCENARIO_RUNNER_ROOT",
+    "LEADERBOARD_ROOT",
+];
+
+pub const RESERVED: Reserved = Reserved {
+    env: &FIXED_ENV,
+    volumes: &CONTENTS_VOLUMES,
+    folders: &[AGENT, SAVED],
+};
 
 /// Port of a pair's simulator.
 fn port(pair: Pair) -> usize {

@@ -3,7 +3,7 @@
 //! Pure: no client, no clock, no error. Called by the controller when an attempt starts, and for the dry run that checks a
 //! Leaderboard. It owns everything the Pod is made of; what the containers then do is in `pod` and in the runner.
 
-mod carla;
+pub mod carla;
 mod disk;
 mod display;
 mod failed_nodes;
@@ -133,7 +133,7 @@ pub fn build_object(input: &JobInput<'_>) -> DynamicObject {
     let mut spec = serde_json::to_value(ours(input)).unwrap_or_default();
     let template = &mut spec["template"];
     let overlay = input.spec().pod_overrides.as_ref();
-    if let Some(overlay) = overlay.filter(|pod| pod_overlay::validate_overlay(pod).is_ok()) {
+    if let Some(overlay) = overlay.filter(|pod| pod_overlay::validate_overlay(pod, &carla::RESERVED).is_ok()) {
         pod_overlay::apply(template, overlay);
     }
     settle(template, input);

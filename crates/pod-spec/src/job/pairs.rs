@@ -7,7 +7,7 @@ use super::security::context;
 use super::workload::{Role, Workload};
 use super::{JobInput, carla, gpu, variable, volumes};
 use crate::gpu_claims::source;
-use crate::layout::{FIXED_ENV, STATUS};
+use crate::layout::STATUS;
 use leaderboard_api::Part;
 use leaderboard_contract::run::{RUNNER, TOOLS};
 use leaderboard_protocol::files::{Member, Pair, Side};
@@ -79,7 +79,7 @@ fn behind_runner(member: Member, flags: impl IntoIterator<Item = String>, words:
 fn merged(mut ours: Vec<EnvVar>, hosts: &[EnvVar]) -> Vec<EnvVar> {
     for variable in hosts
         .iter()
-        .filter(|variable| !FIXED_ENV.contains(&variable.name.as_str()))
+        .filter(|variable| !carla::RESERVED.env.contains(&variable.name.as_str()))
     {
         match ours.iter_mut().find(|known| known.name == variable.name) {
             Some(known) => known.clone_from(variable),

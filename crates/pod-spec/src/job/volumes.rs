@@ -7,10 +7,9 @@ use k8s_openapi::api::core::v1::{
 use k8s_openapi::apimachinery::pkg::api::resource::Quantity;
 
 use super::workload::Mount;
-use super::{JobInput, pairs};
+use super::{JobInput, carla, pairs};
 use crate::layout::{
-    CONTENTS_LOG_FOLDER, CONTENTS_VOLUMES, IDENTITY_VOLUME, LOGS_VOLUME, PODINFO_VOLUME, SHM, SHM_VOLUME, STATUS,
-    TOOLS_VOLUME,
+    CONTENTS_LOG_FOLDER, IDENTITY_VOLUME, LOGS_VOLUME, PODINFO_VOLUME, SHM, SHM_VOLUME, STATUS, TOOLS_VOLUME,
 };
 use leaderboard_api::{ByteQuantity, names};
 use leaderboard_contract::run::{
@@ -26,7 +25,7 @@ const LOGS_MARGIN: u64 = 1 << 30;
 
 /// Every volume of the Pod.
 pub(super) fn all(input: &JobInput<'_>) -> Vec<Volume> {
-    let contents = CONTENTS_VOLUMES.map(|volume| empty(volume.name, None));
+    let contents = carla::RESERVED.volumes.iter().map(|volume| empty(volume.name, None));
     let own = [
         empty(LOGS_VOLUME, Some(Quantity(logs_limit(input).to_string()))),
         empty(TOOLS_VOLUME, Some(Quantity("64Mi".into()))),
@@ -35,7 +34,7 @@ pub(super) fn all(input: &JobInput<'_>) -> Vec<Volume> {
     let identity = input.spec().has_role().then(identity);
     let shared = input.spec().agent.shm_size.iter();
     let shared = shared.flat_map(|size| Pair::first(input.pairs()).map(|pair| memory(pair, size)));
-    let all = contents.into_iter().chain(own).chain(identity);
+    let all = contents.chain(own).chain(identity);
     all.chain(of_node(input)).chain(shared).collect()
 }
 
@@ -139,12 +138,15 @@ fn identity() -> Volume {
 
 /// Where `contents` writes, and the runner that keeps what it prints.
 pub(super) fn of_contents() -> Vec<VolumeMount> {
-    let written = CONTENTS_VOLUMES.map(|volume| mount(volume.name, volume.written));
+    let written = carla::RESERVED
+        .volumes
+        .iter()
+        .map(|volume| mount(volume.name, volume.written));
     let own = [
         read_only(mount(TOOLS_VOLUME, TOOLS)),
         mount_part(LOGS_VOLUME, "contents".into(), CONTENTS_LOG_FOLDER),
     ];
-    written.into_iter().chain(own).collect()
+    written.chain(own).collect()
 }
 
 /// What `workspace` prepares.

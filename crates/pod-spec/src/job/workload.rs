@@ -3,6 +3,17 @@
 use leaderboard_api::{Deadlines, LeaderboardSpec, RunPlan, Track};
 use leaderboard_protocol::graphics::Needs;
 
+/// Names that a kind of evaluation uses itself, so that no host gives them another meaning.
+#[derive(Clone, Copy, Debug, PartialEq, Eq)]
+pub struct Reserved {
+    /// Variables of the workers' containers.
+    pub env: &'static [&'static str],
+    /// Volumes that `contents` fills.
+    pub volumes: &'static [ContentsVolume],
+    /// Folders that the workers' containers write.
+    pub folders: &'static [&'static str],
+}
+
 /// What a workload depends on.
 #[derive(Clone, Copy, Debug)]
 pub struct Asked<'a> {

@@ -6,7 +6,9 @@ use k8s_openapi::api::core::v1::PodTemplateSpec;
 use serde_json::{Map, Value};
 
 use super::without_nulls;
-use crate::layout::{ANNOTATION_SKIP_CONTAINERS, CONTENTS_VOLUMES, FIXED_ENV, OWN_VOLUMES, protected_mounts};
+use crate::job::carla::RESERVED;
+use crate::job::workload::Reserved;
+use crate::layout::{ANNOTATION_SKIP_CONTAINERS, OWN_VOLUMES, protected_mounts};
 use leaderboard_api::{LeaderboardSpec, Part, names};
 use leaderboard_contract::run::{ENV_POD_UID, ENV_ROLE_ARN, ENV_RUN};
 
@@ -103,16 +105,18 @@ const OWN_ENV: [&str; 6] = [
 
 /// Checks all of a Leaderboard that goes into its Pods: `podOverrides`, and the variables of its containers.
 pub fn validate(spec: &LeaderboardSpec) -> Checked {
+    let reserved = &RESERVED;
     for part in [Part::Host, Part::Agent] {
         let hosts = spec.given(None, part);
         let names = hosts.env.iter().map(|variable| variable.name.as_str());
-        fixed_names(&format!("{}.env", hosts.path), names)?;
+        fixed_names(&format!("{}.env", hosts.path), names, reserved)?;
     }
-    spec.pod_overrides.as_ref().map_or(Ok(()), validate_overlay)
+    let overlay = spec.pod_overrides.as_ref();
+    overlay.map_or(Ok(()), |pod| validate_overlay(pod, reserved))
 }
 
 /// Checks a Leaderboard's `podOverrides`. The API server's answer to a dry run of the Job then judges what is left.
-pub fn validate_overlay(pod: &Value) -> Checked {
+pub fn validate_overlay(pod: &Value, reserved: &Reserved) -> Checked {
     let template = object(pod, "podOverrides")?;
     only(
         template,
@@ -124,7 +128,7 @@ pub fn validate_overlay(pod: &Value) -> Checked {
         metadata(object(value, "podOverrides.metadata")?)?;
     }
     if let Some(value) = template.get("spec") {
-        spec(object(value, "podOverrides.spec")?)?;
+        spec(object(value, "podOverrides.spec")?, reserved)?;
     }
     let typed: Result<PodTemplateSpec, _> = serde_json::from_value(without_nulls(pod));
     typed.map(|_| ()).map_err(|error| OverlayError::Template {
@@ -156,24 +160,24 @@ fn metadata(metadata: &Map<String, Value>) -> Checked {
     Ok(())
 }
 
-fn spec(spec: &Map<String, Value>) -> Checked {
+fn spec(spec: &Map<String, Value>, reserved: &Reserved) -> Checked {
     fields(spec, "podOverrides.spec", &POD_FIELDS)?;
     if let Some(value) = spec.get("volumes") {
-        volumes(value)?;
+        volumes(value, reserved)?;
     }
     for (field, init) in [("initContainers", true), ("containers", false)] {
         let Some(value) = spec.get(field) else { continue };
         for (path, container) in named(value, &format!("podOverrides.spec.{field}"))? {
-            check_container(&path, container, init)?;
+            check_container(&path, container, init, reserved)?;
         }
     }
     Ok(())
 }
 
-fn volumes(value: &Value) -> Checked {
+fn volumes(value: &Value, reserved: &Reserved) -> Checked {
     for (path, volume) in named(value, "podOverrides.spec.volumes")? {
         if let Some(name) = volume["name"].as_str()
-            && (OWN_VOLUMES.contains(&name) || CONTENTS_VOLUMES.iter().any(|known| known.name == name))
+            && (OWN_VOLUMES.contains(&name) || reserved.volumes.iter().any(|known| known.name == name))
         {
             return protected(path, "the operator fills this volume; give yours another name");
         }
@@ -203,7 +207,7 @@ enum Whose {
     Added,
 }
 
-fn check_container(path: &str, container: &Map<String, Value>, init: bool) -> Checked {
+fn check_container(path: &str, container: &Map<String, Value>, init: bool, reserved: &Reserved) -> Checked {
     let name = container["name"].as_str().unwrap_or_default();
     let whose = whose(name);
     match (whose, init) {
@@ -215,7 +219,7 @@ fn check_container(path: &str, container: &Map<String, Value>, init: bool) -> Ch
         }
         _ => {}
     }
-    mounts(path, container)?;
+    mounts(path, container, reserved)?;
     if whose == Whose::Added {
         return Ok(());
     }
@@ -225,7 +229,7 @@ fn check_container(path: &str, container: &Map<String, Value>, init: bool) -> Ch
         path,
         &[("restartPolicy", RUN_BY_US), ("restartPolicyRules", RUN_BY_US)],
     )?;
-    env(path, container, whose)
+    env(path, container, whose, reserved)
 }
 
 fn whose(name: &str) -> Whose {
@@ -241,7 +245,7 @@ fn whose(name: &str) -> Whose {
     }
 }
 
-fn env(path: &str, container: &Map<String, Value>, whose: Whose) -> Checked {
+fn env(path: &str, container: &Map<String, Value>, whose: Whose, reserved: &Reserved) -> Checked {
     let path = format!("{path}.env");
     let Some(value) = container.get("env") else {
         return Ok(());
@@ -256,13 +260,13 @@ fn env(path: &str, container: &Map<String, Value>, whose: Whose) -> Checked {
             ),
             None => Ok(()),
         },
-        Whose::Worker => fixed_names(&path, names),
+        Whose::Worker => fixed_names(&path, names, reserved),
         Whose::Contents | Whose::Added => Ok(()),
     }
 }
 
-fn fixed_names<'a>(path: &str, mut names: impl Iterator<Item = &'a str>) -> Checked {
-    match names.find(|name| FIXED_ENV.contains(name)) {
+fn fixed_names<'a>(path: &str, mut names: impl Iterator<Item = &'a str>, reserved: &Reserved) -> Checked {
+    match names.find(|name| reserved.env.contains(name)) {
         Some(name) => protected(
             format!("{path}[{name}]"),
             "it follows from the plan of the run; set pairs, routes, repetitions, or routesFile, scenariosFile and codename of the track",
@@ -271,7 +275,7 @@ fn fixed_names<'a>(path: &str, mut names: impl Iterator<Item = &'a str>) -> Chec
     }
 }
 
-fn mounts(path: &str, container: &Map<String, Value>) -> Checked {
+fn mounts(path: &str, container: &Map<String, Value>, reserved: &Reserved) -> Checked {
     let path = format!("{path}.volumeMounts");
     let Some(value) = container.get("volumeMounts") else {
         return Ok(());
@@ -285,7 +289,7 @@ fn mounts(path: &str, container: &Map<String, Value>) -> Checked {
                 expected: "a path",
             });
         };
-        if let Some(ours) = protected_mounts().find(|ours| below(target, ours)) {
+        if let Some(ours) = protected_mounts(reserved).find(|ours| below(target, ours)) {
             return protected(path, format!("the operator mounts {ours}"));
         }
         let volume = mount.get("name").and_then(Value::as_str).unwrap_or_default();
@@ -293,7 +297,7 @@ fn mounts(path: &str, container: &Map<String, Value>) -> Checked {
         if OWN_VOLUMES.contains(&volume) {
             return protected(path, format!("volume {volume} is mounted by the operator alone"));
         }
-        if !read_only && CONTENTS_VOLUMES.iter().any(|known| known.name == volume) {
+        if !read_only && reserved.volumes.iter().any(|known| known.name == volume) {
             return protected(
                 path,
                 format!("volume {volume} holds the contents; mount it with readOnly true"),

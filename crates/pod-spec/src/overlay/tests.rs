@@ -3,6 +3,7 @@
 use serde_json::{Value, json};
 
 use super::*;
+use crate::job::carla::RESERVED;
 
 fn base() -> Value {
     json!({
@@ -146,7 +147,7 @@ fn an_empty_overlay_changes_nothing() {
         json!({"spec": {}}),
         json!({"metadata": {"labels": {}}, "spec": {"containers": []}}),
     ] {
-        assert_eq!(validate_overlay(&overlay), Ok(()));
+        assert_eq!(validate_overlay(&overlay, &RESERVED), Ok(()));
         check(overlay, "", base());
     }
 }
@@ -165,7 +166,7 @@ fn what_an_overlay_may_set_is_accepted() {
         json!({"spec": {"tolerations": null, "fieldOfTheFuture": [1]}}),
     ];
     for case in cases {
-        assert_eq!(validate_overlay(&case), Ok(()), "{case}");
+        assert_eq!(validate_overlay(&case, &RESERVED), Ok(()), "{case}");
     }
 }
 
@@ -173,7 +174,7 @@ fn what_an_overlay_may_set_is_accepted() {
 #[track_caller]
 fn refused(cases: &[(&str, &str)]) {
     for (overlay, expected) in cases {
-        let error = validate_overlay(&serde_json::from_str(overlay).unwrap())
+        let error = validate_overlay(&serde_json::from_str(overlay).unwrap(), &RESERVED)
             .expect_err(overlay)
             .to_string();
         assert!(error.starts_with(expected), "{overlay}\n  {error}\n  {expected}");
