@@ -26,7 +26,7 @@ use leaderboard_api::names::OPERATOR;
 use leaderboard_aws::clients::Aws;
 use leaderboard_base::shutdown::on_signals;
 use leaderboard_contract::run::ENV_CHECKSUMS;
-use leaderboard_evaluation::carla::judge::Pace;
+use leaderboard_evaluation::judge::Pace;
 use leaderboard_pod::places::{Places, Setting};
 use leaderboard_pod::{logcopy as logcopy_program, ownlog, workspace as workspace_program};
 use leaderboard_pod_spec::job::OwnImage;

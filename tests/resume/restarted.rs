@@ -12,7 +12,7 @@ use super::submission::{FASTER, PAIRS, ROUTES_OF_PAIR, Submission};
 use crate::ministack::server;
 use leaderboard_api::LeaderboardVersion;
 use leaderboard_contract::report::Report;
-use leaderboard_evaluation::carla::judge::Pace;
+use leaderboard_evaluation::judge::Pace;
 use leaderboard_protocol::files::{Mark, Side, StatusFile};
 
 const LIMIT: Duration = Duration::from_mins(1);

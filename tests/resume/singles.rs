@@ -10,7 +10,7 @@ use super::results::{report, results};
 use super::submission::{FASTER, Submission};
 use crate::ministack::{Proxy, server};
 use leaderboard_api::LeaderboardVersion;
-use leaderboard_evaluation::carla::judge::Pace;
+use leaderboard_evaluation::judge::Pace;
 use leaderboard_protocol::files::{Mark, Side, StatusFile};
 
 const LIMIT: Duration = Duration::from_mins(1);

@@ -7,3 +7,5 @@
 pub mod carla;
 #[cfg(any(test, feature = "fixtures"))]
 pub mod fixtures;
+pub mod judge;
+pub mod workload;

@@ -1,7 +1,7 @@
 //! The inside of a Pod as the Job and the rules for an overlay agree on it: volumes and paths. Pure.
 
-use crate::job::workload::Reserved;
 use leaderboard_contract::run::{IDENTITY, LOGS, NAME_FILES, PODINFO, TOOLS};
+use leaderboard_evaluation::workload::Reserved;
 
 /// The volumes of ours beside the contents. Nothing but our own mounts of them keeps a stranger from what is in them.
 pub(super) const OWN_VOLUMES: [&str; 4] = [LOGS_VOLUME, TOOLS_VOLUME, PODINFO_VOLUME, IDENTITY_VOLUME];

@@ -10,7 +10,7 @@ use leaderboard_contract::run::{
     SCHEMA, STATUS_FOLDER, STOP_FILE, TOOLS,
 };
 use leaderboard_contract::schema::is_read;
-use leaderboard_evaluation::carla::judge::Pace;
+use leaderboard_evaluation::judge::Pace;
 
 /// Files and folders.
 #[derive(Clone, Debug, PartialEq, Eq)]

@@ -1,10 +1,12 @@
 //! What the operator knows of the CARLA Leaderboard inside a Pod.
 
 pub mod commands;
+mod display;
 pub mod gather;
-pub mod judge;
 pub mod layout;
 pub mod measures;
+pub mod workload;
+
 use leaderboard_api::LeaderboardVersion;
 use leaderboard_results::{Format, metrics};
 

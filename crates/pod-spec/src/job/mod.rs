@@ -3,9 +3,7 @@
 //! Pure: no client, no clock, no error. Called by the controller when an attempt starts, and for the dry run that checks a
 //! Leaderboard. It owns everything the Pod is made of; what the containers then do is in `pod` and in the runner.
 
-pub mod carla;
 mod disk;
-mod display;
 mod failed_nodes;
 mod gpu;
 mod gpu_count;
@@ -14,7 +12,6 @@ mod own_uid;
 mod pairs;
 mod security;
 mod volumes;
-pub mod workload;
 
 #[cfg(test)]
 mod command_tests;
@@ -48,7 +45,8 @@ use leaderboard_api::{
     RunPlan, Submission, Track, conditions, effective, names, reasons,
 };
 use leaderboard_contract::run::{Isolation, Run, SCHEMA};
-use workload::Asked;
+use leaderboard_evaluation::carla::workload as carla;
+use leaderboard_evaluation::workload::Asked;
 
 /// Seconds the containers have between SIGTERM and SIGKILL: the agents' 20 s, then logcopy's last upload.
 const GRACE_SECONDS: i64 = 600;

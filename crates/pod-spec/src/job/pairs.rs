@@ -4,12 +4,12 @@ use k8s_openapi::api::core::v1::{Container, EnvVar};
 use serde_json::Value;
 
 use super::security::context;
-use super::workload::{Role, Workload};
 use super::{JobInput, carla, gpu, variable, volumes};
 use crate::gpu_claims::source;
 use crate::layout::STATUS;
 use leaderboard_api::Part;
 use leaderboard_contract::run::{RUNNER, TOOLS};
+use leaderboard_evaluation::workload::{Role, Workload};
 use leaderboard_protocol::files::{Member, Pair, Side};
 
 pub(super) fn workload(input: &JobInput<'_>, pair: Pair) -> Workload {

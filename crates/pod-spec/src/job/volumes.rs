@@ -6,7 +6,6 @@ use k8s_openapi::api::core::v1::{
 };
 use k8s_openapi::apimachinery::pkg::api::resource::Quantity;
 
-use super::workload::Mount;
 use super::{JobInput, carla, pairs};
 use crate::layout::{
     CONTENTS_LOG_FOLDER, IDENTITY_VOLUME, LOGS_VOLUME, PODINFO_VOLUME, SHM, SHM_VOLUME, STATUS, TOOLS_VOLUME,
@@ -15,6 +14,7 @@ use leaderboard_api::{ByteQuantity, names};
 use leaderboard_contract::run::{
     IDENTITY, IDENTITY_TOKEN_FILE, LOGS, NAME_FILES, PODINFO, STATUS_FOLDER, STOP_FILE, TOOLS,
 };
+use leaderboard_evaluation::workload::Mount;
 use leaderboard_protocol::files::{Member, Pair, Side};
 
 const AUDIENCE: &str = "sts.amazonaws.com";

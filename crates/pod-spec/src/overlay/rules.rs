@@ -6,11 +6,11 @@ use k8s_openapi::api::core::v1::PodTemplateSpec;
 use serde_json::{Map, Value};
 
 use super::without_nulls;
-use crate::job::carla::RESERVED;
-use crate::job::workload::Reserved;
 use crate::layout::{ANNOTATION_SKIP_CONTAINERS, OWN_VOLUMES, protected_mounts};
 use leaderboard_api::{LeaderboardSpec, Part, names};
 use leaderboard_contract::run::{ENV_POD_UID, ENV_ROLE_ARN, ENV_RUN};
+use leaderboard_evaluation::carla::workload::RESERVED;
+use leaderboard_evaluation::workload::Reserved;
 
 /// Why a Leaderboard's `podOverrides` cannot be used. `path` is below `spec` of the Leaderboard.
 #[derive(thiserror::Error, Debug, PartialEq, Eq)]

@@ -3,7 +3,7 @@
 use serde_json::{Value, json};
 
 use super::*;
-use crate::job::carla::RESERVED;
+use leaderboard_evaluation::carla::workload::RESERVED;
 
 fn base() -> Value {
     json!({

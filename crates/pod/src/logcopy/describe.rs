@@ -6,8 +6,8 @@ use leaderboard_api::text::one_line;
 use leaderboard_contract::report::{LONGEST_TEXT, MAX_BYTES, Report, SCHEMA};
 use leaderboard_contract::run::Run;
 use leaderboard_evaluation::carla::gather::Gathered;
-use leaderboard_evaluation::carla::judge::Ending;
 use leaderboard_evaluation::carla::measures::UNIT;
+use leaderboard_evaluation::judge::Ending;
 
 /// Warnings of the results' check that are reported.
 const WARNINGS: usize = 50;

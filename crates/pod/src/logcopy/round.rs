@@ -25,7 +25,7 @@ use leaderboard_contract::keys::agent_folder;
 use leaderboard_contract::report::{Logs, OWNER_KEY, Owner, REPORT_KEY, Report};
 use leaderboard_contract::run::{STATUS_FOLDER, Stop};
 use leaderboard_evaluation::carla::gather::{Gathered, Gatherer, Object};
-use leaderboard_evaluation::carla::judge::{Ending, Judge, Outside, Step, decide};
+use leaderboard_evaluation::judge::{Ending, Judge, Outside, Step, decide};
 use leaderboard_evidence::Tree;
 use leaderboard_protocol::files as protocol;
 use leaderboard_protocol::files::{Mark, Pair, StatusFile};

@@ -5,7 +5,7 @@
 
 use leaderboard_api::{Display, LeaderboardVersion, SimulatorContainer};
 
-use super::workload::Mount;
+use crate::workload::Mount;
 
 const DRIVER: &str = "SDL_VIDEODRIVER";
 const SCREEN: &str = "DISPLAY";

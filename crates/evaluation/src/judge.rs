@@ -5,7 +5,7 @@
 
 use std::time::Duration;
 
-use super::gather::Gathered;
+use crate::carla::gather::Gathered;
 use leaderboard_contract::run::Stop;
 
 /// How a run ended.

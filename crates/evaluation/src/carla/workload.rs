@@ -2,13 +2,13 @@
 //!
 //! What they see is the original's, version by version.
 
+use super::commands::{self, Adapter};
 use super::display;
-use super::workload::{Asked, Contents, ContentsVolume, Mount, Reserved, Role, Workload};
+use super::layout::{CARLA_ROOT, LEADERBOARD_ROOT, SCENARIO_RUNNER_ROOT, python_path};
+use crate::workload::{Asked, Contents, ContentsVolume, Mount, Reserved, Role, Workload};
 use leaderboard_api::{LeaderboardVersion, SimulatorContainer};
 use leaderboard_contract::keys::agent_folder;
 use leaderboard_contract::run::console_name;
-use leaderboard_evaluation::carla::commands::{self, Adapter};
-use leaderboard_evaluation::carla::layout::{CARLA_ROOT, LEADERBOARD_ROOT, SCENARIO_RUNNER_ROOT, python_path};
 use leaderboard_protocol::files::Pair;
 use leaderboard_protocol::graphics::Needs;
 
