@@ -8,7 +8,6 @@ use std::time::Duration;
 use jiff::Timestamp;
 use k8s_openapi::api::core::v1::Secret;
 use kube::{Api, Client};
-use leaderboard_results::metrics;
 
 use super::places;
 use super::reach::{AwsResource, Place, Reach};
@@ -25,7 +24,6 @@ use leaderboard_base::spans::LogSpan;
 use leaderboard_base::tasks::Tasks;
 use leaderboard_evalai::Target;
 use leaderboard_evalai::token::Token;
-use leaderboard_evaluation::carla::results_format;
 use leaderboard_policy::ask::{Ask, Failure, Lookup, Service};
 
 /// A token is looked at again after this long.
@@ -179,7 +177,6 @@ impl Looked {
         let evalai = leaderboard.spec.evalai.as_ref()?;
         let token = self.token(leaderboard)?.as_ref().ok()?;
         let spec = &leaderboard.spec;
-        let format = results_format(spec.leaderboard_version);
         let created = leaderboard.metadata.creation_timestamp.as_ref();
         Some(Target {
             leaderboard: key_of(leaderboard),
@@ -191,7 +188,11 @@ impl Looked {
             sweep: Duration::from_secs(evalai.sweep_seconds.unsigned_abs()),
             period: Duration::from_secs(spec.sync_period_seconds.unsigned_abs()),
             phases: spec.tracks.iter().filter_map(|t| t.phase).collect(),
-            labels: metrics(format).iter().map(|m| m.name.to_owned()).collect(),
+            labels: leaderboard_evaluation::of(spec)
+                .columns()
+                .into_iter()
+                .map(|column| column.label)
+                .collect(),
             inbox: evalai.queue.as_ref().map(|queue| queue.name.clone()),
             is_observed: evalai.mode == EvalaiMode::Observe,
             since: created.map(|time| time.0).unwrap_or_default(),

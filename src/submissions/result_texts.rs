@@ -3,15 +3,14 @@
 use serde_json::Value;
 
 use super::failure_log::Tail;
-use leaderboard_api::{FailureClass, LeaderboardVersion, LogTail, State, SubmissionStatus, effective};
+use leaderboard_api::{FailureClass, LogTail, State, SubmissionStatus, effective};
 use leaderboard_aws::table::Row;
 use leaderboard_evalai::{Outline, Patience, StoredResult};
-use leaderboard_evaluation::carla::results_format;
+use leaderboard_evaluation::{Evaluation, number_text, of_plan};
 use leaderboard_policy::report_digest::ReportDigest;
 use leaderboard_policy::view::View;
-use leaderboard_results::{metrics, number_text};
 
-/// What the result in the view is sent with: nothing of a bucket where none is stored. `so_far`: with the metrics over the routes so
+/// What the result in the view is sent with: nothing of a bucket where none is stored. `so_far`: with the metrics over what is done so
 /// far, else with the original's zeros.
 pub(super) fn outline(view: &View, status: &SubmissionStatus, so_far: bool, patience: Patience) -> Outline {
     let stored = view
@@ -91,7 +90,7 @@ pub(super) fn row(report: Option<&ReportDigest>, status: &SubmissionStatus) -> O
         results: status.results_url.clone().unwrap_or_default(),
         progress: status.progress.as_ref().map(|p| p.text.clone()).unwrap_or_default(),
         gpu_seconds: gpu_seconds(status),
-        metrics: columns(report.filter(|_| is_finished(status)), plan.leaderboard_version),
+        metrics: columns(report.filter(|_| is_finished(status)), &*of_plan(plan)),
     })
 }
 
@@ -127,17 +126,15 @@ fn table_status(state: State) -> &'static str {
 }
 
 /// The metric columns, as text with the digits of results.json; those without a value are to be removed.
-fn columns(report: Option<&ReportDigest>, version: LeaderboardVersion) -> Vec<(String, Option<String>)> {
+fn columns(report: Option<&ReportDigest>, kind: &dyn Evaluation) -> Vec<(String, Option<String>)> {
     let accuracies = report.and_then(|report| report.accuracies.as_ref());
     let text = |value: &Value| match value.as_f64().filter(|_| value.is_f64()) {
         Some(number) => number_text(number),
         None => value.to_string(),
     };
-    let all = metrics(results_format(version)).iter().map(|metric| {
-        (
-            metric.column.to_owned(),
-            accuracies.and_then(|all| all.get(metric.name)).map(text),
-        )
+    let all = kind.columns().into_iter().map(|column| {
+        let value = accuracies.and_then(|all| all.get(&column.label));
+        (column.name, value.map(text))
     });
     all.collect()
 }
@@ -145,7 +142,8 @@ fn columns(report: Option<&ReportDigest>, version: LeaderboardVersion) -> Vec<(S
 #[cfg(test)]
 mod tests {
     use super::*;
-    use leaderboard_api::Attempt;
+    use leaderboard_api::{Attempt, LeaderboardVersion};
+    use leaderboard_evaluation::carla::Carla;
     use serde_json::json;
 
     fn report(results: &str) -> ReportDigest {
@@ -167,7 +165,7 @@ mod tests {
     #[test]
     fn columns_keep_the_digits_and_the_names_of_the_original() {
         let results = r#"[{"split": "leaderboard", "accuracies": {"Driving score": 43.125, "Off-road infractions": 0.0, "Agent blocked": 0}}]"#;
-        let found = columns(Some(&report(results)), LeaderboardVersion::V2);
+        let found = columns(Some(&report(results)), &Carla::new(LeaderboardVersion::V2));
         let get = |name: &str| found.iter().find(|(n, _)| n == name).and_then(|(_, v)| v.as_deref());
         assert_eq!(get("driving_score"), Some("43.125"));
         assert_eq!(get("off_road_infractions"), Some("0.0"));
@@ -262,7 +260,7 @@ mod tests {
 
     #[test]
     fn a_broken_report_has_no_columns() {
-        let found = columns(Some(&report("not json")), LeaderboardVersion::V2);
+        let found = columns(Some(&report("not json")), &Carla::new(LeaderboardVersion::V2));
         assert!(found.iter().all(|(_, value)| value.is_none()));
     }
 }

@@ -37,7 +37,7 @@ use leaderboard_aws::logs::LogClient;
 use leaderboard_contract::report::{MAX_BYTES, OWNER_KEY, Owner, REPORT_KEY, Report};
 use leaderboard_contract::run::{Run, SCHEMA, STATUS_FOLDER, Stop};
 use leaderboard_contract::verdict::{WorkspaceReason, WorkspaceVerdict};
-use leaderboard_evaluation::carla::gather::Object;
+use leaderboard_evaluation::Object;
 use leaderboard_evaluation::judge::Pace;
 use leaderboard_evidence::Tree;
 use leaderboard_pod::logcopy::{self, LogcopyError};

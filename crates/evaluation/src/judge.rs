@@ -5,7 +5,7 @@
 
 use std::time::Duration;
 
-use crate::carla::gather::Gathered;
+use crate::Gathered;
 use leaderboard_contract::run::Stop;
 
 /// How a run ended.
@@ -132,11 +132,11 @@ impl Judge {
         Situation {
             whole,
             complete: self.complete.map(since),
-            all_done: gathered.seen.iter().all(|pair| pair.agent.done),
+            all_done: gathered.seen.iter().all(|worker| worker.agent.done),
             any_started: gathered
                 .seen
                 .iter()
-                .any(|pair| pair.agent.started || pair.simulator.started),
+                .any(|worker| worker.agent.started || worker.host.started),
             stop: outside.stop,
             spoiled: self.spoiled.clone().map(|(why, then)| (why, since(then))),
             cancelled: self.cancelled.map(since),
@@ -152,7 +152,7 @@ fn spoiled(gathered: &Gathered) -> Option<String> {
     if gathered.is_complete() {
         return None;
     }
-    let ended = gathered.seen.iter().zip(&gathered.pairs).zip(&gathered.refused);
+    let ended = gathered.seen.iter().zip(&gathered.workers).zip(&gathered.refused);
     let readable = ended.zip(&gathered.unreadable).filter(|(_, unreadable)| !**unreadable);
     let mut short = readable.filter(|(((seen, pair), _), _)| seen.agent.done && pair.done < pair.total);
     if let Some((((_, pair), refused), _)) = short.next() {

@@ -1,11 +1,109 @@
-//! What the operator knows of the evaluation that it runs: the words of its commands, where its parts lie, what its pairs have so far,
-//! and when a run has ended. Everything that is the CARLA Leaderboard's own is below `carla`.
+//! Kinds of evaluation: what a Pod runs, how its results are read, and in which words people read of it.
 //!
-//! Plain data comes out: no type of Kubernetes, no client of any service. Files are read through `leaderboard-evidence` only.
+//! ```text
+//!   api: spec, plan ──► of(), of_plan() ──► a member, such as carla
+//!                                             │  plain data
+//!        pod-spec ◄── Workload, Contents ─────┤
+//!        pod      ◄── Gathered, each round ───┤──► judge, one for all kinds
+//!        policy, table, page ◄── Words, Columns┘
+//! ```
+//!
+//! No member makes a type of Kubernetes, and none knows S3, EvalAI or a clock.
 #![cfg_attr(not(test), deny(clippy::indexing_slicing, clippy::arithmetic_side_effects))]
 
 pub mod carla;
 #[cfg(any(test, feature = "fixtures"))]
 pub mod fixtures;
+mod gathered;
 pub mod judge;
 pub mod workload;
+
+use std::sync::Arc;
+
+use leaderboard_api::{LeaderboardSpec, RunPlan};
+use leaderboard_contract::run::Run;
+use leaderboard_evidence::{Tree, TreeError};
+use leaderboard_protocol::files::Pair;
+
+pub use gathered::{Gathered, Object, Objects, Refused, Summary, Texts, WorkerSeen};
+pub use leaderboard_results::number_text;
+use workload::{Asked, Contents, Reserved, Workload};
+
+/// One kind of evaluation.
+pub trait Evaluation {
+    fn words(&self) -> &'static Words;
+
+    /// The numbers of a result, in EvalAI's order.
+    fn columns(&self) -> Vec<Column>;
+
+    /// Names that no host may use.
+    fn reserved(&self) -> Reserved;
+
+    /// The container that fills the volumes with what the host keeps private, before the workers start.
+    fn contents(&self, asked: &Asked<'_>) -> Contents;
+
+    /// The containers of one worker.
+    fn workload(&self, asked: &Asked<'_>, worker: Pair) -> Workload;
+
+    /// An error if the plan of a run contradicts itself.
+    fn check(&self, run: &Run) -> Result<(), Refused>;
+
+    /// What reads the results of a run from the `logs` volume.
+    fn results(&self, run: &Run, tree: Arc<Tree>) -> Result<Box<dyn Results>, Refused>;
+}
+
+/// The results of a run as its workers write them.
+pub trait Results: Send {
+    /// Reads everything once. Blocks: not for an asynchronous thread.
+    fn round(&mut self) -> Gathered;
+
+    /// Removes restored files that belong to another plan, so that no worker goes on with them.
+    fn remove_others(&self) -> Result<(), TreeError>;
+}
+
+/// A kind's own words, for the sentences that people read.
+#[derive(Clone, Copy, Debug, PartialEq, Eq)]
+pub struct Words {
+    /// Units of work, in the plural.
+    pub units: &'static str,
+    /// One unit of work.
+    pub unit: &'static str,
+    /// The container with the host's image.
+    pub host: &'static str,
+}
+
+/// The words where no kind is known yet.
+const PLAIN: Words = Words {
+    units: "units",
+    unit: "unit",
+    host: "host's container",
+};
+
+/// One number of a result, under both of its names.
+#[derive(Clone, Debug, PartialEq, Eq)]
+pub struct Column {
+    /// The label in EvalAI's result and on its leaderboard.
+    pub label: String,
+    /// The column of the submissions table.
+    pub name: String,
+}
+
+/// The kind of evaluation of a Leaderboard.
+pub fn of(spec: &LeaderboardSpec) -> Box<dyn Evaluation> {
+    Box::new(carla::Carla::new(spec.leaderboard_version))
+}
+
+/// The kind of evaluation of a plan.
+pub fn of_plan(plan: &RunPlan) -> Box<dyn Evaluation> {
+    Box::new(carla::Carla::new(plan.leaderboard_version))
+}
+
+/// The words of a plan's kind.
+pub fn words(plan: Option<&RunPlan>) -> &'static Words {
+    plan.map_or(&PLAIN, |plan| of_plan(plan).words())
+}
+
+/// Labels of all kinds, for a reader that does not know the kind.
+pub fn labels() -> impl Iterator<Item = &'static str> {
+    carla::labels()
+}

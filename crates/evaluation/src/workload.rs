@@ -1,4 +1,4 @@
-//! What a Pod runs, as plain data: a kind of evaluation says it, and the other modules here make Kubernetes' objects of it.
+//! What a Pod runs, as plain data: a kind of evaluation says it, and `pod-spec` makes Kubernetes' objects of it.
 
 use leaderboard_api::{Deadlines, LeaderboardSpec, RunPlan, Track};
 use leaderboard_protocol::graphics::Needs;
@@ -81,4 +81,18 @@ pub struct ContentsVolume {
     pub written: &'static str,
     /// Where the agents read it.
     pub read: &'static str,
+}
+
+/// Writes a word so that Kubernetes hands it on unchanged.
+pub fn literal(word: &str) -> String {
+    let mut out = String::with_capacity(word.len());
+    let mut characters = word.chars().peekable();
+    while let Some(character) = characters.next() {
+        out.push(character);
+        // Kubernetes reads `$$` as `$` and `$(` as the start of a name; any other `$` is a `$`.
+        if character == '$' && matches!(characters.peek(), Some('$' | '(')) {
+            out.push('$');
+        }
+    }
+    out
 }

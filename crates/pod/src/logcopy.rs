@@ -29,7 +29,7 @@ use leaderboard_base::shutdown;
 use leaderboard_base::tasks::{TaskFailed, Tasks};
 use leaderboard_contract::report::Logs;
 use leaderboard_contract::run::Stop;
-use leaderboard_evaluation::carla::gather::{Gatherer, Refused};
+use leaderboard_evaluation::{Refused, of_plan};
 use leaderboard_evidence::{Tree, TreeError};
 use leaderboard_protocol::files::StatusFile;
 use round::{News, Rounds, Why};
@@ -83,7 +83,7 @@ pub async fn work(
     shutdown: impl Future<Output = ()>,
 ) -> Result<(), LogcopyError> {
     let tree = Arc::new(Tree::open(&setting.places.logs)?);
-    let gatherer = Gatherer::new(&setting.run, Arc::clone(&tree))?;
+    let results = of_plan(&setting.run.plan).results(&setting.run, Arc::clone(&tree))?;
     let plan = &setting.run.plan;
     let quota = Quota::new(plan.storage.size_limit.bytes(), plan.workers());
     let uploader = Uploader::new(archive.clone(), Arc::clone(&tree), quota);
@@ -93,7 +93,7 @@ pub async fn work(
     let (told, logs) = watch::channel(None);
     let (shipped, shipping) = ship(&setting, aws, &tree, &uploader, (&tasks, told));
     let (stop, stop_watch) = watch_stop(setting.places.clone(), &tasks);
-    let rounds = Rounds::new(setting, archive, tree, gatherer, uploader, News { stop, logs });
+    let rounds = Rounds::new(setting, archive, tree, results, uploader, News { stop, logs });
     let result = tokio::select! {
         biased;
         failed = tasks.failed() => Err(failed.into()),

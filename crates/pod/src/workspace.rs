@@ -25,7 +25,7 @@ use leaderboard_aws::archive::{Archive, ArchiveError};
 use leaderboard_contract::report::{MAX_BYTES, OWNER_KEY, Owner, REPORT_KEY, Report};
 use leaderboard_contract::run::{Run, STATUS_FOLDER};
 use leaderboard_contract::verdict::{WorkspaceReason, WorkspaceVerdict};
-use leaderboard_evaluation::carla::gather::{Gatherer, Refused, check};
+use leaderboard_evaluation::{Refused, Results, of_plan};
 use leaderboard_evidence::{Tree, TreeError};
 
 /// Folders that no mount makes. The others are the kubelet's.
@@ -117,7 +117,7 @@ pub async fn main(setting: Setting) -> Result<(), WorkspaceError> {
 
 async fn measure_and_prepare(setting: &Setting) -> Result<Option<Finding>, WorkspaceError> {
     let plan = &setting.run.plan;
-    check(&setting.run)?;
+    of_plan(&setting.run.plan).check(&setting.run)?;
     let finding = measure(setting).await?;
     let aws = identity::aws(setting, "workspace").await;
     prepare(setting, &Archive::of_run(&aws, &plan.storage, &plan.run_id)).await?;
@@ -139,7 +139,7 @@ async fn measure(setting: &Setting) -> Result<Option<Finding>, WorkspaceError> {
 
 /// Does the work, again and again while S3 does not answer.
 pub async fn prepare(setting: &Setting, archive: &Archive) -> Result<(), WorkspaceError> {
-    check(&setting.run)?;
+    of_plan(&setting.run.plan).check(&setting.run)?;
     copy_runner(&setting.places)?;
     name_files::copy(&setting.places).map_err(|(path, error)| WorkspaceError::NameFile {
         path: path.display().to_string(),
@@ -166,12 +166,12 @@ pub async fn prepare(setting: &Setting, archive: &Archive) -> Result<(), Workspa
 /// Takes the prefix for this Pod.
 async fn take(setting: &Setting, archive: &Archive, tree: &Arc<Tree>) -> Result<(), WorkspaceError> {
     let run = &setting.run;
-    let mut gatherer = Gatherer::new(run, Arc::clone(tree))?;
+    let mut results = of_plan(&run.plan).results(run, Arc::clone(tree))?;
     let owner = Owner::new(setting.pod_uid.clone()).to_json();
     match claim(run, archive).await? {
         Claim::Fresh => {
             // Names the prefix's owner before anything else is in it, so that a Pod that is lost early can be replaced.
-            let report = first_report(run, &setting.pod_uid, &mut gatherer);
+            let report = first_report(run, &setting.pod_uid, &mut *results);
             let bytes = serde_json::to_vec(&report).unwrap_or_default();
             archive.put(REPORT_KEY, bytes).await?;
             archive.put(OWNER_KEY, owner).await?;
@@ -180,7 +180,7 @@ async fn take(setting: &Setting, archive: &Archive, tree: &Arc<Tree>) -> Result<
             // The fence first: what a Pod before this one still stores, it stores before it next reads the fence, and what is
             // restored is then the last of it.
             archive.put(OWNER_KEY, owner).await?;
-            let restored = restore::restore(gatherer, run, archive, tree).await?;
+            let restored = restore::restore(results, run, archive, tree).await?;
             tracing::info!(
                 files = restored.files,
                 bytes = restored.bytes,
@@ -230,10 +230,10 @@ async fn claim(run: &Run, archive: &Archive) -> Result<Claim, WorkspaceError> {
 }
 
 /// The report of a run in which nothing has happened, and nothing but it is stored.
-fn first_report(run: &Run, pod_uid: &str, gatherer: &mut Gatherer) -> Report {
+fn first_report(run: &Run, pod_uid: &str, results: &mut dyn Results) -> Report {
     Report {
         files: BTreeMap::new(),
-        ..describe(run, pod_uid, &gatherer.round(), None)
+        ..describe(run, pod_uid, &results.round(), None)
     }
 }
 
@@ -274,7 +274,8 @@ mod tests {
     fn first() -> Report {
         let (run, folder) = (fixtures::run(), tempfile::tempdir().unwrap());
         let tree = Arc::new(Tree::open(folder.path()).unwrap());
-        first_report(&run, "pod-1", &mut Gatherer::new(&run, tree).unwrap())
+        let mut results = of_plan(&run.plan).results(&run, tree).unwrap();
+        first_report(&run, "pod-1", &mut *results)
     }
 
     #[test]

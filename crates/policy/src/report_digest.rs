@@ -6,7 +6,7 @@ use leaderboard_api::text::one_line;
 use leaderboard_api::{Attempt, Metric, Progress, Score};
 use leaderboard_contract::report::{ContentId, Logs, Report, ReportError, ReportWorker};
 use leaderboard_contract::run::Stop;
-use leaderboard_evaluation::carla;
+use leaderboard_evaluation::labels;
 
 /// Largest text that is passed on to EvalAI, in bytes.
 pub const MAX_TEXT: u64 = 4 << 20;
@@ -110,7 +110,7 @@ impl ReportDigest {
 fn accuracies(results: &str) -> Option<Box<Map<String, Value>>> {
     let mut parsed: Value = serde_json::from_str(results).ok()?;
     let all = parsed.get_mut(0)?.get_mut("accuracies")?.as_object_mut()?;
-    let kept = carla::columns().filter_map(|name| all.remove_entry(name));
+    let kept = labels().filter_map(|name| all.remove_entry(name));
     Some(Box::new(kept.collect()))
 }
 

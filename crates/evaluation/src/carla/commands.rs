@@ -4,6 +4,7 @@
 //! agent's words when it starts that, and knows the round. A shell comes last.
 
 use crate::carla::layout::python_path;
+use crate::workload::literal;
 use leaderboard_api::LeaderboardVersion;
 
 const ADAPTER: &str = "-ini:[/Script/Engine.RendererSettings]:r.GraphicsAdapter=";
@@ -35,20 +36,6 @@ impl Adapter {
 pub fn of_host(command: Option<&[String]>, arguments: Option<&[String]>) -> Option<Vec<String>> {
     let words = command?.iter().chain(arguments.unwrap_or_default());
     Some(words.cloned().collect())
-}
-
-/// Writes a word so that Kubernetes hands it on unchanged.
-pub fn literal(word: &str) -> String {
-    let mut out = String::with_capacity(word.len());
-    let mut characters = word.chars().peekable();
-    while let Some(character) = characters.next() {
-        out.push(character);
-        // Kubernetes reads `$$` as `$` and `$(` as the start of a name; any other `$` is a `$`.
-        if character == '$' && matches!(characters.peek(), Some('$' | '(')) {
-            out.push('$');
-        }
-    }
-    out
 }
 
 /// Copies the private contents into their volumes, which `contents` has below /tmp.

@@ -4,33 +4,22 @@
 //! is torn, gone, refused or poorer leaves the last good one in place. What is to be stored is handed out from memory, so that no torn
 //! file and no full disk comes between the results and S3. [`Plan::limits_of`] bounds the memory of all pairs together.
 
-use std::collections::BTreeMap;
 use std::path::PathBuf;
 use std::sync::Arc;
 
-use bytes::Bytes;
-use sha2::{Digest, Sha256};
-
 use super::measures;
 use crate::carla::results_format;
-use leaderboard_api::{Metric, Verify, WorkerState};
-use leaderboard_contract::keys::{EVALAI, MERGED, checkpoint_path};
-use leaderboard_contract::report::{ReportWorker, StoredFile};
+use crate::{Gathered, Object, Objects, Refused, Results, Summary, Texts, WorkerSeen};
+use leaderboard_api::Verify;
+use leaderboard_contract::keys::{MERGED, checkpoint_path};
+use leaderboard_contract::report::ReportWorker;
 use leaderboard_contract::run::{Run, STATUS_FOLDER};
 use leaderboard_evidence::{Stamp, Tree, TreeError};
-use leaderboard_protocol::files::{KEPT_CHECKPOINT, Pair, Progress};
+use leaderboard_protocol::files::{KEPT_CHECKPOINT, Pair};
 use leaderboard_results::{Checkpoint, Files, Merged, Plan, Refusal, Slice, Strictness, read_worker};
 
 /// The merged file under EvalAI's name.
 const METADATA: &str = "evalai/metadata.json";
-
-/// Why a plan cannot be evaluated, and what to do.
-#[derive(thiserror::Error, Clone, Debug, PartialEq, Eq)]
-#[error("{problem}. {next_step}")]
-pub struct Refused {
-    pub problem: String,
-    pub next_step: String,
-}
 
 impl From<Refusal> for Refused {
     fn from(refusal: Refusal) -> Self {
@@ -82,39 +71,6 @@ fn kept_path(pair: Pair) -> String {
     format!("{STATUS_FOLDER}/{}/{KEPT_CHECKPOINT}", pair.agent())
 }
 
-/// One pair, as its status files show it.
-#[derive(Clone, Copy, Debug, PartialEq, Eq)]
-pub struct PairSeen {
-    /// From its agent's folder.
-    pub agent: Progress,
-    /// From its simulator's folder.
-    pub simulator: Progress,
-}
-
-impl PairSeen {
-    fn read(status: &std::path::Path, pair: Pair) -> Self {
-        Self {
-            agent: Progress::read(status, pair.agent()),
-            simulator: Progress::read(status, pair.host()),
-        }
-    }
-
-    /// `Waiting`, `Running`, `Done` or `Crashed`; the last means between a crash and the next start.
-    pub fn state(&self) -> WorkerState {
-        match self {
-            Self { agent, .. } if agent.done => WorkerState::Done,
-            Self { agent, simulator } if agent.started || simulator.started => WorkerState::Running,
-            _ if self.crashes() > 0 => WorkerState::Crashed,
-            _ => WorkerState::Waiting,
-        }
-    }
-
-    /// Of the side that had more.
-    pub fn crashes(&self) -> u32 {
-        self.agent.crashes.max(self.simulator.crashes)
-    }
-}
-
 /// What one worker has, over the rounds.
 #[derive(Debug, Default)]
 struct Worker {
@@ -138,30 +94,6 @@ enum ReadOutcome {
     Unusable,
 }
 
-/// Results by their keys below the run's prefix.
-pub type Objects = BTreeMap<String, Object>;
-
-/// The results so far in numbers.
-#[derive(Clone, Debug, Default, PartialEq)]
-pub struct Summary {
-    /// Units of work done.
-    pub done: u32,
-    /// Over the units done so far; over all of them once `is_complete`.
-    pub score: Option<Metric>,
-    /// Further numbers, over the same units.
-    pub metrics: Vec<Metric>,
-    /// No unit of the plan is missing.
-    pub is_complete: bool,
-    /// Every evaluator has come to its regular end.
-    pub has_ended: bool,
-    /// The results count.
-    pub eligible: bool,
-    /// How the run ended, in the words of its evaluators.
-    pub ended_as: String,
-    /// Scores that do not follow from what was recorded, one sentence each.
-    pub warnings: Vec<String>,
-}
-
 impl From<&Merged> for Summary {
     fn from(merged: &Merged) -> Self {
         Self {
@@ -174,63 +106,6 @@ impl From<&Merged> for Summary {
             ended_as: merged.ended_as().to_owned(),
             warnings: merged.warnings.clone(),
         }
-    }
-}
-
-/// What EvalAI gets as a result.
-#[derive(Clone, Debug, PartialEq, Eq)]
-pub struct Texts {
-    /// JSON of the metrics; zeros until the results are complete.
-    pub results: String,
-    /// The same with the metrics so far; `None` before the first unit, and once the results are complete.
-    pub partial_results: Option<String>,
-}
-
-/// What one round found.
-#[derive(Clone, Debug)]
-pub struct Gathered {
-    /// The last good merge; `None` before the first checkpoint.
-    pub merged: Option<Arc<Summary>>,
-    /// EvalAI's short texts, of the same merge.
-    pub texts: Arc<Texts>,
-    /// The last good checkpoints, the merged file and EvalAI's texts, as they are to be stored.
-    pub objects: Objects,
-    /// Each pair from its status files.
-    pub seen: Vec<PairSeen>,
-    /// Each pair for the report.
-    pub pairs: Vec<ReportWorker>,
-    /// Why each pair's checkpoint is refused, if it is.
-    pub refused: Vec<Option<String>>,
-    /// Each pair whose checkpoint this node can't read at present.
-    pub unreadable: Vec<bool>,
-    /// Why the checkpoints can't be merged, if they can't.
-    pub unmerged: Option<String>,
-}
-
-impl Gathered {
-    /// The first reason why something is refused; none once nothing is missing, since what came later changes nothing.
-    pub fn why(&self) -> Option<String> {
-        let first = self.refused.iter().flatten().next().or(self.unmerged.as_ref());
-        first.filter(|_| !self.is_complete()).cloned()
-    }
-
-    /// Whether nothing is missing: judged by the plan and the last good files, whatever the agents report.
-    pub fn is_complete(&self) -> bool {
-        self.unmerged.is_none() && self.merged.as_ref().is_some_and(|merged| merged.is_complete)
-    }
-
-    /// Whether every evaluator has come to its regular end. One whose simulator crashed in its last route has a record of each
-    /// and has not: it will repeat that route, as long as it is restarted.
-    pub fn has_ended(&self) -> bool {
-        self.merged.as_ref().is_some_and(|merged| merged.has_ended)
-    }
-
-    /// Digests of EvalAI's texts, by key.
-    pub fn digests(&self) -> BTreeMap<String, StoredFile> {
-        let texts = self.objects.iter().filter(|(key, _)| key.starts_with(EVALAI));
-        texts
-            .map(|(key, object)| (key.clone(), object.digest.clone()))
-            .collect()
     }
 }
 
@@ -265,27 +140,37 @@ pub struct Gatherer {
     unmerged: Option<String>,
 }
 
-impl Gatherer {
-    /// For a run whose plan holds.
-    pub fn new(run: &Run, tree: Arc<Tree>) -> Result<Self, Refused> {
-        let plan = results_plan(run)?;
-        let mut objects = Objects::new();
-        let texts = take_texts(&mut objects, leaderboard_results::render(&plan, None)?);
-        Ok(Self {
-            status: tree.path().join(STATUS_FOLDER),
-            workers: plan.pairs.iter().map(|_| Worker::default()).collect(),
-            plan,
-            tree,
-            merged: None,
-            texts,
-            objects,
-            unmerged: None,
-        })
+impl Results for Gatherer {
+    fn round(&mut self) -> Gathered {
+        // The status files are read before the results: an agent that is done has written everything.
+        let pairs = Pair::first(self.workers.len());
+        let seen: Vec<WorkerSeen> = pairs.clone().map(|pair| WorkerSeen::read(&self.status, pair)).collect();
+        let mut changed = false;
+        for pair in pairs {
+            changed |= match self.read(pair) {
+                ReadOutcome::New => true,
+                ReadOutcome::Same => false,
+                ReadOutcome::Unusable => self.read_kept(pair),
+            };
+        }
+        if changed {
+            self.merge();
+        }
+        let workers = self.reported(&seen);
+        Gathered {
+            merged: self.merged.clone(),
+            texts: Arc::clone(&self.texts),
+            objects: self.objects.clone(),
+            workers,
+            seen,
+            refused: self.workers.iter().map(|worker| worker.refused.clone()).collect(),
+            unreadable: self.workers.iter().map(|worker| worker.unreadable.is_some()).collect(),
+            unmerged: self.unmerged.clone(),
+        }
     }
 
-    /// Removes the checkpoints of other routes, as those of before the plan was changed. None of their routes counts here, and one that is
-    /// complete would be taken for a pair with nothing left to drive.
-    pub fn remove_others(&self) -> Result<(), TreeError> {
+    /// None of the routes of another plan counts here, and a checkpoint that is complete would be taken for a pair with nothing left to drive.
+    fn remove_others(&self) -> Result<(), TreeError> {
         for pair in Pair::first(self.workers.len()) {
             let (path, index) = (checkpoint_path(pair), pair.index());
             let found = match self.tree.read(&path, self.plan.limits_of(index).bytes as u64) {
@@ -303,34 +188,24 @@ impl Gatherer {
         }
         Ok(())
     }
+}
 
-    /// Reads everything once. Blocks: not for an asynchronous thread.
-    pub fn round(&mut self) -> Gathered {
-        // The status files are read before the results: an agent that is done has written everything.
-        let pairs = Pair::first(self.workers.len());
-        let seen: Vec<PairSeen> = pairs.clone().map(|pair| PairSeen::read(&self.status, pair)).collect();
-        let mut changed = false;
-        for pair in pairs {
-            changed |= match self.read(pair) {
-                ReadOutcome::New => true,
-                ReadOutcome::Same => false,
-                ReadOutcome::Unusable => self.read_kept(pair),
-            };
-        }
-        if changed {
-            self.merge();
-        }
-        let pairs = self.pairs(&seen);
-        Gathered {
-            merged: self.merged.clone(),
-            texts: Arc::clone(&self.texts),
-            objects: self.objects.clone(),
-            pairs,
-            seen,
-            refused: self.workers.iter().map(|worker| worker.refused.clone()).collect(),
-            unreadable: self.workers.iter().map(|worker| worker.unreadable.is_some()).collect(),
-            unmerged: self.unmerged.clone(),
-        }
+impl Gatherer {
+    /// For a run whose plan holds.
+    pub fn new(run: &Run, tree: Arc<Tree>) -> Result<Self, Refused> {
+        let plan = results_plan(run)?;
+        let mut objects = Objects::new();
+        let texts = take_texts(&mut objects, leaderboard_results::render(&plan, None)?);
+        Ok(Self {
+            status: tree.path().join(STATUS_FOLDER),
+            workers: plan.pairs.iter().map(|_| Worker::default()).collect(),
+            plan,
+            tree,
+            merged: None,
+            texts,
+            objects,
+            unmerged: None,
+        })
     }
 
     /// Reads one worker's checkpoint, if it is not the one of the last round.
@@ -433,7 +308,7 @@ impl Gatherer {
         }
     }
 
-    fn pairs(&self, seen: &[PairSeen]) -> Vec<ReportWorker> {
+    fn reported(&self, seen: &[WorkerSeen]) -> Vec<ReportWorker> {
         let slices = self.plan.pairs.iter().zip(&self.workers).zip(seen);
         (1..)
             .zip(slices)
@@ -492,25 +367,4 @@ impl Worker {
 /// Which checkpoint, why, and what to do.
 fn reason(refusal: &Refusal) -> String {
     format!("{refusal}. {}", refusal.next_step())
-}
-
-/// A result that is stored from memory. Its content is shared, never copied.
-#[derive(Clone, Debug, PartialEq, Eq)]
-pub struct Object {
-    /// Its content.
-    pub bytes: Bytes,
-    /// Size and digest of it.
-    pub digest: StoredFile,
-}
-
-impl Object {
-    /// With its digest.
-    pub fn new(bytes: impl Into<Bytes>) -> Self {
-        let bytes = bytes.into();
-        let digest = StoredFile {
-            size: bytes.len() as u64,
-            sha256: hex::encode(Sha256::digest(&bytes)),
-        };
-        Self { bytes, digest }
-    }
 }

@@ -1,14 +1,75 @@
-//! What the operator knows of the CARLA Leaderboard inside a Pod.
+//! CARLA: pairs of a simulator and an agent share out the routes, and each agent's evaluator writes a checkpoint.
 
 pub mod commands;
 mod display;
 pub mod gather;
 pub mod layout;
-pub mod measures;
-pub mod workload;
+mod measures;
+mod workload;
+
+use std::sync::Arc;
 
 use leaderboard_api::LeaderboardVersion;
+use leaderboard_contract::run::Run;
+use leaderboard_evidence::Tree;
+use leaderboard_protocol::files::Pair;
 use leaderboard_results::{Format, metrics};
+
+use crate::workload::{Asked, Contents, Reserved, Workload};
+use crate::{Column, Evaluation, Refused, Results, Words};
+use gather::Gatherer;
+
+const WORDS: Words = Words {
+    units: measures::UNIT,
+    unit: "route",
+    host: "simulator",
+};
+
+/// The CARLA Leaderboard, by its version.
+#[derive(Clone, Copy, Debug)]
+pub struct Carla(LeaderboardVersion);
+
+impl Carla {
+    pub fn new(version: LeaderboardVersion) -> Self {
+        Self(version)
+    }
+}
+
+impl Evaluation for Carla {
+    fn words(&self) -> &'static Words {
+        &WORDS
+    }
+
+    fn columns(&self) -> Vec<Column> {
+        let of_format = metrics(results_format(self.0)).iter();
+        of_format
+            .map(|metric| Column {
+                label: metric.name.to_owned(),
+                name: metric.column.to_owned(),
+            })
+            .collect()
+    }
+
+    fn reserved(&self) -> Reserved {
+        workload::RESERVED
+    }
+
+    fn contents(&self, asked: &Asked<'_>) -> Contents {
+        workload::contents(asked)
+    }
+
+    fn workload(&self, asked: &Asked<'_>, worker: Pair) -> Workload {
+        workload::workload(asked, worker)
+    }
+
+    fn check(&self, run: &Run) -> Result<(), Refused> {
+        gather::check(run)
+    }
+
+    fn results(&self, run: &Run, tree: Arc<Tree>) -> Result<Box<dyn Results>, Refused> {
+        Ok(Box::new(Gatherer::new(run, tree)?))
+    }
+}
 
 /// The format of the results of a version.
 pub fn results_format(version: LeaderboardVersion) -> Format {
@@ -18,10 +79,8 @@ pub fn results_format(version: LeaderboardVersion) -> Format {
     }
 }
 
-/// The names of the metrics that a table has columns for, of either version.
-pub fn columns() -> impl Iterator<Item = &'static str> {
-    [Format::V1, Format::V2]
-        .into_iter()
-        .flat_map(metrics)
-        .map(|metric| metric.name)
+/// Labels of both versions.
+pub(crate) fn labels() -> impl Iterator<Item = &'static str> {
+    let of_all = [Format::V1, Format::V2].into_iter().flat_map(metrics);
+    of_all.map(|metric| metric.name)
 }

@@ -5,7 +5,7 @@
 use super::commands::{self, Adapter};
 use super::display;
 use super::layout::{CARLA_ROOT, LEADERBOARD_ROOT, SCENARIO_RUNNER_ROOT, python_path};
-use crate::workload::{Asked, Contents, ContentsVolume, Mount, Reserved, Role, Workload};
+use crate::workload::{Asked, Contents, ContentsVolume, Mount, Reserved, Role, Workload, literal};
 use leaderboard_api::{LeaderboardVersion, SimulatorContainer};
 use leaderboard_contract::keys::agent_folder;
 use leaderboard_contract::run::console_name;
@@ -55,7 +55,7 @@ const FIXED_ENV: [&str; 12] = [
     "LEADERBOARD_ROOT",
 ];
 
-pub const RESERVED: Reserved = Reserved {
+pub(super) const RESERVED: Reserved = Reserved {
     env: &FIXED_ENV,
     volumes: &CONTENTS_VOLUMES,
     folders: &[AGENT, SAVED],
@@ -67,7 +67,7 @@ fn port(pair: Pair) -> usize {
 }
 
 /// The container with the private contents.
-pub fn contents(asked: &Asked<'_>) -> Contents {
+pub(super) fn contents(asked: &Asked<'_>) -> Contents {
     let spec = &asked.spec.contents;
     let host = commands::of_host(spec.command.as_deref(), spec.args.as_deref());
     Contents {
@@ -77,7 +77,7 @@ pub fn contents(asked: &Asked<'_>) -> Contents {
 }
 
 /// The simulator and the agent of a pair.
-pub fn workload(asked: &Asked<'_>, pair: Pair) -> Workload {
+pub(super) fn workload(asked: &Asked<'_>, pair: Pair) -> Workload {
     Workload {
         host: simulator(asked, pair),
         agent: Some(agent(asked, pair)),
@@ -150,7 +150,7 @@ fn agent(asked: &Asked<'_>, pair: Pair) -> Role {
         image: asked.plan.image.clone(),
         flags,
         // The runner expands these words, so that RESUME is what it is in this round.
-        command: words.iter().map(|word| commands::literal(word)).collect(),
+        command: words.iter().map(|word| literal(word)).collect(),
         env: agent_env(asked, pair),
         mounts: CONTENTS_VOLUMES.map(Mount::Contents).into_iter().chain([own]).collect(),
         removes: &[],

@@ -7,6 +7,7 @@ use nix::errno::Errno;
 
 use super::tests::seen_on_a_volume::{Volume, text};
 use super::*;
+use crate::Results;
 use crate::carla::gather::Gatherer;
 use crate::fixtures::{checkpoint, put_checkpoint, put_status, run};
 use leaderboard_api::RouteSlice;
@@ -138,7 +139,7 @@ fn a_later_checkpoint_with_fewer_routes_does_not_replace_the_one_before() {
     for done in [0, 1] {
         put_checkpoint(volume.folder.path(), 1, &checkpoint(0, done, 2));
         let (gathered, _) = volume.round();
-        assert_eq!((gathered.pairs[0].done, gathered.why()), (2, None));
+        assert_eq!((gathered.workers[0].done, gathered.why()), (2, None));
         assert_eq!(text(&gathered, "agent/agent1/agent_results.json"), checkpoint(0, 2, 2));
     }
     // As many as before are the evaluator's newest word, whole.
@@ -166,7 +167,7 @@ fn a_checkpoint_that_the_node_cannot_read_is_tried_again_and_spoils_nothing() {
         for _ in 0..2 {
             let (gathered, seen) = volume.round();
             assert_eq!((gathered.why(), seen.spoiled), (None, None), "{trouble}");
-            assert_eq!(gathered.pairs[1].done, 1);
+            assert_eq!(gathered.workers[1].done, 1);
         }
         *tree.disk.lock().unwrap() = None;
         assert!(volume.round().0.is_complete(), "{trouble}");

@@ -126,6 +126,7 @@ pub(super) mod seen_on_a_volume {
     use leaderboard_protocol::files::{Mark, Pair, Side};
 
     use super::super::*;
+    use crate::Results;
     use crate::carla::gather::{Gatherer, results_plan};
     use crate::fixtures::{checkpoint, put_checkpoint, put_status, run};
     use leaderboard_api::{RouteSlice, WorkerState};
@@ -181,11 +182,11 @@ pub(super) mod seen_on_a_volume {
         put_checkpoint(volume.folder.path(), 1, &checkpoint(0, 1, 2));
         let (gathered, seen) = volume.round();
         assert_eq!(
-            (gathered.pairs[0].done, gathered.pairs[0].state),
+            (gathered.workers[0].done, gathered.workers[0].state),
             (1, WorkerState::Running)
         );
         assert_eq!(
-            (gathered.pairs[1].done, gathered.pairs[1].state),
+            (gathered.workers[1].done, gathered.workers[1].state),
             (0, WorkerState::Waiting)
         );
         assert!(seen.any_started && seen.complete.is_none());
@@ -212,10 +213,10 @@ pub(super) mod seen_on_a_volume {
         for text in ["", "{\"_checkpoint\": {", "null"] {
             put_checkpoint(volume.folder.path(), 1, text);
             let (gathered, _) = volume.round();
-            assert_eq!((gathered.pairs[0].done, gathered.why()), (1, None), "{text:?}");
+            assert_eq!((gathered.workers[0].done, gathered.why()), (1, None), "{text:?}");
         }
         fs::remove_file(volume.folder.path().join("agent/agent1/agent_results.json")).unwrap();
-        assert_eq!(volume.round().0.pairs[0].done, 1);
+        assert_eq!(volume.round().0.workers[0].done, 1);
     }
 
     #[test]
@@ -246,16 +247,16 @@ pub(super) mod seen_on_a_volume {
         fs::write(kept.join("checkpoint.json"), checkpoint(0, 1, 2)).unwrap();
         put_checkpoint(volume.folder.path(), 1, "{\"_checkpoint\"");
         let (gathered, _) = volume.round();
-        assert_eq!(gathered.pairs[0].done, 1);
+        assert_eq!(gathered.workers[0].done, 1);
         assert!(gathered.objects.contains_key("agent/agent1/agent_results.json"));
         // The copy is never a step back.
         put_checkpoint(volume.folder.path(), 1, &checkpoint(0, 2, 2));
-        assert_eq!(volume.round().0.pairs[0].done, 2);
+        assert_eq!(volume.round().0.workers[0].done, 2);
         put_checkpoint(volume.folder.path(), 1, "");
         fs::write(kept.join("checkpoint.json"), checkpoint(0, 1, 2) + " ").unwrap();
-        assert_eq!(volume.round().0.pairs[0].done, 2);
+        assert_eq!(volume.round().0.workers[0].done, 2);
         put_checkpoint(volume.folder.path(), 1, &checkpoint(0, 2, 2));
-        assert_eq!(volume.round().0.pairs[0].done, 2);
+        assert_eq!(volume.round().0.workers[0].done, 2);
     }
 
     #[test]
@@ -308,7 +309,7 @@ pub(super) mod seen_on_a_volume {
         );
         put_checkpoint(volume.folder.path(), 2, &named);
         let (gathered, _) = volume.round();
-        let found: Vec<bool> = gathered.pairs.iter().map(|pair| pair.names_crash).collect();
+        let found: Vec<bool> = gathered.workers.iter().map(|pair| pair.names_crash).collect();
         assert_eq!(found, [false, true]);
     }
 
@@ -350,7 +351,7 @@ pub(super) mod seen_on_a_volume {
         let (gathered, _) = volume.round();
         let why = gathered.why().unwrap();
         assert!(why.contains(&format!("more than the {limit} that are read")), "{why}");
-        assert_eq!(gathered.pairs[0].done, 1);
+        assert_eq!(gathered.workers[0].done, 1);
         assert_eq!(
             gathered.objects["agent/agent1/agent_results.json"].bytes,
             checkpoint(0, 1, 2)
@@ -384,7 +385,7 @@ pub(super) mod seen_on_a_volume {
             why.starts_with("pair 2, route RouteScenario_2_rep0: ") && why.contains("1000"),
             "{why}"
         );
-        assert_eq!((gathered.pairs[1].done, seen.spoiled), (1, None));
+        assert_eq!((gathered.workers[1].done, seen.spoiled), (1, None));
         put_status(volume.folder.path(), Side::Agent, 2, Mark::Done);
         let (_, seen) = volume.round();
         assert_eq!(seen.spoiled, Some((why.clone(), Duration::ZERO)));
@@ -430,7 +431,7 @@ pub(super) mod seen_on_a_volume {
         ] {
             put_status(&folder, side, 1, mark);
         }
-        let pair = volume.round().0.pairs[0].clone();
+        let pair = volume.round().0.workers[0].clone();
         assert_eq!((pair.crashes, pair.state), (2, WorkerState::Crashed));
     }
 

@@ -13,7 +13,7 @@ use serde_json::{Value, json};
 
 use super::tests::{Case, container};
 use leaderboard_api::Attempt;
-use leaderboard_evaluation::carla::commands;
+use leaderboard_evaluation::workload::literal;
 use leaderboard_runner::{args, expand, graphics};
 
 /// A word as the kubelet hands it on (k8s.io/kubernetes/third_party/forked/golang/expansion).
@@ -462,7 +462,7 @@ fn every_word_gets_past_kubernetes_unchanged() {
     }
     assert!(words.len() > 16_000);
     for word in words {
-        let written = commands::literal(&word);
+        let written = literal(&word);
         assert_eq!(
             kubernetes_expand(&written, &|_| Some("expanded".into())),
             word,

@@ -3,14 +3,14 @@
 use leaderboard_protocol::files::Pair;
 use serde_json::{Value, json};
 
-use super::{carla, gpu, pairs};
+use super::{gpu, pairs};
 use crate::gpu_claims::source;
 use crate::overlay as pod_overlay;
 use leaderboard_api::{GpuSource, LeaderboardSpec, RunPlan, Track};
 
 /// GPUs that the Pod of a plan requests or claims; shares of GPUs and MIG slices count as one each.
 pub fn gpus(spec: &LeaderboardSpec, track: Option<&Track>, plan: &RunPlan) -> i64 {
-    let source = source(spec);
+    let (source, kind) = (source(spec), leaderboard_evaluation::of_plan(plan));
     let of_worker = |worker: Pair| {
         [worker.host(), worker.agent()].map(|member| {
             let hosts = spec.given(track, pairs::part(member.side)).resources;
@@ -21,7 +21,7 @@ pub fn gpus(spec: &LeaderboardSpec, track: Option<&Track>, plan: &RunPlan) -> i6
     let containers: Vec<Value> = Pair::first(plan.workers()).flat_map(of_worker).collect();
     let mut template = json!({"spec": {"containers": containers}});
     let overlay = spec.pod_overrides.as_ref();
-    if let Some(overlay) = overlay.filter(|pod| pod_overlay::validate_overlay(pod, &carla::RESERVED).is_ok()) {
+    if let Some(overlay) = overlay.filter(|pod| pod_overlay::validate_overlay(pod, &kind.reserved()).is_ok()) {
         pod_overlay::apply(&mut template, overlay);
     }
     let containers = template.pointer("/spec/containers").and_then(Value::as_array);

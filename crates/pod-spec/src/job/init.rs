@@ -7,7 +7,7 @@ use k8s_openapi::api::core::v1::{
 };
 
 use super::security::{confined, context, resources};
-use super::{JobInput, carla, is_resumed, own_uid, run_document, variable, volumes};
+use super::{JobInput, is_resumed, own_uid, run_document, variable, volumes};
 use crate::layout::CONTENTS_LOG_FOLDER;
 use leaderboard_api::{Part, names};
 use leaderboard_contract::keys::CONTENTS_LOG;
@@ -19,7 +19,7 @@ const CONTENTS_LOG_LIMIT: u64 = 16 << 20;
 /// Copies the private contents into their volumes.
 pub(super) fn contents(input: &JobInput<'_>) -> Container {
     let (contents, hosts) = (
-        carla::contents(&input.asked()),
+        input.kind().contents(&input.asked()),
         input.spec().given(None, Part::Contents),
     );
     Container {
@@ -29,7 +29,7 @@ pub(super) fn contents(input: &JobInput<'_>) -> Container {
         env: Some(contents_env(input, hosts.env)),
         resources: hosts.resources,
         security_context: Some(context(hosts.security)),
-        volume_mounts: Some(volumes::of_contents()),
+        volume_mounts: Some(volumes::of_contents(input)),
         ..Container::default()
     }
 }

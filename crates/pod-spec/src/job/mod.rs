@@ -45,8 +45,8 @@ use leaderboard_api::{
     RunPlan, Submission, Track, conditions, effective, names, reasons,
 };
 use leaderboard_contract::run::{Isolation, Run, SCHEMA};
-use leaderboard_evaluation::carla::workload as carla;
-use leaderboard_evaluation::workload::Asked;
+use leaderboard_evaluation::Evaluation;
+use leaderboard_evaluation::workload::{Asked, literal};
 
 /// Seconds the containers have between SIGTERM and SIGKILL: the agents' 20 s, then logcopy's last upload.
 const GRACE_SECONDS: i64 = 600;
@@ -97,6 +97,10 @@ impl JobInput<'_> {
         effective::deadlines(self.spec(), self.track())
     }
 
+    fn kind(&self) -> Box<dyn Evaluation> {
+        leaderboard_evaluation::of_plan(self.plan)
+    }
+
     fn asked(&self) -> Asked<'_> {
         Asked {
             spec: self.spec(),
@@ -131,7 +135,7 @@ pub fn build_object(input: &JobInput<'_>) -> DynamicObject {
     let mut spec = serde_json::to_value(ours(input)).unwrap_or_default();
     let template = &mut spec["template"];
     let overlay = input.spec().pod_overrides.as_ref();
-    if let Some(overlay) = overlay.filter(|pod| pod_overlay::validate_overlay(pod, &carla::RESERVED).is_ok()) {
+    if let Some(overlay) = overlay.filter(|pod| pod_overlay::validate_overlay(pod, &input.kind().reserved()).is_ok()) {
         pod_overlay::apply(template, overlay);
     }
     settle(template, input);
@@ -357,7 +361,7 @@ fn skip_strangers(template: &mut Value) {
 fn variable(name: &str, value: &str) -> EnvVar {
     EnvVar {
         name: name.into(),
-        value: Some(leaderboard_evaluation::carla::commands::literal(value)),
+        value: Some(literal(value)),
         value_from: None,
     }
 }

@@ -4,7 +4,7 @@ use k8s_openapi::api::core::v1::{Container, EnvVar};
 use serde_json::Value;
 
 use super::security::context;
-use super::{JobInput, carla, gpu, variable, volumes};
+use super::{JobInput, gpu, variable, volumes};
 use crate::gpu_claims::source;
 use crate::layout::STATUS;
 use leaderboard_api::Part;
@@ -13,7 +13,7 @@ use leaderboard_evaluation::workload::{Role, Workload};
 use leaderboard_protocol::files::{Member, Pair, Side};
 
 pub(super) fn workload(input: &JobInput<'_>, pair: Pair) -> Workload {
-    carla::workload(&input.asked(), pair)
+    input.kind().workload(&input.asked(), pair)
 }
 
 fn role(input: &JobInput<'_>, member: Member) -> Option<Role> {
@@ -44,7 +44,7 @@ fn container(input: &JobInput<'_>, member: Member, role: Role) -> Container {
         // Kubernetes asks for `latest` anew before each container: a worker, or a restart, could get another image.
         image_pull_policy: (member.side == Side::Agent).then(|| "IfNotPresent".into()),
         command: Some(behind_runner(member, flags, role.command)),
-        env: Some(merged(env, hosts.env)),
+        env: Some(merged(env, hosts.env, input.kind().reserved().env)),
         resources: gpu::resources(gpus, member, hosts.resources),
         security_context: Some(context(hosts.security)),
         volume_mounts: Some(volumes::of_member(input, member, &role.mounts)),
@@ -76,10 +76,10 @@ fn behind_runner(member: Member, flags: impl IntoIterator<Item = String>, words:
 }
 
 /// The host's variables take the place of ours of the same name, but for those that follow from the plan.
-fn merged(mut ours: Vec<EnvVar>, hosts: &[EnvVar]) -> Vec<EnvVar> {
+fn merged(mut ours: Vec<EnvVar>, hosts: &[EnvVar], reserved: &[&str]) -> Vec<EnvVar> {
     for variable in hosts
         .iter()
-        .filter(|variable| !carla::RESERVED.env.contains(&variable.name.as_str()))
+        .filter(|variable| !reserved.contains(&variable.name.as_str()))
     {
         match ours.iter_mut().find(|known| known.name == variable.name) {
             Some(known) => known.clone_from(variable),

@@ -6,7 +6,7 @@ use k8s_openapi::api::core::v1::{
 };
 use k8s_openapi::apimachinery::pkg::api::resource::Quantity;
 
-use super::{JobInput, carla, pairs};
+use super::{JobInput, pairs};
 use crate::layout::{
     CONTENTS_LOG_FOLDER, IDENTITY_VOLUME, LOGS_VOLUME, PODINFO_VOLUME, SHM, SHM_VOLUME, STATUS, TOOLS_VOLUME,
 };
@@ -25,7 +25,12 @@ const LOGS_MARGIN: u64 = 1 << 30;
 
 /// Every volume of the Pod.
 pub(super) fn all(input: &JobInput<'_>) -> Vec<Volume> {
-    let contents = carla::RESERVED.volumes.iter().map(|volume| empty(volume.name, None));
+    let contents = input
+        .kind()
+        .reserved()
+        .volumes
+        .iter()
+        .map(|volume| empty(volume.name, None));
     let own = [
         empty(LOGS_VOLUME, Some(Quantity(logs_limit(input).to_string()))),
         empty(TOOLS_VOLUME, Some(Quantity("64Mi".into()))),
@@ -137,8 +142,10 @@ fn identity() -> Volume {
 }
 
 /// Where `contents` writes, and the runner that keeps what it prints.
-pub(super) fn of_contents() -> Vec<VolumeMount> {
-    let written = carla::RESERVED
+pub(super) fn of_contents(input: &JobInput<'_>) -> Vec<VolumeMount> {
+    let written = input
+        .kind()
+        .reserved()
         .volumes
         .iter()
         .map(|volume| mount(volume.name, volume.written));

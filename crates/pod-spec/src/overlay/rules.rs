@@ -9,7 +9,6 @@ use super::without_nulls;
 use crate::layout::{ANNOTATION_SKIP_CONTAINERS, OWN_VOLUMES, protected_mounts};
 use leaderboard_api::{LeaderboardSpec, Part, names};
 use leaderboard_contract::run::{ENV_POD_UID, ENV_ROLE_ARN, ENV_RUN};
-use leaderboard_evaluation::carla::workload::RESERVED;
 use leaderboard_evaluation::workload::Reserved;
 
 /// Why a Leaderboard's `podOverrides` cannot be used. `path` is below `spec` of the Leaderboard.
@@ -105,7 +104,7 @@ const OWN_ENV: [&str; 6] = [
 
 /// Checks all of a Leaderboard that goes into its Pods: `podOverrides`, and the variables of its containers.
 pub fn validate(spec: &LeaderboardSpec) -> Checked {
-    let reserved = &RESERVED;
+    let reserved = &leaderboard_evaluation::of(spec).reserved();
     for part in [Part::Host, Part::Agent] {
         let hosts = spec.given(None, part);
         let names = hosts.env.iter().map(|variable| variable.name.as_str());

@@ -5,9 +5,9 @@ use std::collections::BTreeMap;
 use leaderboard_api::text::one_line;
 use leaderboard_contract::report::{LONGEST_TEXT, MAX_BYTES, Report, SCHEMA};
 use leaderboard_contract::run::Run;
-use leaderboard_evaluation::carla::gather::Gathered;
-use leaderboard_evaluation::carla::measures::UNIT;
+use leaderboard_evaluation::Gathered;
 use leaderboard_evaluation::judge::Ending;
+use leaderboard_evaluation::words;
 
 /// Warnings of the results' check that are reported.
 const WARNINGS: usize = 50;
@@ -25,7 +25,7 @@ pub fn describe(run: &Run, pod_uid: &str, gathered: &Gathered, ending: Option<&E
     };
     let counts = invalid.is_none() && gathered.is_complete();
     let total = gathered
-        .pairs
+        .workers
         .iter()
         .map(|pair| pair.total)
         .fold(0, u32::saturating_add);
@@ -38,8 +38,8 @@ pub fn describe(run: &Run, pod_uid: &str, gathered: &Gathered, ending: Option<&E
         round: 0,
         done: merged.map_or(0, |merged| merged.done).min(total),
         total,
-        unit: UNIT.to_owned(),
-        workers: gathered.pairs.clone(),
+        unit: words(Some(&run.plan)).units.to_owned(),
+        workers: gathered.workers.clone(),
         score: merged.and_then(|merged| merged.score.clone()),
         metrics: merged.map(|merged| merged.metrics.clone()).unwrap_or_default(),
         is_final: ending.is_some(),

@@ -24,8 +24,8 @@ use leaderboard_base::lock::lock;
 use leaderboard_contract::keys::agent_folder;
 use leaderboard_contract::report::{Logs, OWNER_KEY, Owner, REPORT_KEY, Report};
 use leaderboard_contract::run::{STATUS_FOLDER, Stop};
-use leaderboard_evaluation::carla::gather::{Gathered, Gatherer, Object};
 use leaderboard_evaluation::judge::{Ending, Judge, Outside, Step, decide};
+use leaderboard_evaluation::{Gathered, Object, Results};
 use leaderboard_evidence::Tree;
 use leaderboard_protocol::files as protocol;
 use leaderboard_protocol::files::{Mark, Pair, StatusFile};
@@ -71,7 +71,7 @@ pub(super) struct Rounds {
     setting: Setting,
     archive: Archive,
     tree: Arc<Tree>,
-    gatherer: Arc<Mutex<Gatherer>>,
+    results: Arc<Mutex<Box<dyn Results>>>,
     uploader: Uploader,
     stop: watch::Receiver<Option<Stop>>,
     logs: watch::Receiver<Option<Logs>>,
@@ -98,7 +98,7 @@ impl Rounds {
         setting: Setting,
         archive: Archive,
         tree: Arc<Tree>,
-        gatherer: Gatherer,
+        results: Box<dyn Results>,
         uploader: Uploader,
         News { stop, logs }: News,
     ) -> Self {
@@ -108,7 +108,7 @@ impl Rounds {
             setting,
             archive,
             tree,
-            gatherer: Arc::new(Mutex::new(gatherer)),
+            results: Arc::new(Mutex::new(results)),
             uploader,
             stop,
             logs,
@@ -232,7 +232,7 @@ impl Rounds {
 
     /// Reads the volume, on a thread that may block.
     async fn read(&self) -> Result<Found, LogcopyError> {
-        let (tree, reader) = (Arc::clone(&self.tree), Arc::clone(&self.gatherer));
+        let (tree, reader) = (Arc::clone(&self.tree), Arc::clone(&self.results));
         let status = self.setting.places.status();
         let pairs = self.pairs();
         let read = move || {

@@ -11,7 +11,7 @@ use super::{Decision, Stored, fingerprint};
 use crate::blocking;
 use crate::upload::wanted::Wanted;
 use leaderboard_aws::archive::{Archive, ArchiveError, Cause, Kept, MIN_PART, PART, read_range};
-use leaderboard_evaluation::carla::gather::Object;
+use leaderboard_evaluation::Object;
 use leaderboard_evidence::{Stamp, Tree, TreeError};
 
 /// What is left to abort an upload that was cut.

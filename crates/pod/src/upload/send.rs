@@ -18,7 +18,7 @@ use super::{Decision, Memory, Stored, decide_upload};
 use crate::blocking;
 use crate::daily::{Spent, today};
 use leaderboard_aws::archive::{Archive, ArchiveError, Cause};
-use leaderboard_evaluation::carla::gather::Object;
+use leaderboard_evaluation::Object;
 use leaderboard_evidence::{Stamp, Tree, TreeError};
 
 /// Files in the air at once.

@@ -21,7 +21,7 @@ use leaderboard_aws::archive::{Archive, Listed};
 use leaderboard_contract::keys::{EVALAI, MERGED, REFUSED, checkpoint_path};
 use leaderboard_contract::report::{OWNER_KEY, REPORT_KEY};
 use leaderboard_contract::run::{Run, STATUS_FOLDER};
-use leaderboard_evaluation::carla::gather::Gatherer;
+use leaderboard_evaluation::Results;
 use leaderboard_evidence::{Stamp, Tree, TreeError, is_plain};
 use leaderboard_protocol::files::Pair;
 
@@ -43,7 +43,7 @@ pub struct Restored {
 
 /// Downloads what the run goes on with, and removes the stored status files.
 pub async fn restore(
-    gatherer: Gatherer,
+    results: Box<dyn Results>,
     run: &Run,
     archive: &Archive,
     tree: &Arc<Tree>,
@@ -73,7 +73,7 @@ pub async fn restore(
         download(archive, tree, object, &path).await?;
     }
     let stored = download_all(archive, tree, chosen.objects).await?;
-    let removed = blocking(move || gatherer.remove_others()).await;
+    let removed = blocking(move || results.remove_others()).await;
     removed
         .map_err(TreeError::from)
         .flatten()

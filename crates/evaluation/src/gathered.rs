@@ -1,0 +1,155 @@
+//! What a round finds in the results of a run. Plain data, whatever kind of evaluation it is of.
+
+use std::collections::BTreeMap;
+use std::path::Path;
+use std::sync::Arc;
+
+use bytes::Bytes;
+use leaderboard_api::{Metric, WorkerState};
+use leaderboard_contract::keys::EVALAI;
+use leaderboard_contract::report::{ReportWorker, StoredFile};
+use leaderboard_protocol::files::{Pair, Progress};
+use sha2::{Digest, Sha256};
+
+/// Why a plan cannot be evaluated, and what to do.
+#[derive(thiserror::Error, Clone, Debug, PartialEq, Eq)]
+#[error("{problem}. {next_step}")]
+pub struct Refused {
+    pub problem: String,
+    pub next_step: String,
+}
+
+/// One worker, as its status files show it.
+#[derive(Clone, Copy, Debug, PartialEq, Eq)]
+pub struct WorkerSeen {
+    /// From its agent's folder.
+    pub agent: Progress,
+    /// From its host's folder.
+    pub host: Progress,
+}
+
+impl WorkerSeen {
+    pub(crate) fn read(status: &Path, pair: Pair) -> Self {
+        Self {
+            agent: Progress::read(status, pair.agent()),
+            host: Progress::read(status, pair.host()),
+        }
+    }
+
+    /// `Waiting`, `Running`, `Done` or `Crashed`; the last means between a crash and the next start.
+    pub fn state(&self) -> WorkerState {
+        match self {
+            Self { agent, .. } if agent.done => WorkerState::Done,
+            Self { agent, host } if agent.started || host.started => WorkerState::Running,
+            _ if self.crashes() > 0 => WorkerState::Crashed,
+            _ => WorkerState::Waiting,
+        }
+    }
+
+    /// Of the side that had more.
+    pub fn crashes(&self) -> u32 {
+        self.agent.crashes.max(self.host.crashes)
+    }
+}
+
+/// A result that is stored from memory. Its content is shared, never copied.
+#[derive(Clone, Debug, PartialEq, Eq)]
+pub struct Object {
+    /// Its content.
+    pub bytes: Bytes,
+    /// Size and digest of it.
+    pub digest: StoredFile,
+}
+
+impl Object {
+    /// With its digest.
+    pub fn new(bytes: impl Into<Bytes>) -> Self {
+        let bytes = bytes.into();
+        let digest = StoredFile {
+            size: bytes.len() as u64,
+            sha256: hex::encode(Sha256::digest(&bytes)),
+        };
+        Self { bytes, digest }
+    }
+}
+
+/// Results by their keys below the run's prefix.
+pub type Objects = BTreeMap<String, Object>;
+
+/// The results so far in numbers.
+#[derive(Clone, Debug, Default, PartialEq)]
+pub struct Summary {
+    /// Units of work done.
+    pub done: u32,
+    /// Over the units done so far; over all of them once `is_complete`.
+    pub score: Option<Metric>,
+    /// Further numbers, over the same units.
+    pub metrics: Vec<Metric>,
+    /// No unit of the plan is missing.
+    pub is_complete: bool,
+    /// Every evaluator has come to its regular end.
+    pub has_ended: bool,
+    /// The results count.
+    pub eligible: bool,
+    /// How the run ended, in the words of its evaluators.
+    pub ended_as: String,
+    /// Scores that do not follow from what was recorded, one sentence each.
+    pub warnings: Vec<String>,
+}
+
+/// What EvalAI gets as a result.
+#[derive(Clone, Debug, PartialEq, Eq)]
+pub struct Texts {
+    /// JSON of the metrics; zeros until the results are complete.
+    pub results: String,
+    /// The same with the metrics so far; `None` before the first unit, and once the results are complete.
+    pub partial_results: Option<String>,
+}
+
+/// What one round found.
+#[derive(Clone, Debug)]
+pub struct Gathered {
+    /// The last good merge; `None` before the first results.
+    pub merged: Option<Arc<Summary>>,
+    /// EvalAI's short texts, of the same merge.
+    pub texts: Arc<Texts>,
+    /// The last good results, the merged file and EvalAI's texts, as they are to be stored.
+    pub objects: Objects,
+    /// Each worker from its status files.
+    pub seen: Vec<WorkerSeen>,
+    /// Each worker for the report.
+    pub workers: Vec<ReportWorker>,
+    /// Why each worker's results are refused, if they are.
+    pub refused: Vec<Option<String>>,
+    /// True for a worker whose results this node can't read at present.
+    pub unreadable: Vec<bool>,
+    /// Why the workers' results can't be merged, if they can't.
+    pub unmerged: Option<String>,
+}
+
+impl Gathered {
+    /// The first reason why something is refused; none once nothing is missing, since what came later changes nothing.
+    pub fn why(&self) -> Option<String> {
+        let first = self.refused.iter().flatten().next().or(self.unmerged.as_ref());
+        first.filter(|_| !self.is_complete()).cloned()
+    }
+
+    /// Whether nothing is missing: judged by the plan and the last good files, whatever the agents report.
+    pub fn is_complete(&self) -> bool {
+        self.unmerged.is_none() && self.merged.as_ref().is_some_and(|merged| merged.is_complete)
+    }
+
+    /// Whether every evaluator has come to its regular end. One whose host crashed in its last unit of work
+    /// has a record of each and has not: it will repeat that one, as long as it is restarted.
+    pub fn has_ended(&self) -> bool {
+        self.merged.as_ref().is_some_and(|merged| merged.has_ended)
+    }
+
+    /// Digests of EvalAI's texts, by key.
+    pub fn digests(&self) -> BTreeMap<String, StoredFile> {
+        let texts = self.objects.iter().filter(|(key, _)| key.starts_with(EVALAI));
+        texts
+            .map(|(key, object)| (key.clone(), object.digest.clone()))
+            .collect()
+    }
+}
