@@ -3,7 +3,7 @@
 use leaderboard_protocol::files::Pair;
 use serde_json::{Value, json};
 
-use super::{gpu, pairs};
+use super::{gpu, workers};
 use crate::gpu_claims::source;
 use crate::overlay as pod_overlay;
 use leaderboard_api::{GpuSource, LeaderboardSpec, RunPlan, Track};
@@ -13,7 +13,7 @@ pub fn gpus(spec: &LeaderboardSpec, track: Option<&Track>, plan: &RunPlan) -> i6
     let (source, kind) = (source(spec), leaderboard_evaluation::of_plan(plan));
     let of_worker = |worker: Pair| {
         [worker.host(), worker.agent()].map(|member| {
-            let hosts = spec.given(track, pairs::part(member.side)).resources;
+            let hosts = spec.given(track, workers::part(member.side)).resources;
             let resources = gpu::resources(source, member, hosts);
             json!({"name": member.to_string(), "resources": resources})
         })

@@ -9,9 +9,9 @@ mod gpu;
 mod gpu_count;
 mod init;
 mod own_uid;
-mod pairs;
 mod security;
 mod volumes;
+mod workers;
 
 #[cfg(test)]
 mod command_tests;
@@ -287,7 +287,7 @@ fn pod(input: &JobInput<'_>) -> PodSpec {
             init::contents(input),
             init::logcopy(input),
         ]),
-        containers: pairs::all(input),
+        containers: workers::all(input),
         volumes: Some(volumes::all(input)),
         active_deadline_seconds: active_deadline(&input.deadlines()),
         termination_grace_period_seconds: Some(GRACE_SECONDS),
@@ -335,7 +335,7 @@ fn settle(template: &mut Value, input: &JobInput<'_>) {
     for list in ["initContainers", "containers"] {
         for container in pod[list].as_array_mut().into_iter().flatten() {
             gpu::hide(container, gpus);
-            pairs::settle(container, input);
+            workers::settle(container, input);
             security::settle(container);
         }
     }

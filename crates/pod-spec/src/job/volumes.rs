@@ -6,7 +6,7 @@ use k8s_openapi::api::core::v1::{
 };
 use k8s_openapi::apimachinery::pkg::api::resource::Quantity;
 
-use super::{JobInput, pairs};
+use super::{JobInput, workers};
 use crate::layout::{
     CONTENTS_LOG_FOLDER, IDENTITY_VOLUME, LOGS_VOLUME, PODINFO_VOLUME, SHM, SHM_VOLUME, STATUS, TOOLS_VOLUME,
 };
@@ -47,7 +47,7 @@ pub(super) fn all(input: &JobInput<'_>) -> Vec<Volume> {
 fn of_node(input: &JobInput<'_>) -> Vec<Volume> {
     let workload = Pair::first(input.pairs())
         .next()
-        .map(|pair| pairs::workload(input, pair));
+        .map(|pair| workers::workload(input, pair));
     let roles = workload
         .into_iter()
         .flat_map(|workload| [Some(workload.host), workload.agent]);
