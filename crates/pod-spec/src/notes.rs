@@ -97,8 +97,8 @@ fn ros(tracks: &[TrackPods]) -> Option<String> {
         _ => "tracks",
     };
     Some(format!(
-        "ROS: all pairs of a Pod share its network, so the agents of the {tracks} {} meet on one ROS1 master (11311), one rosbridge \
-         (9090) and ROS2's default domain; set pairs: 1 for each track of ROS agents.",
+        "ROS: all workers of a Pod share its network, so the agents of the {tracks} {} meet on one ROS1 master (11311), one rosbridge \
+         (9090) and ROS2's default domain; give each track of ROS agents one worker.",
         listed(found)
     ))
 }

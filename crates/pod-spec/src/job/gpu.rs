@@ -23,7 +23,7 @@ const CAPABILITIES: &str = "NVIDIA_DRIVER_CAPABILITIES";
 const NO_DEVICE: &str = "void";
 /// What the resources of NVIDIA's device plugin begin with: whole GPUs, shared ones, MIG slices.
 const RESOURCES: &str = "nvidia.com/";
-/// The variables of a container of a pair.
+/// The variables of a container of a worker.
 pub(super) fn variables(source: GpuSource<'_>, member: Member) -> Vec<EnvVar> {
     let index = member.pair.index().to_string();
     let devices = match source {
@@ -43,7 +43,7 @@ pub(super) fn variables(source: GpuSource<'_>, member: Member) -> Vec<EnvVar> {
         .collect()
 }
 
-/// What a container of a pair requests, with its GPU.
+/// What a container of a worker requests, with its GPU.
 pub(super) fn resources(
     source: GpuSource<'_>,
     member: Member,
@@ -70,23 +70,23 @@ pub(super) fn resources(
     }
 }
 
-/// One claim for each pair, which its two containers share.
+/// One claim for each worker, which its two containers share.
 pub(super) fn claims(input: &JobInput<'_>) -> Option<Vec<PodResourceClaim>> {
     let GpuSource::Claim(claim) = source(input.spec()) else {
         return None;
     };
     let leaderboard = input.leaderboard.metadata.name.as_deref().unwrap_or_default();
     let template = template_name(leaderboard, claim);
-    let of_pair = |pair| PodResourceClaim {
-        name: claim_name(pair),
+    let of_worker = |worker| PodResourceClaim {
+        name: claim_name(worker),
         resource_claim_name: None,
         resource_claim_template_name: Some(template.clone()),
     };
-    Some(Pair::first(input.pairs()).map(of_pair).collect())
+    Some(Pair::first(input.workers()).map(of_worker).collect())
 }
 
-fn claim_name(pair: Pair) -> String {
-    format!("gpu-{pair}")
+fn claim_name(worker: Pair) -> String {
+    format!("gpu-{worker}")
 }
 
 /// Flags of the runner: what it checks before it starts its command, which is nothing where the operator gives no GPU. By its index the
@@ -139,14 +139,14 @@ pub(super) fn is_gpu(resource: &str, source: GpuSource<'_>) -> bool {
     resource.starts_with(RESOURCES) || Some(resource) == own
 }
 
-/// Why it is not clear which container of a finished template is meant to have which GPU. A resource that a container of a pair names
-/// is its own alone: without `gpu` the other one would have none, and with a claim the pair would take two.
+/// Why it is not clear which container of a finished template is meant to have which GPU. A resource that a container of a worker names
+/// is its own alone: without `gpu` the other one would have none, and with a claim the worker would take two.
 pub fn unclear(spec: &LeaderboardSpec, template: &Value) -> Option<String> {
     let source = source(spec);
     let containers = template["spec"]["containers"].as_array()?;
-    let mut of_pairs = containers.iter().filter(|container| member(container).is_some());
+    let mut of_workers = containers.iter().filter(|container| member(container).is_some());
     let (container, resource) =
-        of_pairs.find_map(|container| Some((container["name"].as_str()?, *requested(container, source).first()?)))?;
+        of_workers.find_map(|container| Some((container["name"].as_str()?, *requested(container, source).first()?)))?;
     match (&spec.gpu, source) {
         (None, _) => Some(format!(
             "{container} requests {resource} and the Leaderboard has no field gpu, so it is not known what the other container of the \
@@ -161,12 +161,12 @@ pub fn unclear(spec: &LeaderboardSpec, template: &Value) -> Option<String> {
     }
 }
 
-/// The container of a pair, by its name.
+/// The container of a worker, by its name.
 pub(super) fn member(container: &Value) -> Option<Member> {
     Member::parse(container["name"].as_str()?)
 }
 
-/// Keeps a Pod whose pairs know their GPU by its index away from nodes with another submission's Pod, whatever its namespace. It comes
+/// Keeps a Pod whose workers know their GPU by its index away from nodes with another submission's Pod, whatever its namespace. It comes
 /// after the overlay, whose lists would take the place of these.
 pub(super) fn place(pod: &mut Value, source: GpuSource<'_>) {
     if !is_by_index(source) {

@@ -54,7 +54,7 @@ const GRACE_SECONDS: i64 = 600;
 const LOST_NODE_SECONDS: i64 = 60;
 /// What the net under all deadlines allows beyond their sum, in seconds.
 const NET_SECONDS: i64 = 1800;
-/// Restarts beyond those of the pairs that do not end the Job: `contents`, `workspace` and `logcopy` count too.
+/// Restarts beyond those of the workers that do not end the Job: `contents`, `workspace` and `logcopy` count too.
 const SPARE_RESTARTS: i32 = 20;
 /// A policy that a Pod has found not to be enforced is taken for such so long; after that each Pod waits its full time again.
 const KNOWN_OPEN_FOR: Duration = Duration::from_hours(1);
@@ -112,7 +112,7 @@ impl JobInput<'_> {
         }
     }
 
-    fn pairs(&self) -> usize {
+    fn workers(&self) -> usize {
         self.plan.workers()
     }
 
@@ -232,11 +232,11 @@ fn labels(input: &JobInput<'_>) -> BTreeMap<String, String> {
     ])
 }
 
-/// A net only: the controller counts the crashes of each pair itself. This limit is one budget over all containers, and
+/// A net only: the controller counts the crashes of each worker itself. This limit is one budget over all containers, and
 /// at it the Pod is deleted with its statuses.
 fn backoff_limit(input: &JobInput<'_>) -> i32 {
-    let pairs = i32::try_from(input.pairs()).unwrap_or(i32::MAX);
-    pairs
+    let workers = i32::try_from(input.workers()).unwrap_or(i32::MAX);
+    workers
         .saturating_mul(2)
         .saturating_mul(input.spec().retries.per_worker.saturating_add(1))
         .saturating_add(SPARE_RESTARTS)
@@ -304,7 +304,7 @@ fn pod(input: &JobInput<'_>) -> PodSpec {
     }
 }
 
-/// Participants' images, and CARLA's, are for one kind of machine. A track can choose another.
+/// Images of participants, and mostly of hosts, are for one kind of machine. A track can choose another.
 fn node_selector(input: &JobInput<'_>) -> BTreeMap<String, String> {
     let mut nodes = BTreeMap::from([("kubernetes.io/arch".into(), "amd64".into())]);
     nodes.extend(

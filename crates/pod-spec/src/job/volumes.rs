@@ -38,16 +38,16 @@ pub(super) fn all(input: &JobInput<'_>) -> Vec<Volume> {
     ];
     let identity = input.spec().has_role().then(identity);
     let shared = input.spec().agent.shm_size.iter();
-    let shared = shared.flat_map(|size| Pair::first(input.pairs()).map(|pair| memory(pair, size)));
+    let shared = shared.flat_map(|size| Pair::first(input.workers()).map(|worker| memory(worker, size)));
     let all = contents.chain(own).chain(identity);
     all.chain(of_node(input)).chain(shared).collect()
 }
 
 /// Folders of the node that a worker's containers mount, which are the same for all workers.
 fn of_node(input: &JobInput<'_>) -> Vec<Volume> {
-    let workload = Pair::first(input.pairs())
+    let workload = Pair::first(input.workers())
         .next()
-        .map(|pair| workers::workload(input, pair));
+        .map(|worker| workers::workload(input, worker));
     let roles = workload
         .into_iter()
         .flat_map(|workload| [Some(workload.host), workload.agent]);
@@ -80,8 +80,8 @@ fn memory(pair: Pair, size: &ByteQuantity) -> Volume {
 
 /// Most bytes of the `logs` volume.
 pub(super) fn logs_limit(input: &JobInput<'_>) -> u64 {
-    let pairs = u64::try_from(input.pairs()).unwrap_or(u64::MAX);
-    let agent_logs = pairs.saturating_mul(input.spec().agent.log_size_limit.bytes());
+    let workers = u64::try_from(input.workers()).unwrap_or(u64::MAX);
+    let agent_logs = workers.saturating_mul(input.spec().agent.log_size_limit.bytes());
     input
         .plan
         .storage

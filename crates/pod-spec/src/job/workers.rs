@@ -26,8 +26,8 @@ fn role(input: &JobInput<'_>, member: Member) -> Option<Role> {
 
 /// The hosts' containers of all workers, then the agents'.
 pub(super) fn all(input: &JobInput<'_>) -> Vec<Container> {
-    let pairs = Pair::first(input.pairs());
-    let members = pairs.clone().map(Pair::host).chain(pairs.map(Pair::agent));
+    let workers = Pair::first(input.workers());
+    let members = workers.clone().map(Pair::host).chain(workers.map(Pair::agent));
     members
         .filter_map(|member| Some(container(input, member, role(input, member)?)))
         .collect()

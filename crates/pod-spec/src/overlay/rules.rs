@@ -46,7 +46,7 @@ const STATUS_IS_READ: &str = "the controller reads how each container ended ther
 const RUN_BY_US: &str = "the operator runs it and knows how";
 /// Fields of the Pod's spec that stay ours.
 const POD_FIELDS: [(&str, &str); 11] = [
-    ("restartPolicy", "a crashed pair resumes by OnFailure"),
+    ("restartPolicy", "a crashed worker resumes by OnFailure"),
     (
         "serviceAccountName",
         "it is the Pod's identity; set podIdentity.serviceAccountName",
@@ -80,15 +80,15 @@ const POD_FIELDS: [(&str, &str); 11] = [
 const CONTAINER_FIELDS: [(&str, &str); 5] = [
     (
         "image",
-        "it is pinned with the run; set contents.image or simulator.image, the agent's is the participant's",
+        "it is pinned with the run; set the image in evaluation, the agent's is the participant's",
     ),
     (
         "command",
-        "the runner stands in front of it; set command of contents, simulator or agent",
+        "the runner stands in front of it; set command in evaluation or agent",
     ),
     (
         "args",
-        "the runner stands in front of them; set args of contents, simulator or agent",
+        "the runner stands in front of them; set args in evaluation or agent",
     ),
     ("terminationMessagePath", STATUS_IS_READ),
     ("terminationMessagePolicy", STATUS_IS_READ),
@@ -268,7 +268,7 @@ fn fixed_names<'a>(path: &str, mut names: impl Iterator<Item = &'a str>, reserve
     match names.find(|name| reserved.env.contains(name)) {
         Some(name) => protected(
             format!("{path}[{name}]"),
-            "it follows from the plan of the run; set pairs, routes, repetitions, or routesFile, scenariosFile and codename of the track",
+            "it follows from the plan of the run; set the fields of evaluation, or of the track, that the plan is made of",
         ),
         None => Ok(()),
     }
