@@ -29,12 +29,12 @@ use leaderboard_base::tasks::Tasks;
 use leaderboard_policy::ask::{Answered, Ask, Failure, Lookup, Service};
 use state::{State, Work};
 
-/// What one read is about.
+/// A question that is sent now.
 #[derive(Clone, Debug)]
 pub struct Asked<Q: Ask> {
     pub about: ObjectKey,
     pub question: Q,
-    /// How long the question has waited.
+    /// Time that the question has waited.
     pub waited: Duration,
     /// The last answer, which may be one to an older question.
     pub last: Option<Answered<Q>>,
@@ -75,17 +75,17 @@ impl<Q: Ask> Asker<Q> {
         }
     }
 
-    /// What is known of the object with this UID.
+    /// All that is known of the object with this UID.
     pub fn get(&self, uid: &str) -> Lookup<Q> {
         lock(&self.0.state).get(uid, Instant::now())
     }
 
-    /// How many questions to a service have waited for an answer for longer than this.
+    /// The number of questions to a service that have waited for an answer for longer than this.
     pub fn waiting(&self, service: &Service, time: Duration) -> usize {
         lock(&self.0.state).waiting(service, time, Instant::now())
     }
 
-    /// Drops the question and the answer. A read that is under way keeps its place until it ends, and wakes nobody.
+    /// Drops the question and the answer. A read that is under way keeps its place until it ends, and wakes no object.
     pub fn forget(&self, uid: &str) {
         lock(&self.0.state).forget(uid);
     }

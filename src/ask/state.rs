@@ -46,7 +46,7 @@ struct Entry<Q: Ask> {
     /// When the question is to be sent; None: it is under way, or answered for good.
     due: Option<Instant>,
     is_under_way: bool,
-    /// What is under way was asked for before the object was forgotten.
+    /// The read under way was asked for before the object was forgotten.
     is_dropped: bool,
     failures: u32,
     last: Option<Last<Q>>,
@@ -142,7 +142,7 @@ impl<Q: Ask> State<Q> {
         }
     }
 
-    /// How many questions to a service have waited for an answer for longer than this.
+    /// The number of questions to a service that have waited for an answer for longer than this.
     pub fn waiting(&self, service: &Service, time: Duration, now: Instant) -> usize {
         let waits = |entry: &&Entry<Q>| {
             let since = entry.waits_since.filter(|_| entry.service == *service);

@@ -22,7 +22,7 @@ enum Outcome {
     Good,
     /// It is asked again every 30 s.
     Held,
-    /// What a question with a higher number was answered is of another run.
+    /// The answer to a question with a higher number is of another run.
     GoesOn,
     Fails,
 }
@@ -314,7 +314,7 @@ async fn who_is_forgotten_is_not_woken_and_its_read_keeps_its_place() {
 }
 
 #[tokio::test(start_paused = true)]
-async fn a_question_that_nobody_repeats_is_given_up() {
+async fn a_question_that_is_not_repeated_is_given_up() {
     let world = World::new();
     let held = Question {
         outcome: Outcome::Held,

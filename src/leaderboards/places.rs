@@ -90,7 +90,7 @@ async fn try_rows(aws: &Aws, table: &api::Table) -> Result<(), TableError> {
     Table::describe(aws, table).await?.try_write().await
 }
 
-/// What an answer means. A cause that passes is silence.
+/// The meaning of an answer. A cause that passes is silence.
 fn seen<T, E: Display>(answer: Result<T, E>, passes: impl Fn(&E) -> bool) -> Result<Seen, Failure> {
     answer.map(|_| Seen::default()).map_err(|error| Failure {
         is_refused: !passes(&error),

@@ -1,4 +1,4 @@
-//! What is asked of a Leaderboard's token, its places in AWS and its Pods. A reconcile asks and finds the answers in memory; an answer
+//! The questions about a Leaderboard's token, its places in AWS and its Pods. A reconcile asks and finds the answers in memory; an answer
 //! that is news wakes it.
 
 use std::collections::BTreeMap;
@@ -119,7 +119,7 @@ impl Asks {
         self.known(leaderboard)
     }
 
-    /// What is known of a Leaderboard.
+    /// All that is known of a Leaderboard.
     pub(super) fn known(&self, leaderboard: &Arc<Leaderboard>) -> Looked {
         let uid = key_of(leaderboard.as_ref()).uid;
         let named = places::named(leaderboard).into_iter();
@@ -139,7 +139,7 @@ impl Asks {
     }
 }
 
-/// What is known of all that a Leaderboard names.
+/// The answers about all that a Leaderboard names.
 #[derive(Debug, Default)]
 pub(super) struct Looked {
     token: Lookup<TokenQuestion>,
@@ -148,7 +148,7 @@ pub(super) struct Looked {
 }
 
 impl Looked {
-    /// How long the Leaderboard as it is has been waited for; None: all of it was looked at.
+    /// The longest wait for an answer about the Leaderboard as it is; None: there are all.
     pub(super) fn waits(&self) -> Option<Duration> {
         let places = self.reach.0.iter().filter_map(|(_, lookup)| unanswered(lookup));
         let others = [unanswered(&self.token), unanswered(&self.pods)];
@@ -199,7 +199,7 @@ impl Looked {
         })
     }
 
-    /// What was found where the Leaderboard names its token.
+    /// The token, or why there is none, where the Leaderboard names it now.
     pub(super) fn token(&self, leaderboard: &Leaderboard) -> Option<&Result<Arc<Token>, Failure>> {
         let place = &leaderboard.spec.evalai.as_ref()?.token;
         let found = self
@@ -210,14 +210,14 @@ impl Looked {
         Some(&found.result)
     }
 
-    /// What was found of its Pods.
+    /// The findings about its Pods.
     pub(super) fn pods(&self) -> TriedPods {
         let found = self.pods.known().and_then(|found| found.result.as_ref().as_ref().ok());
         found.cloned().unwrap_or_default()
     }
 }
 
-/// How long a question has waited for its first answer.
+/// Time that a question has waited for its first answer.
 fn unanswered<Q: Ask>(lookup: &Lookup<Q>) -> Option<Duration> {
     let asked = lookup.asked.as_ref().filter(|asked| lookup.answer_to(asked).is_none());
     asked.and(lookup.waited)

@@ -1,8 +1,8 @@
-//! Whether a Leaderboard's bucket, table, queues and log group can be reached, and what is reported of them.
+//! A Leaderboard's bucket, table, queues and log group: which can be reached, and what is reported of the others.
 //!
 //! Pure: `places` asks, `decide` turns what is shown into the condition `Ready`. An answer counts at once. Silence counts
 //! when it has lasted for [`PATIENCE`], and then as `Unknown`: a service that is away for a minute makes nothing flap, and
-//! nobody knows yet what is wrong with one that never answers.
+//! the cause of a silence is not known.
 
 use std::sync::Arc;
 use std::time::Duration;
@@ -18,7 +18,7 @@ use leaderboard_policy::leaderboards::view::Unreachable;
 const AGAIN: Duration = Duration::from_mins(5);
 /// The waits after checks that found something wrong, up to [`AGAIN`].
 const RETRY: Backoff = Backoff::new(Duration::from_secs(5), AGAIN);
-/// How long what was last found is held to be true while there is no answer.
+/// Time for which the last answer is held to be true while the service is silent.
 const PATIENCE: Duration = Duration::from_mins(2);
 
 /// What a Leaderboard names in AWS, the gravest first.
@@ -72,7 +72,7 @@ impl PartialEq for Place {
     }
 }
 
-/// What was seen of a place.
+/// The answer of a place.
 #[derive(Clone, Debug, Default, PartialEq, Eq)]
 pub struct Seen {
     /// Messages of a queue, visible and in flight.
@@ -149,7 +149,7 @@ impl Reach {
     }
 }
 
-/// What is wrong with a place, if anything is.
+/// The fault of a place, if it has one.
 fn said<'a>(place: &Place, lookup: &'a Lookup<Place>) -> Option<(Truth, &'a str)> {
     let patient = lookup.silence.as_ref().filter(|silence| silence.lasts < PATIENCE);
     let before = patient.and_then(|silence| silence.before.as_ref());

@@ -1,4 +1,4 @@
-//! Whether a Leaderboard's Pods would be taken, by our own rules and by a dry run of its first track's Job, before anybody submits.
+//! Tries whether a Leaderboard's Pods would be taken, by our own rules and by a dry run of its first track's Job, before anybody submits.
 //! Also keeps the template of their claims.
 
 use std::sync::Arc;
@@ -26,7 +26,7 @@ use leaderboard_policy::leaderboards::view::Claims;
 
 /// Classes and templates that are as they should be are looked at again after this long.
 const AGAIN: Duration = Duration::from_mins(5);
-/// What is wrong may be corrected at any moment.
+/// A fault may be corrected at any moment.
 const SOON: Duration = Duration::from_secs(15);
 
 /// Asks for the Pods of a Leaderboard. An edit of the Leaderboard asks anew.
@@ -57,7 +57,7 @@ impl Ask for Pods {
     }
 }
 
-/// What was found of a Leaderboard's Pods.
+/// The findings about a Leaderboard's Pods.
 #[derive(Clone, Debug, Default, PartialEq, Eq)]
 pub(super) struct TriedPods {
     /// Why they would be refused.
@@ -70,7 +70,7 @@ pub(super) struct TriedPods {
     may_change: bool,
 }
 
-/// Whether Pods of this Leaderboard would be refused, and what is to be noted. Puts the template of their claims in place.
+/// Tries whether Pods of this Leaderboard would be refused, and what is to be noted. Puts the template of their claims in place.
 pub(super) async fn try_pods(client: &Client, settings: &Settings, asked: &Asked<Pods>) -> TriedPods {
     let leaderboard = asked.question.0.as_ref();
     let tried = try_templates(client, settings, leaderboard).await;
@@ -90,7 +90,7 @@ pub(super) async fn try_pods(client: &Client, settings: &Settings, asked: &Asked
     }
 }
 
-/// What our own rules and the API server say of its Pods.
+/// The verdict of our own rules and of the API server on its Pods.
 async fn try_templates(client: &Client, settings: &Settings, leaderboard: &Leaderboard) -> TriedPods {
     if let Err(error) = pod_overlay::validate(&leaderboard.spec) {
         return TriedPods {

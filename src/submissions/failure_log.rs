@@ -34,7 +34,7 @@ const NODE_LINES: i64 = 200;
 const NODE_BYTES: u64 = 1 << 20;
 /// Time that reading one place, or storing, may take.
 const TRY: Duration = Duration::from_secs(5);
-/// How often one log is looked for, and the time between two tries.
+/// The number of tries to get one log, and the time between two of them.
 const TRIES: u32 = 3;
 const TRY_AGAIN: Duration = Duration::from_secs(3);
 
@@ -72,7 +72,7 @@ pub fn start(client: &Client, aws: &Aws, tasks: &Tasks, wake: Wake) -> Asker<Fai
     })
 }
 
-/// What became of the log of a Job. `is_over`: of the end of the submission.
+/// The state of the log of a Job. `is_over`: the log at the end of the submission.
 pub fn seen(lookup: &Lookup<FailureLog>, job: JobNumber, is_over: bool) -> ObservedLog {
     let asked = lookup.asked.as_ref();
     let Some(asked) = asked.filter(|asked| asked.job == job && asked.is_over == is_over) else {

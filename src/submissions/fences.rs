@@ -14,7 +14,7 @@ use leaderboard_policy::view::ObservedFence;
 
 /// Time before a write that failed is made again.
 const TRY_AGAIN: Duration = Duration::from_secs(3);
-/// How long the fence is tried. After that `decide` goes on without it, and a late mark would stop the next Pod.
+/// Time for which the fence is tried. After that `decide` goes on without it, and a late mark would stop the next Pod.
 const TRIES: Duration = Duration::from_mins(1);
 
 /// A mark that is to be written against the Pod of one Job.

@@ -1,6 +1,6 @@
 //! The rows of the tables: at most one write in 2 s and table, each only while this process leads, and ends before all others.
 //!
-//! Of an object's rows the newest wins: a later attempt over an earlier one, an end over what comes before it.
+//! The newest row of an object wins: a later attempt over an earlier one, an end over what comes before it.
 
 use std::sync::Arc;
 use std::time::Duration;

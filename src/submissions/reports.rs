@@ -67,7 +67,7 @@ impl PartialEq for Report {
     }
 }
 
-/// What is stored where a report belongs.
+/// The object that is stored where a report belongs.
 #[derive(Clone, Debug, PartialEq)]
 pub enum Stored {
     Nothing,
@@ -165,7 +165,7 @@ pub(super) fn silent(error: &ArchiveError) -> Failure {
     }
 }
 
-/// What is known of a report, seen from a run that is at this Job with this Pod.
+/// The report as it is known, seen from a run that is at this Job with this Pod.
 pub fn seen(lookup: &Lookup<Report>, job: JobNumber, pod: Option<&str>) -> ReportView {
     let last = lookup.last.as_ref();
     let is_of = |asked: &ReportDemand| {

@@ -8,7 +8,7 @@ use leaderboard_api::{LogGroup, Queue, SecretsManagerKey, Storage, Table};
 
 /// One kind of question. Everything that makes an older answer useless is part of the question: the attempt, a digest, a stage.
 pub trait Ask: Clone + Debug + PartialEq + Send + 'static {
-    /// What is found. The same answer as before is no news.
+    /// The finding. The same answer as before is no news.
     type Answer: Debug + PartialEq + Send + Sync + 'static;
     /// Reads under way at once.
     const AT_ONCE: usize;
@@ -26,7 +26,7 @@ pub trait Ask: Clone + Debug + PartialEq + Send + 'static {
     /// `failures` counts those in a row. `waited` is the time without an answer since the question was first asked.
     fn again(&self, result: &Result<Self::Answer, Failure>, failures: u32, waited: Duration) -> Option<Duration>;
 
-    /// Of the questions that are due, the lowest goes first.
+    /// The lowest of the questions that are due goes first.
     fn rank(&self) -> Rank {
         Rank::default()
     }
@@ -48,14 +48,14 @@ pub struct Failure {
     pub why: String,
 }
 
-/// What is known of an object.
+/// The question about an object, and its last answer.
 #[derive(Clone, Debug)]
 pub struct Lookup<Q: Ask> {
     /// The present question.
     pub asked: Option<Q>,
-    /// How long the present question has waited; None: it is answered, or there is none.
+    /// Time that the present question has waited; None: it is answered, or there is none.
     pub waited: Option<Duration>,
-    /// What came of the last read, which may answer an older question.
+    /// The outcome of the last read, which may answer an older question.
     pub last: Option<Answered<Q>>,
     /// Present while the service does not answer.
     pub silence: Option<Silence<Q>>,
@@ -73,7 +73,7 @@ pub struct Silence<Q: Ask> {
 #[derive(Debug)]
 pub struct Answered<Q: Ask> {
     pub question: Q,
-    /// How long ago the question was sent: the answer shows nothing that has happened since.
+    /// Time since the question was sent: the answer shows nothing that has happened since.
     pub sent_ago: Duration,
     pub result: Arc<Result<Q::Answer, Failure>>,
 }

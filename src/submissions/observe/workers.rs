@@ -1,4 +1,4 @@
-//! What is asked of other systems in the background: a reconcile asks, and a later one finds the answer in memory.
+//! The questions to other systems in the background: a reconcile asks, and a later one finds the answer in memory.
 
 use std::sync::Arc;
 
@@ -90,7 +90,7 @@ impl Workers {
     }
 }
 
-/// The files of a run. Without a plan nobody knows where they would be.
+/// The files of a run. Without a plan their place is not known.
 fn files(submission: &Submission, status: &SubmissionStatus) -> Option<Arc<RunFiles>> {
     let plan = status.plan.as_ref()?;
     Some(RunFiles::of(plan, uid(submission)))
