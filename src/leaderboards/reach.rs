@@ -177,10 +177,6 @@ mod tests {
 
     type Found = Result<Seen, Failure>;
 
-    fn good() -> Found {
-        Ok(Seen::default())
-    }
-
     fn bad() -> Found {
         Err(Failure {
             is_refused: true,
@@ -231,7 +227,7 @@ mod tests {
             assert_eq!(reach.notes(), ["It does not exist; create it."]);
             reach.0.push(found(AwsResource::Table, Some(bad()), None));
             assert_eq!(reach.unreachable().unwrap().reason, reasons::TABLE_UNREACHABLE);
-            reach.0[0] = found(resource, Some(good()), None);
+            reach.0[0] = found(resource, Some(Ok(Seen::default())), None);
             assert_eq!(reach.notes(), Vec::<String>::new());
         }
     }
@@ -246,13 +242,13 @@ mod tests {
             })
         };
         for (name, known, lasts, expected) in [
-            ("good", Some(good()), None, None),
+            ("good", Some(Ok(Seen::default())), None, None),
             ("bad", Some(bad()), None, Some(False)),
             ("hidden", Some(hidden()), None, Some(Unknown)),
             ("not asked yet", None, None, None),
             ("never answered", None, Some(0), Some(Unknown)),
-            ("away for a minute", Some(good()), Some(60), None),
-            ("away for longer", Some(good()), Some(120), Some(Unknown)),
+            ("away for a minute", Some(Ok(Seen::default())), Some(60), None),
+            ("away for longer", Some(Ok(Seen::default())), Some(120), Some(Unknown)),
             (
                 "bad, then silent: it stays bad for as long",
                 Some(bad()),
@@ -272,7 +268,7 @@ mod tests {
         let pause = |found, failures| place.again(&found, failures, Duration::ZERO).unwrap().as_secs();
         let failed: Vec<u64> = (1..=8).map(|failures| pause(bad(), failures)).collect();
         assert_eq!(failed, [5, 10, 20, 40, 80, 160, 300, 300]);
-        assert_eq!(pause(good(), 0), 300);
+        assert_eq!(pause(Ok(Seen::default()), 0), 300);
     }
 
     #[test]
@@ -288,7 +284,7 @@ mod tests {
 
     #[test]
     fn the_end_of_patience_is_a_moment_to_look() {
-        let reach = |lasts| Reach(vec![found(AwsResource::Bucket, Some(good()), lasts)]);
+        let reach = |lasts| Reach(vec![found(AwsResource::Bucket, Some(Ok(Seen::default())), lasts)]);
         assert_eq!(reach(Some(75)).patience(), Some(Duration::from_secs(45)));
         assert_eq!((reach(None).patience(), reach(Some(120)).patience()), (None, None));
     }
@@ -297,7 +293,7 @@ mod tests {
     fn what_is_surely_wrong_comes_first_and_all_is_shown() {
         let reach = Reach(vec![
             found(AwsResource::Bucket, None, Some(0)),
-            found(AwsResource::Table, Some(good()), None),
+            found(AwsResource::Table, Some(Ok(Seen::default())), None),
             found(AwsResource::Queue, Some(bad()), None),
         ]);
         let found = reach.unreachable().unwrap();

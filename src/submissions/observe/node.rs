@@ -74,7 +74,6 @@ fn of(node: &Node) -> NodeView {
     NodeView {
         state: state(node),
         leaving: leaving(node),
-        ..NodeView::default()
     }
 }
 
