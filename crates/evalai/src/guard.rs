@@ -35,7 +35,7 @@ pub enum Start {
 
 /// What becomes of an update to `queued`, `running` or partial results.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
-pub enum Verdict {
+pub enum Interim {
     /// Write.
     Send,
     /// EvalAI shows it already: a repeated PATCH would reset the execution time.
@@ -74,22 +74,22 @@ pub fn start(status: Status, attempt: Attempt) -> Start {
 
 /// Whether `queued` or `running` is written. `is_known`: EvalAI has stored this attempt. Before that, a later attempt writes even over
 /// `running`, which an earlier one has written.
-pub fn progress(status: Status, attempt: Attempt, is_known: bool, wanted: Progress) -> Verdict {
+pub fn progress(status: Status, attempt: Attempt, is_known: bool, wanted: Progress) -> Interim {
     match start(status, attempt) {
-        Start::Drop(status) => Verdict::Ended(status),
-        Start::Unclear => Verdict::Wait,
-        Start::Run if (attempt.number == api::Attempt::FIRST || is_known) && reached(status, wanted) => Verdict::There,
-        Start::Run => Verdict::Send,
+        Start::Drop(status) => Interim::Ended(status),
+        Start::Unclear => Interim::Wait,
+        Start::Run if (attempt.number == api::Attempt::FIRST || is_known) && reached(status, wanted) => Interim::There,
+        Start::Run => Interim::Send,
     }
 }
 
 /// Whether partial results are written. An earlier attempt's end is first overwritten by `queued` or `running`.
-pub fn partial(status: Status, attempt: Attempt) -> Verdict {
+pub fn partial(status: Status, attempt: Attempt) -> Interim {
     match start(status, attempt) {
-        Start::Drop(status) => Verdict::Ended(status),
-        Start::Unclear => Verdict::Wait,
-        Start::Run if standing(status, attempt) != status => Verdict::Wait,
-        Start::Run => Verdict::Send,
+        Start::Drop(status) => Interim::Ended(status),
+        Start::Unclear => Interim::Wait,
+        Start::Run if standing(status, attempt) != status => Interim::Wait,
+        Start::Run => Interim::Send,
     }
 }
 
@@ -162,10 +162,10 @@ mod tests {
             let attempt = asked_for(2, begun);
             assert_eq!(start(S::Cancelled, attempt), Start::Drop(S::Cancelled));
             for wanted in [Progress::Queued, Progress::Running] {
-                let ended = Verdict::Ended(S::Cancelled);
+                let ended = Interim::Ended(S::Cancelled);
                 assert_eq!(progress(S::Cancelled, attempt, false, wanted), ended);
             }
-            assert_eq!(partial(S::Cancelled, attempt), Verdict::Ended(S::Cancelled));
+            assert_eq!(partial(S::Cancelled, attempt), Interim::Ended(S::Cancelled));
             assert_eq!(end(S::Cancelled, attempt, Outcome::Finished), End::Amend(S::Cancelled));
         }
         assert_eq!(
@@ -186,9 +186,9 @@ mod tests {
             assert_eq!(start(S::Finished, under_way), Start::Run);
             for is_known in [false, true] {
                 let sent = progress(S::Finished, under_way, is_known, Progress::Running);
-                assert_eq!(sent, Verdict::Send, "{number} {begun} {is_known}");
+                assert_eq!(sent, Interim::Send, "{number} {begun} {is_known}");
             }
-            assert_eq!(partial(S::Finished, under_way), Verdict::Send);
+            assert_eq!(partial(S::Finished, under_way), Interim::Send);
             for wanted in [Outcome::Finished, Outcome::Failed, Outcome::Cancelled] {
                 assert_eq!(end(S::Finished, under_way, wanted), End::Put);
             }
@@ -299,22 +299,22 @@ mod tests {
     fn progress_is_written_once() {
         use Progress::{Queued, Running};
         for (status, wanted, first, later) in [
-            (S::Submitted, Queued, Verdict::Send, Verdict::Send),
-            (S::Resuming, Running, Verdict::Send, Verdict::Send),
-            (S::Queued, Queued, Verdict::There, Verdict::Send),
-            (S::Queued, Running, Verdict::Send, Verdict::Send),
-            (S::Running, Queued, Verdict::There, Verdict::Send),
-            (S::Running, Running, Verdict::There, Verdict::Send),
-            (S::PartiallyEvaluated, Running, Verdict::There, Verdict::Send),
-            (S::Cancelled, Queued, Verdict::Ended(S::Cancelled), Verdict::Send),
-            (S::Failed, Running, Verdict::Ended(S::Failed), Verdict::Send),
+            (S::Submitted, Queued, Interim::Send, Interim::Send),
+            (S::Resuming, Running, Interim::Send, Interim::Send),
+            (S::Queued, Queued, Interim::There, Interim::Send),
+            (S::Queued, Running, Interim::Send, Interim::Send),
+            (S::Running, Queued, Interim::There, Interim::Send),
+            (S::Running, Running, Interim::There, Interim::Send),
+            (S::PartiallyEvaluated, Running, Interim::There, Interim::Send),
+            (S::Cancelled, Queued, Interim::Ended(S::Cancelled), Interim::Send),
+            (S::Failed, Running, Interim::Ended(S::Failed), Interim::Send),
             (
                 S::Finished,
                 Running,
-                Verdict::Ended(S::Finished),
-                Verdict::Ended(S::Finished),
+                Interim::Ended(S::Finished),
+                Interim::Ended(S::Finished),
             ),
-            (S::Unknown, Queued, Verdict::Wait, Verdict::Wait),
+            (S::Unknown, Queued, Interim::Wait, Interim::Wait),
         ] {
             assert_eq!(
                 progress(status, of(1, false), false, wanted),
@@ -338,28 +338,28 @@ mod tests {
     fn a_later_attempt_is_published_once_even_where_the_earlier_one_left_its_texts() {
         assert_eq!(
             progress(S::Running, of(2, true), false, Progress::Queued),
-            Verdict::Send
+            Interim::Send
         );
         assert_eq!(
             progress(S::Cancelled, of(2, true), false, Progress::Queued),
-            Verdict::Ended(S::Cancelled)
+            Interim::Ended(S::Cancelled)
         );
     }
 
     #[test]
     fn partials_follow_only_a_run_that_evalai_has() {
         for status in LIVE {
-            assert_eq!(partial(status, of(1, false)), Verdict::Send);
+            assert_eq!(partial(status, of(1, false)), Interim::Send);
         }
         for status in GONE
             .into_iter()
             .chain(DELETED)
             .chain([S::Cancelled, S::Failed, S::Finished])
         {
-            assert_eq!(partial(status, of(1, true)), Verdict::Ended(status));
+            assert_eq!(partial(status, of(1, true)), Interim::Ended(status));
         }
-        assert_eq!(partial(S::Cancelled, of(2, false)), Verdict::Wait);
-        assert_eq!(partial(S::Cancelled, of(2, true)), Verdict::Ended(S::Cancelled));
-        assert_eq!(partial(S::Unknown, of(1, true)), Verdict::Wait);
+        assert_eq!(partial(S::Cancelled, of(2, false)), Interim::Wait);
+        assert_eq!(partial(S::Cancelled, of(2, true)), Interim::Ended(S::Cancelled));
+        assert_eq!(partial(S::Unknown, of(1, true)), Interim::Wait);
     }
 }

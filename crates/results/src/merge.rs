@@ -6,7 +6,7 @@ use crate::json::{KeyOrder, Node, Object, Text, write};
 use crate::names::{self, STARTED, Score};
 use crate::number::{Number, count};
 use crate::statistics::{self, Global};
-use crate::verdict::Verdict;
+use crate::verdict::Ending;
 use crate::{Format, Outcome, Plan, RecordName, Refusal, Slice};
 
 /// How far one pair is.
@@ -118,17 +118,17 @@ pub fn merge(plan: &Plan, workers: &[Option<&Checkpoint>]) -> Result<Merged, Ref
         global_so_far(plan, &done_unsorted, &done_sorted)
     };
     let global = is_final.then(|| global(plan, &unsorted, &sorted)).transpose()?;
-    let verdict = Verdict::of(plan, workers, (&sorted, &sensors), is_final);
-    let text = text(plan.format, &sorted, [done, total], &sensors, global.as_ref(), &verdict)
+    let ending = Ending::of(plan, workers, (&sorted, &sensors), is_final);
+    let text = text(plan.format, &sorted, [done, total], &sensors, global.as_ref(), &ending)
         .map_err(|limit| Refusal::Output { limit })?;
     Ok(Merged {
         text,
         done,
         total,
         is_final,
-        eligible: verdict.outcome == Outcome::Finished,
-        entry_status: verdict.entry_status.to_owned(),
-        outcome: verdict.outcome,
+        eligible: ending.outcome == Outcome::Finished,
+        entry_status: ending.entry_status.to_owned(),
+        outcome: ending.outcome,
         score: global.as_ref().map(|global| global.mean(Score::Composed).as_f64()),
         partial_score: partial_score(&done_sorted),
         pairs: pairs(plan, workers),
@@ -335,7 +335,7 @@ fn text(
     [done, total]: [u32; 2],
     sensors: &[Text],
     global: Option<&Global>,
-    verdict: &Verdict,
+    ending: &Ending,
 ) -> Result<String, crate::Limit> {
     let values = global.map(Global::values).unwrap_or_default();
     let labels: Vec<&str> = match global {
@@ -353,8 +353,8 @@ fn text(
     ]);
     let file = Node::object([
         ("_checkpoint", checkpoint),
-        ("entry_status", Node::Str(verdict.entry_status)),
-        ("eligible", Node::Bool(verdict.eligible)),
+        ("entry_status", Node::Str(ending.entry_status)),
+        ("eligible", Node::Bool(ending.eligible)),
         ("sensors", Node::List(sensors.iter().map(Node::Text).collect())),
         ("values", Node::texts(&values)),
         ("labels", Node::texts(&labels)),

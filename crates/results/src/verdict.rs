@@ -34,14 +34,14 @@ impl Outcome {
 }
 
 /// The outcome of the whole run, and what the merged file has of it.
-pub(crate) struct Verdict {
+pub(crate) struct Ending {
     pub(crate) entry_status: &'static str,
     pub(crate) eligible: bool,
     /// The original calls every file without sensors invalid, whatever its workers had.
     pub(crate) outcome: Outcome,
 }
 
-impl Verdict {
+impl Ending {
     pub(crate) fn of(
         plan: &Plan,
         workers: &[Option<&Checkpoint>],

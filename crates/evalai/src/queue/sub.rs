@@ -9,7 +9,7 @@ use jiff::Timestamp;
 
 use super::Now;
 use super::poll::pause;
-use crate::guard::{self, Attempt, End, Start, Verdict};
+use crate::guard::{self, Attempt, End, Interim, Start};
 use crate::row::Row;
 use crate::types::{Ended, ImageAnswer, Outline, Run, SubmissionState, Target};
 use leaderboard_api::evalai_status::{Outcome, Progress, Status};
@@ -156,7 +156,7 @@ impl Sub {
         let end = self.end.as_ref().map(|want| (Write::End, want.since));
         let progress = self.progress.as_ref().map(|want| (Write::Progress, want.since));
         // Partial results of an attempt that EvalAI does not know yet wait for its `queued` or `running`.
-        let may_follow = self.partial_verdict() != Some(Verdict::Wait);
+        let may_follow = self.of_partial() != Some(Interim::Wait);
         let partial = self.partial.as_ref().filter(|_| may_follow);
         end.or(progress)
             .or_else(|| partial.map(|want| (Write::Partial, want.since)))
@@ -165,15 +165,15 @@ impl Sub {
     /// Whether the row, as last read, allows it.
     pub fn may_write(&self, write: Write) -> bool {
         match write {
-            Write::Progress => self.progress_verdict() == Some(Verdict::Send),
-            Write::Partial => self.partial_verdict() == Some(Verdict::Send),
+            Write::Progress => self.of_progress() == Some(Interim::Send),
+            Write::Partial => self.of_partial() == Some(Interim::Send),
             Write::End => self.outcome().is_some(),
         }
     }
 
     /// The end to write: `cancelled` for a submission that was deleted before its end, whatever it was here.
     pub fn outcome(&self) -> Option<Outcome> {
-        match self.end_verdict()? {
+        match self.of_end()? {
             End::Put if self.problem().is_none() => Some(self.end.as_ref()?.what.0),
             End::Cancel => Some(Outcome::Cancelled),
             _ => None,
@@ -275,13 +275,13 @@ impl Sub {
 
     /// Drops the updates that EvalAI shows already.
     pub fn settle(&mut self, now: &Now) {
-        if let Some((Verdict::There, wanted)) = self.progress_verdict().zip(self.progress.clone()) {
+        if let Some((Interim::There, wanted)) = self.of_progress().zip(self.progress.clone()) {
             let known = self.read.unwrap_or(now.at);
             self.known_at = Some(self.known_at.unwrap_or(known));
             self.view.progress = self.view.progress.max(Some(wanted.what));
             self.progress = None;
         }
-        match self.end_verdict() {
+        match self.of_end() {
             Some(End::Done(status)) => self.close(Ended::Agreed { status, at: now.wall }),
             Some(End::Amend(status)) => self.close(Ended::Otherwise(status)),
             Some(End::Wait) => self.retry_at = now.at + UNCLEAR_PAUSE,
@@ -329,7 +329,7 @@ impl Sub {
     }
 
     /// What becomes of the update of progress; none without one, or without a row.
-    fn progress_verdict(&self) -> Option<Verdict> {
+    fn of_progress(&self) -> Option<Interim> {
         let (row, read) = (self.view.row.as_ref()?, self.read?);
         let wanted = self.progress.as_ref()?.what;
         let (attempt, is_known) = (self.attempt(row, read), self.is_known(row, read));
@@ -337,14 +337,14 @@ impl Sub {
     }
 
     /// What becomes of partial results; none without some, or without a row.
-    fn partial_verdict(&self) -> Option<Verdict> {
+    fn of_partial(&self) -> Option<Interim> {
         let (row, read) = (self.view.row.as_ref()?, self.read?);
         self.partial.as_ref()?;
         Some(guard::partial(row.status, self.attempt(row, read)))
     }
 
     /// What becomes of the update to an end; none without one, or without a read since.
-    fn end_verdict(&self) -> Option<End> {
+    fn of_end(&self) -> Option<End> {
         let (row, read, want) = (self.view.row.as_ref()?, self.read?, self.end.as_ref()?);
         let since = !self.outdated && read >= want.since && read >= self.wrote_at;
         since.then(|| guard::end(row.status, self.attempt(row, read), want.what.0))
