@@ -20,7 +20,7 @@ use leaderboard_api::{
     effective, image_pattern, reasons,
 };
 
-/// Whether the plan is pinned, and the submission may go on to its turn. Otherwise the draft shows why not. EvalAI's own end goes before all
+/// Pins the plan and returns true if the submission may go on to its turn. Otherwise the draft shows why not. EvalAI's own end goes before all
 /// that it may wait for, and the look for another program before anything that could end it: an end is written over what that one writes.
 pub(super) fn decide(draft: &mut PlanBuilder<'_>) -> bool {
     let Some(leaderboard) = draft.leaderboard() else {
@@ -81,7 +81,7 @@ fn allowed_image(draft: &mut PlanBuilder<'_>, leaderboard: &LeaderboardSpec, tra
     None
 }
 
-/// What is shown of a row that has come to its end without us. EvalAI resumes only what has failed, re-runs all but what was deleted,
+/// The message for a row that has come to its end without us. EvalAI resumes only what has failed, re-runs all but what was deleted,
 /// and counts what was deleted before its end as being processed until it is ended.
 fn ended_in_evalai(status: Status) -> String {
     let done = if status == Status::Deleted {
@@ -99,7 +99,7 @@ fn ended_in_evalai(status: Status) -> String {
     format!("EvalAI shows {status}: nothing is run and {done}. {next}")
 }
 
-/// What is known of the participant's image.
+/// The participant's image, as far as it is known.
 enum Image {
     Named(String),
     /// It could not be asked for yet.
@@ -135,7 +135,7 @@ fn named_image(draft: &PlanBuilder<'_>) -> Image {
     }
 }
 
-/// What is shown while the file in EvalAI cannot be read.
+/// The message while the file in EvalAI cannot be read.
 fn image_unread(draft: &PlanBuilder<'_>) -> String {
     let error = draft.view.evalai.as_ref().and_then(|view| view.error.as_deref());
     let why = error.map_or_else(String::new, |e| format!(" The last request failed: {}", sentence(e)));
@@ -145,7 +145,7 @@ fn image_unread(draft: &PlanBuilder<'_>) -> String {
     )
 }
 
-/// Whether EvalAI wants the submission to run, or need not be asked.
+/// True if EvalAI wants the submission to run, or need not be asked.
 fn is_wanted(draft: &mut PlanBuilder<'_>) -> bool {
     if draft.spec().evalai.is_none() {
         return true;
@@ -250,14 +250,14 @@ fn image_not_allowed(draft: &PlanBuilder<'_>, leaderboard: &LeaderboardSpec, ima
     Some(charged(reasons::IMAGE_NOT_ALLOWED, what))
 }
 
-/// Whether a check runs what its Leaderboard names for that.
+/// True if a check runs what its Leaderboard names for that.
 fn is_check_image(draft: &PlanBuilder<'_>, leaderboard: &LeaderboardSpec, repository: &Repository<'_>) -> bool {
     let named = leaderboard.check.as_ref().filter(|_| draft.spec().check);
     let named = named.and_then(|check| ImageReference::parse(&check.image).ok());
     named.is_some_and(|named| Repository::of(&named).is_same(repository))
 }
 
-/// What may be submitted; none: everything.
+/// Patterns of the images that may be submitted; None: all may.
 fn image_patterns(draft: &PlanBuilder<'_>, leaderboard: &LeaderboardSpec) -> Option<Vec<ImagePattern>> {
     match &leaderboard.agent.images {
         Some(images) if images.is_empty() => None,

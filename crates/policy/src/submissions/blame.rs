@@ -92,7 +92,7 @@ fn from_outside(host: Option<&ContainerView>, agent: Option<&ContainerView>) -> 
     (by_times_and_rounds(own, agent) == Order::SameRound).then(|| crash(EndReason::EndedFromOutside, own))
 }
 
-/// Whether the kubelet could not start a host's container again that has run in this Pod, for want of processes. That is no failure of its own:
+/// True if the kubelet could not start a host's container again that has run in this Pod, for want of processes. That is no failure of its own:
 /// it is waited for, and an agent that ends meanwhile is the cause.
 fn lacked_processes(container: &ContainerView, end: &EndView) -> bool {
     !is_of_first_life(container) && is_start_without_process(end)
@@ -107,18 +107,18 @@ fn is_of_processes(words: &str) -> bool {
     OF_PROCESSES.iter().any(|sign| words.contains(sign))
 }
 
-/// Whether the last end of a container is that of its first life. The kubelet counts, so no agent changes it.
+/// True if the last end of a container is that of its first life. The kubelet counts, so no agent changes it.
 fn is_of_first_life(container: &ContainerView) -> bool {
     container.restarts <= i32::from(container.has_next_life())
 }
 
-/// Whether an end was a crash, and not one that was asked for.
+/// True if an end was a crash, and not one that was asked for.
 pub(super) fn is_crash(end: &EndView) -> bool {
     let is_asked_for = matches!(what(end), Some(What::Stopped | What::Cancelled | What::Finished));
     end.exit_code != 0 && !is_asked_for
 }
 
-/// Whether an agent reports that it was asked to end, and it was not: its host had to end because of it, or the kubelet starts it
+/// True if an agent reports that it was asked to end, and it was not: its host had to end because of it, or the kubelet starts it
 /// again, which it does in no Pod that is being ended. Where the host was ended from outside, too, the agent may be right.
 fn is_false_claim(host: Option<&ContainerView>, agent: &ContainerView, end: &EndView) -> bool {
     if end.exit_code == 0 {
@@ -133,7 +133,7 @@ fn is_false_claim(host: Option<&ContainerView>, agent: &ContainerView, end: &End
     }
 }
 
-/// Whether a crash was a failure of the host's container itself, which it was not if its Pod was being ended.
+/// True if a crash was a failure of the host's container itself, which it was not if its Pod was being ended.
 fn is_hosts_own(host: Option<&ContainerView>, crash: &Crash) -> bool {
     let was_ended = host.and_then(|container| what(container.last.as_ref()?)) == Some(What::Stopped);
     let is_its = matches!(
@@ -211,7 +211,7 @@ fn of_agent_alone(host: Option<&ContainerView>, blamed: Crash, now: Timestamp) -
     }
 }
 
-/// Whether the kubelet cannot start it. The pause after a crash is none: its last end counts then. One that has run is not kept away by
+/// True if the kubelet cannot start it. The pause after a crash is none: its last end counts then. One that has run is not kept away by
 /// its own fault where the Pod lacks processes.
 fn cannot_be_started(host: &ContainerView) -> bool {
     let is_refused = |(reason, words): &(String, String)| reason != "CrashLoopBackOff" && !is_of_processes(words);
@@ -219,7 +219,7 @@ fn cannot_be_started(host: &ContainerView) -> bool {
     !host.running && (never_ran || host.waiting.as_ref().is_some_and(is_refused))
 }
 
-/// Whether the other side's end may still be seen. A clock that was set back does not prolong this.
+/// True if the other side's end may still be seen. A clock that was set back does not prolong this.
 fn is_awaited(at: Option<Timestamp>, now: Timestamp) -> bool {
     at.is_some_and(|at| now.duration_since(at).as_secs().abs() < Wait::PEER.longest)
 }
@@ -248,7 +248,7 @@ fn of_host(host: Option<&ContainerView>, end: &EndView) -> EndReason {
     }
 }
 
-/// What the agent's own end shows; all of it is the agent's fault, but what its node refused its runner before the agent's command ran. The
+/// The cause that the agent's own end shows; all of it is the agent's fault, but what its node refused its runner before the agent's command ran. The
 /// exit code is the runner's, which no process of the agent has. Processes alone the other agents of the Pod can use up, once they run.
 fn of_agent(container: &ContainerView, end: &EndView) -> EndReason {
     let is_first = is_of_first_life(container);
@@ -406,7 +406,7 @@ pub(super) fn too_many(draft: &mut PlanBuilder<'_>) -> Option<Failure> {
     None
 }
 
-/// Whether another round in the same Pod would end in the same way.
+/// True if another round in the same Pod would end in the same way.
 fn is_hopeless(cause: EndReason) -> bool {
     matches!(
         cause,

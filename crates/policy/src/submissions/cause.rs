@@ -17,7 +17,7 @@ use leaderboard_contract::verdict::WorkspaceReason;
 use leaderboard_pod_spec::layout::{LOGS_VOLUME, SHM_VOLUME};
 use leaderboard_protocol::files::{Member, Side};
 
-/// What is shown should `workspace` not report it itself.
+/// The message should `workspace` not report it itself.
 const NOT_ISOLATED: &str = "The Pod was not shown to be isolated from the network, and network.enforcement is Require. Look at the log of its \
      container workspace.";
 

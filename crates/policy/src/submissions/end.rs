@@ -82,7 +82,7 @@ pub(super) fn of_complete_run(draft: &mut PlanBuilder<'_>) -> bool {
     true
 }
 
-/// Whether the end still waits until the bucket can be read.
+/// True if the end still waits until the bucket can be read.
 fn wait_for_bucket(draft: &mut PlanBuilder<'_>, why: &str) -> bool {
     let limit = if draft.is_cancelled() {
         draft.deadlines().cancel_seconds.max(Wait::CANCELLED_REPORT.longest)
@@ -315,20 +315,20 @@ const REASONS: [&str; 8] = [
 const NO_ROUTE: &str =
     "The attempt had such an end before, and this Job has finished no route, so no further Job follows.";
 
-/// Whether an agent can have provoked a failure.
+/// True if an agent can have provoked a failure.
 fn is_provoked(found: &Failure) -> bool {
     // A pull of the hosts' own images belongs to no worker.
     let is_of_hosts = found.reason == reasons::IMAGE_PULL && found.worker.is_none();
     found.class == FailureClass::Infrastructure && !is_of_hosts && REASONS.contains(&found.reason.as_str())
 }
 
-/// Whether the rule leaves another Job: `before` has the units that were stored when the failed Job was due, None for the attempt's first
+/// True if the rule leaves another Job: `before` has the units that were stored when the failed Job was due, None for the attempt's first
 /// such failure; `stored` those that are stored by now.
 pub(super) fn may_go_on(found: &Failure, before: Option<i32>, stored: i32) -> bool {
     !is_provoked(found) || before.is_none_or(|before| stored > before)
 }
 
-/// The same for the present Job.
+/// True if the rule leaves another Job after the present one.
 fn leaves_a_job(draft: &PlanBuilder<'_>, found: &Failure) -> bool {
     may_go_on(found, draft.status.done_before, stored_routes(draft))
 }

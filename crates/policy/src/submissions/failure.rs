@@ -24,7 +24,7 @@ pub(super) fn participant(reason: &str, what: &str, next: &Steps) -> Failure {
     }
 }
 
-/// The same with the next step of the table of reasons, which both readers can take.
+/// A participant's failure with the next step of the table of reasons, which both readers can take.
 pub(super) fn charged(reason: &str, what: &str) -> Failure {
     participant(reason, what, &for_both(&of_participant(reason)))
 }
@@ -56,7 +56,7 @@ pub(super) fn at_the_end(found: Failure) -> Failure {
     }
 }
 
-/// What was submitted names no image that could ever be pulled.
+/// The submitted text names no image that could ever be pulled.
 pub(super) fn image_invalid(what: &str) -> Failure {
     charged(reasons::IMAGE_INVALID, what)
 }
@@ -162,7 +162,7 @@ pub(super) fn worst(status: &SubmissionStatus) -> Option<Failure> {
     Some(of_worker(worker, cause_of(worker)?, status.node_name.as_deref()))
 }
 
-/// Whether what looked like crashes were runs to the end whose checkpoint is refused: an agent that ends by itself without
+/// True if what looked like crashes were runs to the end whose checkpoint is refused: an agent that ends by itself without
 /// results that can be read is tried again as one that crashed.
 pub(super) fn is_refusal(status: &SubmissionStatus, found: &Failure, report: &ReportDigest) -> bool {
     let by_itself = |worker: &WorkerStatus| matches!(cause_of(worker), Some(EndReason::Exited | EndReason::Incomplete));
@@ -195,7 +195,7 @@ pub(super) fn of_worker(worker: &WorkerStatus, cause: EndReason, node: Option<&s
     }
 }
 
-/// What the node lacked: to draw, or to start an agent.
+/// The node's fault: it cannot draw, or start an agent.
 fn of_node(id: i32, times: &str, cause: EndReason, node: Option<&str>) -> Option<(&'static str, String)> {
     let node = node.map_or_else(|| "the node".to_owned(), |node| format!("node {node}"));
     match cause {
@@ -227,7 +227,7 @@ fn of_node(id: i32, times: &str, cause: EndReason, node: Option<&str>) -> Option
     }
 }
 
-/// What the host's container did, if it was the cause.
+/// The end of the host's container, if that was the cause.
 fn of_host(cause: EndReason) -> Option<&'static str> {
     match cause {
         EndReason::SimulatorCrashed => Some("it crashed"),
@@ -324,7 +324,7 @@ fn of_participant(reason: &str) -> String {
     reasons::of(reason).map_or_else(String::new, |reason| reasons::plain(reason.next_step))
 }
 
-/// What a host does about a failure of the infrastructure that no retry has ended.
+/// The host's next step after a failure of the infrastructure that no retry has ended.
 fn of_infrastructure(reason: &str) -> &'static str {
     match reason {
         // The text of `workspace` has the step before this one.

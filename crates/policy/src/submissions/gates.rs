@@ -15,7 +15,7 @@ use leaderboard_api::text::{LONGEST_NAME, one_line, sentence};
 use leaderboard_api::{Eta, PolicySource, ResourceExt, Waiting, names, reasons};
 use leaderboard_contract::verdict::WorkspaceReason;
 
-/// What a submission passes on its way to a Job.
+/// A condition that a submission passes on its way to a Job.
 #[derive(Clone, Copy, PartialEq, Eq)]
 pub(super) enum Gate {
     /// No other program runs it.
@@ -93,7 +93,7 @@ fn waits_for_policy(draft: &mut PlanBuilder<'_>) -> bool {
     true
 }
 
-/// What is shown of a row that belongs to another phase than the Submission: its run would count for neither.
+/// The message for a row of another phase than the Submission's: its run would count for neither.
 fn foreign_phase(draft: &PlanBuilder<'_>) -> Option<String> {
     let evalai = draft.spec().evalai?;
     let (pk, ours) = (evalai.submission, evalai.phase);
@@ -103,7 +103,7 @@ fn foreign_phase(draft: &PlanBuilder<'_>) -> Option<String> {
     ))
 }
 
-/// Whether the row is of another phase, and has to be of ours again. The object may have been applied with a wrong phase, so nothing
+/// True if the row is of another phase, and has to be of ours again. The object may have been applied with a wrong phase, so nothing
 /// is reported at once; but the participant's submission does not wait for an end without limit.
 fn waits_for_phase(draft: &mut PlanBuilder<'_>) -> bool {
     let Some(what) = foreign_phase(draft) else {
@@ -161,7 +161,7 @@ pub(super) fn missing_policy(draft: &PlanBuilder<'_>) -> Option<Missing> {
     Some(Missing { message, is_refused })
 }
 
-/// Whether no Job may be made at the moment, because of its Leaderboard.
+/// True if no Job may be made at the moment, because of its Leaderboard.
 pub(super) fn is_held_up(draft: &mut PlanBuilder<'_>) -> bool {
     if draft.leaderboard().is_none() {
         let message = draft.no_leaderboard();
@@ -183,7 +183,7 @@ pub(super) fn is_held_up(draft: &mut PlanBuilder<'_>) -> bool {
 pub(super) const NOT_WRITTEN: &str = "Nothing is written of this end, because another program may run the submission. If none does, \
                                       cancel it in EvalAI.";
 
-/// Whether the submission is held back, or that is not known yet.
+/// True if the submission is held back, or that is not known yet.
 fn waits_for_other_program(draft: &mut PlanBuilder<'_>) -> bool {
     if draft.is_adopted() {
         return false;
@@ -287,7 +287,7 @@ fn adoption() -> String {
     )
 }
 
-/// Whether a Pod of the submission has found results of something else below the prefix, and nobody has handed it over since.
+/// True if a Pod of the submission has found results of something else below the prefix, and nobody has handed it over since.
 fn is_held_by_prefix(draft: &PlanBuilder<'_>) -> bool {
     draft.status.plan.is_some() && draft.is_held()
 }

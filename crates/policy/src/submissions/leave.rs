@@ -39,7 +39,7 @@ pub(super) fn show_refused_attempt(draft: &mut PlanBuilder<'_>) {
     }
 }
 
-/// What becomes of the Job of an attempt that has ended: it is kept for its time, and one that shows up late is ended.
+/// Keeps the Job of an attempt that has ended for its time, and ends one that shows up late.
 pub(super) fn leave_job(draft: &mut PlanBuilder<'_>) {
     let ObservedJob::Ours(job) = &draft.view.job else {
         return;
@@ -150,7 +150,7 @@ fn deleted_at(draft: &PlanBuilder<'_>) -> Option<Timestamp> {
     may_go.then(|| after(end.last_transition_time.0, kept))
 }
 
-/// Whether its Job has not ended: with the Submission its Pod would go.
+/// True if its Job has not ended: with the Submission its Pod would go.
 fn has_job(draft: &PlanBuilder<'_>) -> bool {
     matches!(&draft.view.job, ObservedJob::Ours(job) if job.end.is_none())
 }

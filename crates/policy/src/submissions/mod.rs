@@ -108,7 +108,7 @@ fn in_line(draft: &mut PlanBuilder<'_>) {
     }
 }
 
-/// Its Job is there: it starts, runs, is stopped, or has ended.
+/// The Job is there: the submission starts, runs, is stopped, or has ended.
 fn with_job(draft: &mut PlanBuilder<'_>, job: &JobView) {
     if gates::holds_back(draft, job) {
         return;
@@ -130,7 +130,7 @@ fn with_job(draft: &mut PlanBuilder<'_>, job: &JobView) {
     }
 }
 
-/// Its Pod starts or runs, or is to stop: the first cause of a stop counts.
+/// The Pod starts or runs. The first cause of a stop counts.
 fn under_way(draft: &mut PlanBuilder<'_>, job: &JobView) {
     if !draft.is_to_stop() {
         run::watch(draft);
@@ -195,7 +195,7 @@ fn without_its_job(draft: &mut PlanBuilder<'_>) {
     start::start_job(draft);
 }
 
-/// Whether Kubernetes may have removed the Job by its time to live, after an end that nobody has read.
+/// True if Kubernetes may have removed the Job by its time to live, after an end that nobody has read.
 fn has_expired(draft: &PlanBuilder<'_>) -> bool {
     let times = &draft.status.times;
     let known = [&times.scheduled, &times.started, &times.accepted];

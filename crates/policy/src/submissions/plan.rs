@@ -8,7 +8,7 @@ use crate::view::{LogPlace, ReportDemand};
 use leaderboard_api::{JobNumber, SubmissionStatus, names};
 use leaderboard_contract::run::Stop;
 
-/// What a reconcile wants: the status to show, then the actions in order, then the events.
+/// The result of a reconcile: the status to show, then the actions in order, then the events.
 #[derive(Clone, Debug, PartialEq)]
 pub struct Plan {
     pub status: SubmissionStatus,
@@ -21,7 +21,7 @@ pub struct Plan {
     pub requeue: Option<Duration>,
 }
 
-/// What becomes of a submission's slot and of its place in line.
+/// The use that a submission makes of its slot and of its place in line.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 pub enum SlotUse {
     /// The Job is about to be created, or exists.
@@ -33,7 +33,7 @@ pub enum SlotUse {
 }
 
 impl Plan {
-    /// What becomes of the slot.
+    /// The use that the plan makes of the slot.
     pub fn slot(&self) -> SlotUse {
         if self.status.job_name.is_some() && !self.status.has_ended() {
             SlotUse::Holds
@@ -108,7 +108,7 @@ pub enum Question {
     EvalaisEnd,
 }
 
-/// What is sent to EvalAI.
+/// An update of EvalAI.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 pub enum EvalaiUpdate {
     Queued,
@@ -122,7 +122,7 @@ pub enum EvalaiUpdate {
     Cancelled,
 }
 
-/// What is written to the table.
+/// A write to the table.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 pub enum TableUpdate {
     /// How a run stands, with the next write of its row.

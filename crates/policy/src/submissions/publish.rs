@@ -1,6 +1,7 @@
 //! What other systems get of an end: EvalAI first, then the table's row.
 //!
-//! The cancel race: EvalAI's own end wins until our result is answered (`amend`), and stands after it (`note_late_cancel`).
+//! The cancel race ([`CancelRace`]): EvalAI's own end wins until our result is answered (`amend`), and changes no state after it
+//! (`note_late_cancel`).
 
 use std::time::Duration;
 
@@ -35,7 +36,7 @@ pub(super) fn decide(draft: &mut PlanBuilder<'_>) {
             follow_evalai(draft);
             false
         }
-        Delivery::Answered(at) => record(draft, draft.now() >= shown_by(at)) == Delivery::Done,
+        Delivery::Answered(at) => record(draft, draft.now() >= Wait::TOGETHER.shown_at(at)) == Delivery::Done,
         Delivery::Done | Delivery::Refused => record(draft, true) == Delivery::Done,
     };
     if let Delivery::Answered(at) = published {
@@ -49,11 +50,9 @@ pub(super) fn decide(draft: &mut PlanBuilder<'_>) {
     if complete {
         draft.act(Action::Forget);
         leave::delete_in_time(draft);
+        leave::remove_job_in_time(draft);
     } else {
         draft.look_again(Wait::DELIVERY);
-    }
-    if complete {
-        leave::remove_job_in_time(draft);
     }
     leave::release(draft, complete);
 }
@@ -72,7 +71,7 @@ pub(super) enum Delivery {
 
 /// Shows that EvalAI has the end. The table's answer is waited for, so that both are one write.
 fn show_published(draft: &mut PlanBuilder<'_>, at: Timestamp, recorded: bool) {
-    let until = shown_by(at);
+    let until = Wait::TOGETHER.shown_at(at);
     if !recorded && draft.now() < until {
         return draft.requeue_at(until);
     }
@@ -81,18 +80,10 @@ fn show_published(draft: &mut PlanBuilder<'_>, at: Timestamp, recorded: bool) {
     published(draft, team.as_deref());
 }
 
-fn shown_by(at: Timestamp) -> Timestamp {
-    Wait::TOGETHER.shown_at(at)
-}
-
-fn is_not_wanted(draft: &PlanBuilder<'_>, type_: &str) -> bool {
-    let known = draft.status.condition(type_);
-    known.is_some_and(|c| c.reason == reasons::NOT_REQUIRED)
-}
-
 /// A Leaderboard that is gone can't show what is wanted: what was decided before stands, and what never ran needs nothing.
 fn without_leaderboard(draft: &mut PlanBuilder<'_>, type_: &str) -> Delivery {
-    if is_not_wanted(draft, type_) {
+    let known = draft.status.condition(type_);
+    if known.is_some_and(|c| c.reason == reasons::NOT_REQUIRED) {
         return Delivery::Done;
     }
     let message = draft.no_leaderboard();
@@ -104,21 +95,50 @@ fn without_leaderboard(draft: &mut PlanBuilder<'_>, type_: &str) -> Delivery {
     }
 }
 
-fn publish(draft: &mut PlanBuilder<'_>, log_left: Option<Duration>) -> Delivery {
+/// The cancel race: EvalAI may end a submission while our own end is decided, on its way, or there.
+#[derive(Clone, Copy, PartialEq, Eq)]
+enum CancelRace {
+    /// No end is ours to send: EvalAI's was first, or the row is another phase's or program's. The condition shows this.
+    NotOurs(&'static str),
+    /// EvalAI's end was first, and a write of ours may have undone it: `cancelled` is sent.
+    Overtaken,
+    /// EvalAI has our end. A cancel after it changes no state.
+    Over,
+    /// Our end is on its way, and EvalAI's answer decides.
+    Open,
+}
+
+fn cancel_race(draft: &PlanBuilder<'_>) -> CancelRace {
     let end = draft.status.condition(conditions::FINISHED);
     let is_evalais = end.is_some_and(|c| c.reason == reasons::ENDED_IN_EVALAI);
     let is_overtaken = is_evalais && is_overtaken(draft);
     // One that was deleted before its end is ended there all the same: EvalAI counts it against its team until then.
     let is_ours = draft.spec().evalai.is_some() && (is_overtaken || !is_of_another_phase(draft));
-    let is_held = is_ours && draft.is_held();
-    if !is_ours || is_held || (is_evalais && !is_overtaken) || draft.observes() {
-        let message = if is_held { gates::NOT_WRITTEN } else { "" };
-        draft.condition(conditions::PUBLISHED, Truth::False, reasons::NOT_REQUIRED, message);
-        return Delivery::Done;
+    if is_ours && draft.is_held() {
+        CancelRace::NotOurs(gates::NOT_WRITTEN)
+    } else if !is_ours || (is_evalais && !is_overtaken) || draft.observes() {
+        CancelRace::NotOurs("")
+    } else if draft.status.is_delivered(conditions::PUBLISHED) {
+        CancelRace::Over
+    } else if is_overtaken {
+        CancelRace::Overtaken
+    } else {
+        CancelRace::Open
     }
-    if draft.status.is_delivered(conditions::PUBLISHED) {
-        note_late_cancel(draft);
-        return Delivery::Done;
+}
+
+fn publish(draft: &mut PlanBuilder<'_>, log_left: Option<Duration>) -> Delivery {
+    let race = cancel_race(draft);
+    match race {
+        CancelRace::NotOurs(message) => {
+            draft.condition(conditions::PUBLISHED, Truth::False, reasons::NOT_REQUIRED, message);
+            return Delivery::Done;
+        }
+        CancelRace::Over => {
+            note_late_cancel(draft);
+            return Delivery::Done;
+        }
+        CancelRace::Overtaken | CancelRace::Open => {}
     }
     if draft.leaderboard().is_none() {
         return without_leaderboard(draft, conditions::PUBLISHED);
@@ -132,7 +152,7 @@ fn publish(draft: &mut PlanBuilder<'_>, log_left: Option<Duration>) -> Delivery 
             Delivery::Refused
         }
         None => {
-            send_end(draft, view, is_overtaken, log_left);
+            send_end(draft, view, race == CancelRace::Overtaken, log_left);
             Delivery::Waiting
         }
     }
@@ -213,7 +233,7 @@ fn published(draft: &mut PlanBuilder<'_>, team: Option<&str>) {
     }
 }
 
-/// Whether it was taken back before it was ever accepted, because EvalAI's row is another phase's: the row is not ours to end.
+/// True if it was taken back before it was ever accepted, because EvalAI's row is another phase's: the row is not ours to end.
 fn is_of_another_phase(draft: &PlanBuilder<'_>) -> bool {
     let accepted = draft.status.condition(conditions::ACCEPTED);
     let differs = accepted.is_some_and(|c| c.reason == reasons::PHASE_DIFFERS);
@@ -229,7 +249,7 @@ pub fn previous_controller(until: Timestamp) -> String {
     )
 }
 
-/// What keeps an end from being published. The first text stands: another one for the same would be a write each time.
+/// The message for an end that cannot be read. The first text stands: another one for the same would be a write each time.
 fn cannot_be_read(draft: &PlanBuilder<'_>, type_: &str, why: &str) -> String {
     const BEGINS: &str = "The stored result cannot be read:";
     let known = draft.status.condition(type_).map(|c| c.message.to_string());
@@ -242,7 +262,7 @@ fn cannot_be_read(draft: &PlanBuilder<'_>, type_: &str, why: &str) -> String {
     })
 }
 
-/// Whether EvalAI's own end may have been undone by a write of ours that was under way. The condition remembers it.
+/// True if EvalAI's own end may have been undone by a write of ours that was under way. The condition remembers it.
 fn is_overtaken(draft: &PlanBuilder<'_>) -> bool {
     let published = draft.status.condition(conditions::PUBLISHED);
     draft.view.evalai.as_ref().is_some_and(|e| e.overtaken)
@@ -280,7 +300,7 @@ fn amend(draft: &mut PlanBuilder<'_>, status: Status) -> Delivery {
         return Delivery::Done;
     }
     draft.condition(conditions::RECORDED, Truth::False, reasons::WAITING, "");
-    record_end(draft);
+    draft.act(Action::Record(TableUpdate::End));
     Delivery::Waiting
 }
 
@@ -348,9 +368,15 @@ fn record(draft: &mut PlanBuilder<'_>, is_shown: bool) -> Delivery {
         return Delivery::Done;
     }
     let mut unread = None;
-    match row_of_end(draft) {
+    // Only the row of a finished submission has metrics.
+    let reading = if draft.is_successful() {
+        run::report_of_end(draft)
+    } else {
+        Reading::Done
+    };
+    match reading {
         Reading::Waits(why) => unread = why.map(|why| cannot_be_read(draft, conditions::RECORDED, &why)),
-        Reading::Done => record_end(draft),
+        Reading::Done => draft.act(Action::Record(TableUpdate::End)),
     }
     let (reason, message) = match view.error {
         Some(error) => (
@@ -384,19 +410,6 @@ fn why_without_row(draft: &PlanBuilder<'_>) -> Option<String> {
         )
     } else {
         superseded(draft)
-    }
-}
-
-fn record_end(draft: &mut PlanBuilder<'_>) {
-    draft.act(Action::Record(TableUpdate::End));
-}
-
-/// Whether all that the row shows is there: only that of a finished submission has metrics.
-fn row_of_end(draft: &mut PlanBuilder<'_>) -> Reading {
-    if draft.is_successful() {
-        run::report_of_end(draft)
-    } else {
-        Reading::Done
     }
 }
 

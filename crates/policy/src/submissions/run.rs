@@ -40,7 +40,7 @@ pub(super) fn take_in(draft: &mut PlanBuilder<'_>) {
     }
 }
 
-/// What ends a run under way: a full disk, agents with different images, crashes, time.
+/// Ends a run under way for a full disk, agents with different images, crashes, time.
 pub(super) fn watch(draft: &mut PlanBuilder<'_>) {
     let found = cause::disk_full(draft).or_else(|| image_changed(draft));
     if let Some(found) = found.or_else(|| blame::too_many(draft)) {
@@ -60,7 +60,7 @@ pub(super) fn watch(draft: &mut PlanBuilder<'_>) {
     }
 }
 
-/// What EvalAI hears of a live submission; it is sent once, however often it is requested.
+/// Shows a live submission in EvalAI; each update is sent once, however often it is requested.
 pub(super) fn update_evalai(draft: &mut PlanBuilder<'_>) {
     if draft.spec().evalai.is_none() {
         return;
@@ -198,7 +198,7 @@ pub(super) fn count_attempts(draft: &mut PlanBuilder<'_>) {
     plan.earlier_attempts = plan.earlier_attempts.max(ahead);
 }
 
-/// Whether a report can be of the present Job, rather than of one before it whose end is settled: it stays where it is until the present
+/// True if a report can be of the present Job, rather than of one before it whose end is settled: it stays where it is until the present
 /// Job's first round. The Pod decides. Without one, what was stopped is the present Job's only if that is being ended too.
 pub(super) fn is_of_present_job(draft: &PlanBuilder<'_>, report: &ReportDigest) -> bool {
     draft.is_first_job()
@@ -236,7 +236,7 @@ fn note_logs(draft: &mut PlanBuilder<'_>, report: &ReportDigest) {
     }
 }
 
-/// What is known of a result that is to be published.
+/// The state of a result that is to be published.
 pub(super) enum Reading {
     /// As much as there ever will be.
     Done,
@@ -291,7 +291,7 @@ fn stage_of_live(draft: &PlanBuilder<'_>) -> Option<Stage> {
     }
 }
 
-/// Whether the report that is known was asked for at this stage of the run, or later.
+/// True if the report that is known was asked for at this stage of the run, or later.
 pub(super) fn is_of(draft: &PlanBuilder<'_>, stage: Stage) -> bool {
     draft.view.report.stage >= Some(stage)
 }
@@ -301,7 +301,7 @@ pub(super) fn answer_left(draft: &PlanBuilder<'_>) -> Option<Duration> {
     Wait::REPORT.silence_left(draft.view.report.waited)
 }
 
-/// Whether the report of an ended run is there. Asks for it.
+/// Asks for the report of an ended run.
 pub(super) fn report_of_end(draft: &mut PlanBuilder<'_>) -> Reading {
     // What never had a Job has stored nothing.
     if draft.status.plan.is_none() || !draft.status.has_run() {
@@ -320,7 +320,7 @@ pub(super) fn report_of_end(draft: &mut PlanBuilder<'_>) -> Reading {
     }
 }
 
-/// Whether an end is still to be sent to EvalAI, with the texts that were read.
+/// True if an end is still to be sent to EvalAI, with the texts that were read.
 pub fn awaits_publication(status: &SubmissionStatus) -> bool {
     let published = status.condition(conditions::PUBLISHED);
     let is_open = |c: &Condition| c.reason != reasons::REFUSED && !status.is_delivered(conditions::PUBLISHED);
@@ -338,7 +338,7 @@ pub fn patience(view: &View, status: &SubmissionStatus) -> Patience {
     }
 }
 
-/// Whether an end that is published once waits for its result: so long after it was decided, and not until the finalizer gives up.
+/// True if an end that is published once waits for its result: so long after it was decided, and not until the finalizer gives up.
 fn may_wait(draft: &PlanBuilder<'_>) -> bool {
     draft.now() < waits_until(draft.view, &draft.status, Wait::UNREAD)
 }
@@ -411,7 +411,7 @@ pub(super) fn count_use(draft: &mut PlanBuilder<'_>, end: Timestamp) {
     }
 }
 
-/// Whether the run takes time at present: the Pod that is there has a node, and an agent of it has started.
+/// True if the run takes time at present: the Pod that is there has a node, and an agent of it has started.
 fn goes_on(draft: &PlanBuilder<'_>) -> bool {
     has_node(draft) && began_at(draft).is_some()
 }

@@ -328,7 +328,7 @@ fn unschedulable(draft: &mut PlanBuilder<'_>, job: &JobView, words: &str, scale_
     show_wait(draft, reason, &message);
 }
 
-/// Whether no node has had the Pod for as long as `scheduleSeconds` allows: then the attempt fails.
+/// True if no node has had the Pod for as long as `scheduleSeconds` allows: then the attempt fails.
 fn is_late(draft: &mut PlanBuilder<'_>, job: &JobView, reason: &str, message: &str) -> bool {
     let Some(limit) = draft.deadlines().schedule_seconds else {
         return false;
@@ -433,7 +433,7 @@ fn last_begun(pod: &PodView) -> Option<Timestamp> {
     begun.max()
 }
 
-/// Whether the kubelet goes on to the next one.
+/// True if the kubelet goes on to the next one.
 fn is_through(container: &ContainerView) -> bool {
     let has_ended_well = container.last.as_ref().is_some_and(|end| end.exit_code == 0);
     let stays = container.running && container.name == names::CONTAINER_LOGCOPY;

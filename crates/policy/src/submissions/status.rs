@@ -15,7 +15,7 @@ use leaderboard_api::{
     SubmissionSpec, SubmissionStatus, effective, names, reasons,
 };
 
-/// What Kubernetes' own events and the status show anyway: a write for each would cost every submission the same again.
+/// Reasons that Kubernetes' own events and the status show anyway: a write for each would cost every submission the same again.
 const WITHOUT_EVENT: [&str; 4] = [
     reasons::PREPARING,
     reasons::ASKING_EVALAI,
@@ -132,7 +132,7 @@ impl<'a> PlanBuilder<'a> {
         self.is_followed() && pod.is_none_or(|pod| pod.run_ended.is_none())
     }
 
-    /// What EvalAI last reported of it.
+    /// EvalAI's last report of it.
     pub(super) fn evalai_info(&self) -> Option<&'a EvalaiInfo> {
         self.view.evalai.as_ref()?.info.as_ref()
     }
@@ -177,13 +177,13 @@ impl<'a> PlanBuilder<'a> {
         matches!(self.status.state_of_conditions(), State::Running | State::Resumed)
     }
 
-    /// Whether the present Job was there. Only then does its absence mean that it was deleted: a crash of the controller before
+    /// True if the present Job was there. Only then does its absence mean that it was deleted: a crash of the controller before
     /// its creation looks the same. A report proves the first Job of an attempt; that of a later one may be its predecessor's.
     pub(super) fn was_job_seen(&self) -> bool {
         self.status.times.scheduled.is_some() || (self.is_first_job() && self.view.report.ours().is_some())
     }
 
-    /// Whether the attempt has had no other Job than the present one.
+    /// True if the attempt has had no other Job than the present one.
     pub(super) fn is_first_job(&self) -> bool {
         self.status.retry == 0 && self.status.recreated == 0
     }
@@ -208,7 +208,7 @@ impl<'a> PlanBuilder<'a> {
         }
     }
 
-    /// Whether nothing of the attempt is there that could be stopped.
+    /// True if nothing of the attempt is there that could be stopped.
     fn is_without_job(&self) -> bool {
         let is_seen = matches!(self.view.job, ObservedJob::Ours(_) | ObservedJob::Created);
         self.status.job_name.is_none() && !is_seen
@@ -364,7 +364,7 @@ impl<'a> PlanBuilder<'a> {
         self.show(reasons::REPLACING, message);
     }
 
-    /// What is shown while the Leaderboard does not exist.
+    /// The message while the Leaderboard does not exist.
     pub(super) fn no_leaderboard(&self) -> String {
         let name = &self.spec().leaderboard_name;
         format!("There is no Leaderboard {name} in this namespace. Apply it, and the submission goes on.")
@@ -383,7 +383,7 @@ impl<'a> PlanBuilder<'a> {
         message
     }
 
-    /// The same with the words of this moment: for a cause that changes while the reason stays.
+    /// Stalls with the words of this moment: for a cause that changes while the reason stays.
     pub(super) fn stall_with(&mut self, reason: &str, message: &str) {
         self.blocked(reason);
         self.condition(conditions::STALLED, Truth::True, reason, message);

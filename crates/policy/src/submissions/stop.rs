@@ -55,7 +55,7 @@ pub(super) fn decide(draft: &mut PlanBuilder<'_>, job: &JobView) {
     }
 }
 
-/// Whether the Job ends because its node is about to go.
+/// True if the Job ends because its node is about to go.
 fn is_leaving(draft: &PlanBuilder<'_>) -> bool {
     !draft.is_cancelled() && draft.status.failure.as_deref().is_some_and(is_interruption)
 }
@@ -217,7 +217,7 @@ fn fence_left(draft: &PlanBuilder<'_>) -> Option<Duration> {
     Wait::FENCE.left(waited)
 }
 
-/// The same for what follows the Pod: only a fence that was requested is waited for.
+/// How long the steps after the Pod wait for the fence: only for one that was requested.
 pub(super) fn requested_fence_left(draft: &PlanBuilder<'_>) -> Option<Duration> {
     fence_left(draft).filter(|_| draft.view.fence != ObservedFence::NotRequested)
 }
@@ -277,7 +277,7 @@ fn interruption(draft: &PlanBuilder<'_>, pod: &PodView) -> Option<String> {
     (!was_here).then(|| format!("Node {node} is about to be taken away (taint {taint})."))
 }
 
-/// Who evicts a Pod, unless its own containers may be the cause: they can use up the node's memory, so that the kubelet evicts them, or
+/// The evictor of a Pod, unless its own containers may be the cause: they can use up the node's memory, so that the kubelet evicts them, or
 /// the node is not ready and the taint manager does.
 fn taken_by(pod: &PodView) -> Option<&str> {
     let who = pod.disruption.as_deref()?;
@@ -286,7 +286,7 @@ fn taken_by(pod: &PodView) -> Option<&str> {
         .then_some(who)
 }
 
-/// Whether a failure is one.
+/// True if a failure is an interruption.
 pub(super) fn is_interruption(found: &Failure) -> bool {
     found.reason == reasons::NODE_INTERRUPTED
 }
@@ -297,7 +297,7 @@ pub(super) fn other_failures(status: &SubmissionStatus) -> i32 {
     status.retry.saturating_sub(interruptions)
 }
 
-/// One more.
+/// Counts an interruption.
 pub(super) fn note_interruption(draft: &mut PlanBuilder<'_>) {
     let now = Time(draft.now());
     let node = draft.status.node_name.clone();

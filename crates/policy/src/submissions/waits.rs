@@ -62,16 +62,16 @@ impl Wait {
     pub(super) const STOP_MARGIN: Self = row(NONE, NONE, 15);
     /// A Job that is being deleted; `longest` is the grace of a Pod that did not stop by itself.
     pub(super) const DELETION: Self = row(NONE, 2, 60);
-    /// The same of a Job that somebody else deletes.
+    /// A Job that somebody else deletes.
     pub(super) const OTHERS_DELETION: Self = row(NONE, 5, NONE);
-    /// What is stored on a node that is about to go: of the two minutes of a Spot instance's notice, what is left when the cluster has passed
+    /// The uploads from a node that is about to go: of the two minutes of a Spot instance's notice, what is left when the cluster has passed
     /// it on.
     pub(super) const LEAVING: Self = row(NONE, NONE, 90);
     /// Grace of such a Pod after that: all that takes longer is lost with the node.
     pub(super) const LEAVING_GRACE: Self = row(NONE, NONE, 5);
     /// A Pod past its grace whose node is not known.
     pub(super) const LOST_POD: Self = row(NONE, NONE, 30);
-    /// The same while the kubelet reports: it may still be cleaning up.
+    /// A Pod past its grace whose kubelet reports: it may still be cleaning up.
     pub(super) const STUCK_POD: Self = row(NONE, NONE, 120);
     /// A Pod that is being deleted on a node that is silent or gone. The node controller itself has waited some 40 s for a word, and 60 s more
     /// before it deletes the Pod.
@@ -82,11 +82,11 @@ impl Wait {
     pub(super) const DELIVERY: Self = row(NONE, 30, NONE);
     /// The table's answer, to be shown with EvalAI's.
     pub(super) const TOGETHER: Self = row(10, NONE, NONE);
-    /// What cannot be read of a result that is to be published: as long as its end has waited.
+    /// The parts of a result to be published that cannot be read: as long as its end has waited.
     pub(super) const UNREAD: Self = row(NONE, NONE, DAY);
     /// Texts of another round than the report: they hardly change.
     pub(super) const UNFIT: Self = row(NONE, NONE, 600);
-    /// What is left to publish an end in before the finalizer of a deleted object gives up.
+    /// The time to publish an end before the finalizer of a deleted object gives up.
     pub(super) const BEFORE_RELEASE: Self = row(NONE, NONE, 120);
     /// The end of a retention, which an edit of the Leaderboard moves.
     pub(super) const RETENTION: Self = row(NONE, 3600, NONE);
@@ -128,7 +128,7 @@ const fn row(silent: i64, again: i64, longest: i64) -> Wait {
     Wait { silent, again, longest }
 }
 
-/// What is left of a time of which so much has passed.
+/// The rest of a time of which so much has passed.
 fn left_of(time: Duration, passed: Duration) -> Option<Duration> {
     time.checked_sub(passed).filter(|left| !left.is_zero())
 }

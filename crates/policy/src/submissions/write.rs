@@ -14,7 +14,7 @@ pub(super) const FIRST_PLACES: i32 = 20;
 /// Periods that progress waits for, where that is shorter.
 const PERIODS: u32 = 3;
 
-/// What separates two statuses.
+/// The difference of two statuses.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 pub(super) enum Change {
     Nothing,
