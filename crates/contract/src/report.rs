@@ -234,9 +234,7 @@ pub struct ContentId([u8; 16]);
 
 impl ContentId {
     pub fn of(bytes: &[u8]) -> Self {
-        let mut id = [0; 16];
-        id.copy_from_slice(&Sha256::digest(bytes)[..16]);
-        Self(id)
+        Self(Sha256::digest(bytes).first_chunk().copied().unwrap_or_default())
     }
 }
 

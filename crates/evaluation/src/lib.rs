@@ -13,6 +13,7 @@
 
 pub mod carla;
 #[cfg(any(test, feature = "fixtures"))]
+#[allow(clippy::unwrap_used, clippy::arithmetic_side_effects)]
 pub mod fixtures;
 mod gathered;
 pub mod judge;

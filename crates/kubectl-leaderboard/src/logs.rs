@@ -164,7 +164,7 @@ fn sources(wanted: &Logs, workers: usize) -> Vec<Source> {
 
 fn workers(submission: &Submission) -> usize {
     let plan = submission.status.as_ref().and_then(|status| status.plan.as_ref());
-    plan.map_or(0, |plan| plan.workers())
+    plan.map_or(0, leaderboard_api::RunPlan::workers)
 }
 
 /// Prints the lines of several containers so far, one after the other, each with its label.
