@@ -188,13 +188,12 @@ async fn prepare(client: &Client, setup: &Setup, storage: &str) -> Outcome<()> {
     });
     api::create(client, "/api/v1/nodes", node.to_string().into_bytes()).await?;
     let mut spec = json!({
-        "tracks": [{"name": "sensors", "codename": "SENSORS"}],
-        "leaderboardVersion": "V2",
-        "contents": {"image": "registry.example/contents:1"},
-        "simulator": {"image": "registry.example/simulator:1"},
-        "storage": {"bucket": BUCKET, "endpoint": storage},
-        "pairs": PAIRS,
-        "routes": ROUTES,
+        "tracks": [{"name": "sensors"}],
+        "evaluation": {"carla": {
+            "version": "V2", "contents": {"image": "registry.example/contents:1"},
+            "simulator": {"image": "registry.example/simulator:1"}, "pairs": PAIRS, "routes": ROUTES,
+        }},
+        "storage": {"s3": {"bucket": BUCKET, "endpoint": storage}},
     });
     if setup.pods != Some(Pods::Wait) {
         // No scheduler runs.

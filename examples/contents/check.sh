@@ -11,7 +11,7 @@ mkdir -p "$out"/{leaderboard,scenario_runner,CARLA}
 out=$(realpath "$out")
 chmod 0777 "$out"/{leaderboard,scenario_runner,CARLA}
 
-# The default of contents.command.
+# The default of evaluation.carla.contents.command.
 script='set -e
 : "${LEADERBOARD_ROOT:?}" "${SCENARIO_RUNNER_ROOT:?}" "${CARLA_PYTHON_API_ROOT:?}"
 cp -r ${LEADERBOARD_ROOT}/* /tmp/leaderboard/
@@ -37,7 +37,7 @@ import sys
 from xml.etree import ElementTree
 
 ids = [route.get("id") for route in ElementTree.parse(sys.argv[1]).getroot().iter("route")]
-print(f"{len(ids)} routes: spec.routes of the Leaderboard")
+print(f"{len(ids)} routes: evaluation.carla.routes of the Leaderboard")
 wrong = [f"the route at position {at} has the id {found}" for at, found in enumerate(ids) if found != str(at)]
 print("\n".join(wrong[:5]), end="\n" if wrong else "")
 sys.exit(bool(wrong))

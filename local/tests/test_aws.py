@@ -33,7 +33,7 @@ ROWS = {
     "controller": "controller",
     "bridge": "bridge",
     "Pods of submissions": "submission-worker",
-    "controller, where `logGroup.retentionDays` is set": "log-groups",
+    "controller, where `logs.cloudWatch.retentionDays` is set": "log-groups",
     "controller and Pods, where S3 uses a key of KMS": "kms",
 }
 # Keys of eksctl's schema that the file may use, so that a misspelled one is noticed.
@@ -77,7 +77,7 @@ def text_as_yaml(text: str) -> Any:
 def gpus_of(file: Path) -> int:
     """GPUs that a Pod of a Leaderboard requests. `PerContainer`: one for each simulator and each agent."""
     ((leaderboard,),) = in_environment(["yaml", str(file)]).values()
-    gpu, pairs = leaderboard["spec"]["gpu"], leaderboard["spec"].get("pairs", 4)
+    gpu, pairs = leaderboard["spec"]["gpu"], leaderboard["spec"]["evaluation"]["carla"].get("pairs", 4)
     assert gpu == {"resourceName": "nvidia.com/gpu"}, gpu
     return 2 * pairs
 

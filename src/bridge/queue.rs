@@ -52,7 +52,9 @@ impl QueueError {
                 "check the operator's AWS credentials and that they allow sqs:{}",
                 self.action
             ),
-            Fault::Missing => "check queue.url, queue.region and queue.endpoint of its Leaderboards".to_owned(),
+            Fault::Missing => {
+                "check queue.sqs.url, queue.sqs.region and queue.sqs.endpoint of its Leaderboards".to_owned()
+            }
             Fault::Refused => "check the queue's settings".to_owned(),
             Fault::Throttled | Fault::Unavailable | Fault::Conflict => "it is retried".to_owned(),
         }
@@ -375,7 +377,7 @@ mod tests {
         assert!(
             error(Fault::Missing)
                 .to_string()
-                .ends_with("check queue.url, queue.region and queue.endpoint of its Leaderboards")
+                .ends_with("check queue.sqs.url, queue.sqs.region and queue.sqs.endpoint of its Leaderboards")
         );
         assert!(error(Fault::Throttled).to_string().ends_with("it is retried"));
     }

@@ -154,7 +154,7 @@ impl Source for SqsQueue {
 
     async fn set_aside(&self, message: &Received, reason: &DeadReason, rules: &Rules) -> Result<SetAside, String> {
         let to = rules.dead_letter.as_ref();
-        let to = to.ok_or("no Leaderboard of this queue has queue.deadLetterURL")?;
+        let to = to.ok_or("no Leaderboard of this queue has queue.sqs.deadLetterURL")?;
         let sent = self.reader()?.send_dead(to, message, reason).await;
         sent.map_err(|error| error.to_string())?;
         Ok(SetAside {

@@ -28,18 +28,18 @@ pub(super) fn board(name: &str, second: i64) -> Leaderboard {
         "metadata": {"name": name, "namespace": "ns", "creationTimestamp": created},
         "spec": {
             "evalai": {"apiServer": "https://e", "challenge": 1, "token": {"secretKeyRef": {"name": "t", "key": "k"}}},
-            "tracks": [{"name": "sensors", "codename": "SENSORS", "phase": 2}, {"name": "map", "codename": "MAP", "phase": 3}],
-            "leaderboardVersion": "V2",
-            "contents": {"image": "c"},
-            "simulator": {"image": "s"},
-            "storage": {"bucket": "bbb"}
+            "tracks": [{"name": "sensors", "phase": 2}, {"name": "map", "phase": 3}],
+            "evaluation": {"carla": {
+                "version": "V2", "contents": {"image": "c"}, "simulator": {"image": "s"},
+            }},
+            "storage": {"s3": {"bucket": "bbb"}}
         }
     }))
     .unwrap()
 }
 
 pub(super) fn with_queue(mut board: Leaderboard, url: &str) -> Arc<Leaderboard> {
-    board.spec.queue = Some(serde_json::from_value(json!({"url": url})).unwrap());
+    board.spec.queue = Some(serde_json::from_value(json!({"sqs": {"url": url}})).unwrap());
     Arc::new(board)
 }
 

@@ -91,7 +91,7 @@ fn desired(all: &[Arc<Leaderboard>], operator: &str) -> BTreeMap<String, Way> {
 fn queue_of<'a>(leaderboard: &'a Leaderboard, operator: &str) -> Option<(String, &'a EvalaiQueue)> {
     let evalai = leaderboard.spec.evalai.as_ref()?;
     let is_read = leaderboard.metadata.deletion_timestamp.is_none() && operator::is_ours(leaderboard, operator);
-    let queue = evalai.queue.as_ref().filter(|_| is_read)?;
+    let queue = leaderboard.spec.evalai_queue().filter(|_| is_read)?;
     Some((evalai.server(), queue))
 }
 

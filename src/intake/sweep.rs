@@ -67,7 +67,7 @@ fn serves(board: &Leaderboard, row: &SweepRow) -> bool {
 
 /// Where a queue of the phase leaves messages to another reader, that one may have the message of any row: no object is made of it.
 fn kind(all: &[Arc<Leaderboard>], row: &SweepRow) -> Swept {
-    let leaves = |board: &Leaderboard| board.spec.queue.as_ref().is_some_and(|q| q.foreign == Foreign::Leave);
+    let leaves = |board: &Leaderboard| board.spec.sqs().is_some_and(|q| q.foreign == Foreign::Leave);
     let is_shared = all.iter().any(|board| serves(board, row) && leaves(board));
     match row.kind {
         Swept::New | Swept::Rerun if is_shared => Swept::Edited,
@@ -89,8 +89,10 @@ mod tests {
     fn board(name: &str, second: i64, server: &str) -> Leaderboard {
         let spec = json!({
             "evalai": {"apiServer": server, "challenge": 1, "token": {"secretKeyRef": {"name": "t", "key": "k"}}},
-            "tracks": [{"name": "sensors", "codename": "SENSORS", "phase": 2}],
-            "leaderboardVersion": "V2", "contents": {"image": "c"}, "simulator": {"image": "s"}, "storage": {"bucket": "bbb"},
+            "tracks": [{"name": "sensors", "phase": 2}],
+            "evaluation": {"carla": {
+                "version": "V2", "contents": {"image": "c"}, "simulator": {"image": "s"},
+            }}, "storage": {"s3": {"bucket": "bbb"}},
         });
         let mut board = Leaderboard::new(name, serde_json::from_value(spec).unwrap());
         board.metadata.namespace = Some(name.into());
@@ -135,7 +137,8 @@ mod tests {
     fn where_a_queue_of_the_phase_is_shared_on_purpose_a_row_makes_nothing_new() {
         let with_queue = |name: &str, foreign: &str| {
             let mut board = board(name, 1, "https://eval.ai");
-            board.spec.queue = serde_json::from_value(json!({"url": "https://q", "foreign": foreign})).unwrap();
+            board.spec.queue =
+                serde_json::from_value(json!({"sqs": {"url": "https://q", "foreign": foreign}})).unwrap();
             Arc::new(board)
         };
         let without = || Arc::new(board("c", 1, "https://eval.ai"));
@@ -177,7 +180,7 @@ mod tests {
     #[tokio::test]
     async fn what_another_reader_may_have_is_not_made() {
         let mut shared = board("real", 1, "http://one");
-        shared.spec.queue = serde_json::from_value(json!({"url": "https://q", "foreign": "Leave"})).unwrap();
+        shared.spec.queue = serde_json::from_value(json!({"sqs": {"url": "https://q", "foreign": "Leave"}})).unwrap();
         let (client, mut asked) = cluster();
         let (sender, rows) = mpsc::unbounded_channel();
         sender.send(row("http://one", 2)).unwrap();

@@ -65,13 +65,15 @@ async fn serve(mut handle: Handle<Request<Body>, Response<Body>>, mut answers: m
 fn board(name: &str, uid: &str, version: &str) -> Value {
     json!({"apiVersion": "leaderboard.carla.org/v1alpha1", "kind": "Leaderboard",
         "metadata": {"name": name, "namespace": "ns", "uid": uid, "resourceVersion": version, "managedFields": [{}]},
-        "spec": {"leaderboardVersion": "V2", "tracks": [{"name": "SENSORS", "codename": "SENSORS"}],
-            "contents": {"image": "contents:1"}, "simulator": {"image": "simulator:1"}, "storage": {"bucket": "b"}}})
+        "spec": {
+            "evaluation": {"carla": {
+                "version": "V2", "contents": {"image": "contents:1"}, "simulator": {"image": "simulator:1"},
+            }}, "tracks": [{"name": "SENSORS"}], "storage": {"s3": {"bucket": "b"}}}})
 }
 
 fn malformed(name: &str, uid: &str, version: &str) -> Value {
     let mut object = board(name, uid, version);
-    object["spec"] = json!({"leaderboardVersion": 7});
+    object["spec"] = json!({"evaluation": {"carla": {"version": 7}}});
     object
 }
 

@@ -193,7 +193,7 @@ fn observe(
 
 /// None without a table.
 fn rows_waiting(uses: Uses<'_>, leaderboard: &Leaderboard) -> Option<usize> {
-    let table = leaderboard.spec.table.as_ref()?;
+    let table = leaderboard.spec.dynamo_table()?;
     let (service, longer) = (Service::table(table), records::ON_ITS_WAY);
     Some(uses.external.records.waiting(&service, longer))
 }

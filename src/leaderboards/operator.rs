@@ -135,8 +135,10 @@ mod tests {
     #[test]
     fn only_the_named_installation_acts() {
         let spec = json!({
-            "tracks": [{"name": "sensors", "codename": "SENSORS"}], "leaderboardVersion": "V2",
-            "contents": {"image": "c"}, "simulator": {"image": "s"}, "storage": {"bucket": "bbb"},
+            "tracks": [{"name": "sensors"}],
+            "evaluation": {"carla": {
+                "version": "V2", "contents": {"image": "c"}, "simulator": {"image": "s"},
+            }}, "storage": {"s3": {"bucket": "bbb"}},
         });
         let mut board = Leaderboard::new("board", serde_json::from_value(spec).unwrap());
         assert_eq!(left_alone(None, "a/b"), None);

@@ -27,10 +27,10 @@ pub(super) fn named(leaderboard: &Arc<Leaderboard>) -> Vec<Place> {
         let place = endpoint.as_ref().or(region.as_ref());
         place.map(|place| format!(" at {place}")).unwrap_or_default()
     };
-    let (region, endpoint) = (&spec.storage.region, &spec.storage.endpoint);
-    let bucket = format!("the bucket {}{}", spec.storage.bucket, at(region, endpoint));
+    let (region, endpoint) = (&spec.storage.s3.region, &spec.storage.s3.endpoint);
+    let bucket = format!("the bucket {}{}", spec.storage.s3.bucket, at(region, endpoint));
     let mut places = vec![(AwsResource::Bucket, bucket)];
-    if let Some(table) = &spec.table {
+    if let Some(table) = spec.dynamo_table() {
         let keys = table.partition_key.as_deref().zip(table.sort_key.as_deref());
         let keys = keys.map(|(team, submission)| format!(" by {team} and {submission}"));
         let (keys, at) = (keys.unwrap_or_default(), at(&table.region, &table.endpoint));
@@ -39,13 +39,13 @@ pub(super) fn named(leaderboard: &Arc<Leaderboard>) -> Vec<Place> {
             places.push((AwsResource::Rows, format!("the rows of {}{keys}{at}", table.name)));
         }
     }
-    if let Some(queue) = &spec.queue {
+    if let Some(queue) = spec.sqs() {
         let at = at(&queue.region, &queue.endpoint);
         places.push((AwsResource::Queue, format!("the queue {}{at}", queue.url)));
         let dead = queue.dead_letter_url.as_ref();
         places.extend(dead.map(|url| (AwsResource::DeadLetterQueue, format!("the dead-letter queue {url}{at}"))));
     }
-    if let Some(group) = spec.log_group.as_ref().filter(|group| group.retention_days.is_some()) {
+    if let Some(group) = spec.log_group().filter(|group| group.retention_days.is_some()) {
         let at = at(&group.region, &group.endpoint);
         places.push((AwsResource::LogGroup, format!("the log group {}{at}", group.name)));
     }
@@ -60,7 +60,7 @@ pub(super) fn named(leaderboard: &Arc<Leaderboard>) -> Vec<Place> {
 /// Asks for one place.
 pub(super) async fn ask(aws: &Aws, place: &Place) -> Result<Seen, Failure> {
     let spec = &place.leaderboard.spec;
-    let answer = match (place.resource, &spec.table, &spec.queue, &spec.log_group) {
+    let answer = match (place.resource, spec.dynamo_table(), spec.sqs(), spec.log_group()) {
         (AwsResource::Table, Some(table), ..) => of_table(Table::describe(aws, table).await),
         (AwsResource::Rows, Some(table), ..) => of_table(try_rows(aws, table).await),
         (AwsResource::Queue, _, Some(queue), _) => of_queue(queue::check(aws, queue, &queue.url).await),
@@ -73,8 +73,8 @@ pub(super) async fn ask(aws: &Aws, place: &Place) -> Result<Seen, Failure> {
             of_log_group(log_groups::keep(aws, group, days).await)
         }
         _ => {
-            let prefix = format!("{}{NO_RUN}", spec.storage.prefix.as_deref().unwrap_or_default());
-            let archive = Archive::of_storage(aws, &spec.storage).at_prefix(prefix);
+            let prefix = format!("{}{NO_RUN}", spec.storage.s3.prefix.as_deref().unwrap_or_default());
+            let archive = Archive::of_storage(aws, &spec.storage.s3).at_prefix(prefix);
             of_bucket(archive.prefix_is_empty().await)
         }
     };
@@ -86,7 +86,7 @@ pub(super) async fn ask(aws: &Aws, place: &Place) -> Result<Seen, Failure> {
 }
 
 /// Whether the table takes rows. The right to describe it does not include that.
-async fn try_rows(aws: &Aws, table: &api::Table) -> Result<(), TableError> {
+async fn try_rows(aws: &Aws, table: &api::DynamoTable) -> Result<(), TableError> {
     Table::describe(aws, table).await?.try_write().await
 }
 
@@ -187,9 +187,11 @@ mod tests {
     fn only_what_is_named_is_asked_for() {
         let mut spec = json!({
             "evalai": {"apiServer": "https://e", "challenge": 1, "token": {"secretKeyRef": {"name": "t", "key": "k"}}},
-            "tracks": [{"name": "sensors", "codename": "SENSORS", "phase": 1}],
-            "leaderboardVersion": "V2", "contents": {"image": "c"}, "simulator": {"image": "s"},
-            "storage": {"bucket": "bucket"},
+            "tracks": [{"name": "sensors", "phase": 1}],
+            "evaluation": {"carla": {
+                "version": "V2", "contents": {"image": "c"}, "simulator": {"image": "s"},
+            }},
+            "storage": {"s3": {"bucket": "bucket"}},
         });
         let places = |spec: &serde_json::Value| {
             let board = Leaderboard::new("one", serde_json::from_value(spec.clone()).unwrap());
@@ -197,8 +199,8 @@ mod tests {
             named.map(|place| place.address).collect::<Vec<_>>()
         };
         assert_eq!(places(&spec), ["the bucket bucket"]);
-        spec["table"] = json!({"name": "rows", "region": "eu-west-1"});
-        spec["queue"] = json!({"url": "https://sqs/one", "deadLetterURL": "https://sqs/dead"});
+        spec["table"] = json!({"dynamoDB": {"name": "rows", "region": "eu-west-1"}});
+        spec["queue"] = json!({"sqs": {"url": "https://sqs/one", "deadLetterURL": "https://sqs/dead"}});
         let all = [
             "the bucket bucket",
             "the table rows at eu-west-1",
@@ -211,9 +213,9 @@ mod tests {
         observing["evalai"]["mode"] = json!("Observe");
         assert!(!places(&observing).contains(&all[2].to_owned()), "none is written");
         // A group that is the host's own is left alone.
-        spec["logGroup"] = json!({"name": "logs"});
+        spec["logs"] = json!({"cloudWatch": {"name": "logs"}});
         assert_eq!(places(&spec), all);
-        spec["logGroup"] = json!({"name": "logs", "retentionDays": 30});
+        spec["logs"] = json!({"cloudWatch": {"name": "logs", "retentionDays": 30}});
         assert_eq!(places(&spec).last().unwrap(), "the log group logs");
     }
 }

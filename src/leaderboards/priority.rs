@@ -94,7 +94,7 @@ mod tests {
     use super::*;
 
     fn track(name: &str, class: Option<&str>) -> Track {
-        serde_json::from_value(json!({"name": name, "codename": "S", "priorityClassName": class})).unwrap()
+        serde_json::from_value(json!({"name": name, "priorityClassName": class})).unwrap()
     }
 
     fn pods(track: &str, class: Option<&str>) -> TrackPods {

@@ -193,7 +193,7 @@ impl Looked {
                 .into_iter()
                 .map(|column| column.label)
                 .collect(),
-            inbox: evalai.queue.as_ref().map(|queue| queue.name.clone()),
+            inbox: spec.evalai_queue().map(|queue| queue.name.clone()),
             is_observed: evalai.mode == EvalaiMode::Observe,
             since: created.map(|time| time.0).unwrap_or_default(),
         })
@@ -257,8 +257,10 @@ mod tests {
         let board = |secret: &str| {
             let spec = serde_json::json!({
                 "evalai": {"apiServer": "https://e", "challenge": 1, "token": {"secretKeyRef": {"name": secret, "key": "k"}}},
-                "tracks": [{"name": "sensors", "codename": "SENSORS", "phase": 1}], "leaderboardVersion": "V2",
-                "contents": {"image": "c"}, "simulator": {"image": "s"}, "storage": {"bucket": "bbb"},
+                "tracks": [{"name": "sensors", "phase": 1}],
+                "evaluation": {"carla": {
+                    "version": "V2", "contents": {"image": "c"}, "simulator": {"image": "s"},
+                }}, "storage": {"s3": {"bucket": "bbb"}},
             });
             Leaderboard::new("one", serde_json::from_value(spec).unwrap())
         };

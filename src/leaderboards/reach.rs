@@ -89,11 +89,11 @@ impl Ask for Place {
 
     fn service(&self) -> Service {
         let spec = &self.leaderboard.spec;
-        match (self.resource, &spec.table, &spec.queue, &spec.log_group) {
+        match (self.resource, spec.dynamo_table(), spec.sqs(), spec.log_group()) {
             (AwsResource::Table | AwsResource::Rows, Some(table), ..) => Service::table(table),
             (AwsResource::Queue | AwsResource::DeadLetterQueue, _, Some(queue), _) => Service::queue(queue),
             (AwsResource::LogGroup, .., Some(group)) => Service::log_group(group),
-            _ => Service::bucket(&spec.storage),
+            _ => Service::bucket(&spec.storage.s3),
         }
     }
 

@@ -120,7 +120,7 @@ mod tests {
         let said = note(None, &labels(vec![unsent]), ends()).unwrap();
         assert_eq!(
             said,
-            "The leaderboard of phase 2 also has Speed, Comfort, which the operator never sends and which stay empty; remove them from its schema, or check spec.leaderboardVersion. EvalAI's token ends \
+            "The leaderboard of phase 2 also has Speed, Comfort, which the operator never sends and which stay empty; remove them from its schema, or check evaluation.carla.version. EvalAI's token ends \
              on 2027-01-01."
         );
     }

@@ -117,8 +117,10 @@ pub(super) fn failed(
 
 pub(super) fn leaderboard(name: &str, spec: &Value, status: &Value) -> Arc<Leaderboard> {
     let mut of = json!({
-        "tracks": [{"name": "sensors", "codename": "SENSORS"}], "leaderboardVersion": "V2",
-        "contents": {"image": "contents:1"}, "simulator": {"image": "simulator:1"}, "storage": {"bucket": "results"},
+        "tracks": [{"name": "sensors"}],
+        "evaluation": {"carla": {
+            "version": "V2", "contents": {"image": "contents:1"}, "simulator": {"image": "simulator:1"},
+        }}, "storage": {"s3": {"bucket": "results"}},
     });
     of.as_object_mut().unwrap().extend(spec.as_object().unwrap().clone());
     let object = json!({

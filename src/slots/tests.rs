@@ -16,8 +16,10 @@ use leaderboard_api::{Attempt, Eta};
 
 fn leaderboard(running: &Value, paused: bool) -> Leaderboard {
     let spec = json!({
-        "tracks": [{"name": "sensors", "codename": "SENSORS"}], "leaderboardVersion": "V2", "contents": {"image": "c"},
-        "simulator": {"image": "s"}, "storage": {"bucket": "b"}, "concurrency": running, "paused": paused,
+        "tracks": [{"name": "sensors"}],
+        "evaluation": {"carla": {
+            "version": "V2", "contents": {"image": "c"}, "simulator": {"image": "s"},
+        }}, "storage": {"s3": {"bucket": "b"}}, "concurrency": running, "paused": paused,
     });
     let mut object = Leaderboard::new("lb", serde_json::from_value(spec).unwrap());
     object.metadata.namespace = Some("ns".into());

@@ -89,7 +89,7 @@ impl ExternalSystems {
 
     /// What is known of a submission's row. None without a table.
     pub fn record_view(&self, leaderboard: &Leaderboard, submission: &Submission) -> Option<RecordView> {
-        leaderboard.spec.table.as_ref()?;
+        leaderboard.spec.dynamo_table()?;
         if let Some(refusal) = self.refusal(leaderboard) {
             return Some(RecordView {
                 error: Some(refusal),
@@ -141,7 +141,7 @@ impl ExternalSystems {
     /// Writes the row, or lets the next write carry it.
     pub fn record(&self, view: &View, status: &SubmissionStatus, update: TableUpdate) {
         let leaderboard = view.leaderboard.as_ref().filter(|_| view.not_allowed.is_none());
-        let Some(table) = leaderboard.and_then(|l| l.spec.table.as_ref()) else {
+        let Some(table) = leaderboard.and_then(|l| l.spec.dynamo_table()) else {
             return;
         };
         let submission = view.submission.as_ref();

@@ -6,7 +6,7 @@ use std::sync::Arc;
 use std::time::Duration;
 
 use crate::ask::{Asker, Wake};
-use leaderboard_api::Table;
+use leaderboard_api::DynamoTable;
 use leaderboard_aws::clients::Aws;
 use leaderboard_aws::table::{Row, TableError, Tables, Written};
 use leaderboard_base::backoff::Backoff;
@@ -26,7 +26,7 @@ pub const ON_ITS_WAY: Duration = Duration::from_secs(10);
 /// A row that is to be written.
 #[derive(Clone, Debug, PartialEq)]
 pub struct Record {
-    pub table: Table,
+    pub table: DynamoTable,
     pub row: Arc<Row>,
     /// It is the last of its attempt.
     pub is_end: bool,

@@ -8,7 +8,7 @@ use std::time::Duration;
 use jiff::Timestamp;
 
 use crate::ask::{Asked, Asker, Wake};
-use leaderboard_api::{Attempt, JobNumber, RunPlan, Storage, effective};
+use leaderboard_api::{Attempt, JobNumber, RunPlan, S3Bucket, effective};
 use leaderboard_aws::archive::{Archive, ArchiveError, Fetched};
 use leaderboard_aws::clients::Aws;
 use leaderboard_base::tasks::Tasks;
@@ -23,7 +23,7 @@ const READ_AGAIN: Duration = Duration::from_secs(10);
 /// Where the files of a run are.
 #[derive(Debug, PartialEq)]
 pub struct RunFiles {
-    storage: Storage,
+    storage: S3Bucket,
     /// Key prefix of the run in the bucket, with the final slash.
     prefix: String,
     /// UID that its reports name, if they are of the time before the object was restored from a backup.
@@ -34,8 +34,8 @@ impl RunFiles {
     /// The files of the run with this plan, of the submission with this UID.
     pub fn of(plan: &RunPlan, uid: &str) -> Arc<Self> {
         Arc::new(Self {
-            storage: plan.storage.clone(),
-            prefix: effective::key_prefix(&plan.storage, &plan.run_id),
+            storage: plan.storage.s3.clone(),
+            prefix: effective::key_prefix(&plan.storage.s3, &plan.run_id),
             former_uid: plan.submission_uid.clone().filter(|former| former != uid),
         })
     }

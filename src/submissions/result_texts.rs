@@ -18,8 +18,8 @@ pub(super) fn outline(view: &View, status: &SubmissionStatus, so_far: bool, pati
         .ours()
         .zip(status.plan.as_ref())
         .map(|(report, plan)| StoredResult {
-            storage: plan.storage.clone(),
-            prefix: effective::key_prefix(&plan.storage, &plan.run_id),
+            storage: plan.storage.s3.clone(),
+            prefix: effective::key_prefix(&plan.storage.s3, &plan.run_id),
             report: report.id,
             done: report.done,
             so_far,
@@ -82,7 +82,7 @@ pub(super) fn row(report: Option<&ReportDigest>, status: &SubmissionStatus) -> O
         team_name: team.name.clone().unwrap_or_default(),
         submission_status: table_status(status.state_of_conditions()).to_owned(),
         track_id: plan.phase.map(|p| p.to_string()).unwrap_or_default(),
-        track_name: plan.codename.to_string(),
+        track_name: plan.carla.codename.to_string(),
         submitted_image_uri: plan.image.clone(),
         submitted_time: text(status.times.submitted.as_ref()),
         start_time: text(status.times.started.as_ref()),
@@ -157,8 +157,10 @@ mod tests {
 
     fn plan() -> Value {
         json!({
-            "runId": "7", "leaderboardVersion": "V2", "track": "sensors", "codename": "SENSORS", "slices": [{"first": 0, "last": 3}], "routes": 4,
-            "repetitions": 1, "storage": {"bucket": "b"}, "image": "i", "contentsImage": "c", "simulatorImage": "s",
+            "runId": "7",
+                "carla": {"version": "V2", "codename": "SENSORS", "slices": [{"first": 0, "last": 3}],
+                    "routes": 4, "repetitions": 1, "contentsImage": "c", "simulatorImage": "s"},
+                "track": "sensors", "storage": {"s3": {"bucket": "b"}}, "image": "i",
         })
     }
 

@@ -239,10 +239,12 @@ fn reply(method: &Method, path: &str, mut body: Value, known: &HashMap<String, V
 /// A Leaderboard whose results go to a bucket at this endpoint.
 pub fn leaderboard(name: &str, endpoint: &str) -> Leaderboard {
     let spec = json!({
-        "tracks": [{"name": "sensors", "codename": "SENSORS"}], "leaderboardVersion": "V2", "routes": 4, "pairs": 2,
-        "contents": {"image": "c"}, "simulator": {"image": "s"},
-        "storage": {"bucket": format!("{name}-bucket"), "endpoint": endpoint},
-        "table": {"name": "rows", "endpoint": endpoint, "partitionKey": "team_id", "sortKey": "submission_id"},
+        "tracks": [{"name": "sensors"}],
+        "evaluation": {"carla": {
+            "version": "V2", "routes": 4, "pairs": 2, "contents": {"image": "c"}, "simulator": {"image": "s"},
+        }},
+        "storage": {"s3": {"bucket": format!("{name}-bucket"), "endpoint": endpoint}},
+        "table": {"dynamoDB": {"name": "rows", "endpoint": endpoint, "partitionKey": "team_id", "sortKey": "submission_id"}},
     });
     let mut object = Leaderboard::new(name, serde_json::from_value(spec).unwrap());
     object.metadata.namespace = Some(NAMESPACE.into());

@@ -54,7 +54,7 @@ async fn a_leaderboard_that_names_what_it_may_not_is_not_ready_until_it_does_not
     let config = server().await.config();
     let operator = Operator::start_with(settings, namespace, world.aws.aws.clone(), config);
     world
-        .leaderboard_with("lb", 1, "Hosts", &json!({"queue": {"url": QUEUE}}))
+        .leaderboard_with("lb", 1, "Hosts", &json!({"queue": {"sqs": {"url": QUEUE}}}))
         .await;
     let said = until_says(&world, reasons::NOT_ALLOWED, "").await;
     for part in ["the queue", QUEUE, "leaderboards[]", "in queues"] {
@@ -69,14 +69,18 @@ async fn a_leaderboard_that_names_what_it_may_not_is_not_ready_until_it_does_not
     let secret = json!({"secretsManager": null, "secretKeyRef": {"name": "evalai", "key": "token"}});
     change(
         &world,
-        &json!({"evalai": {"token": secret}, "table": {"name": "theirs"}}),
+        &json!({"evalai": {"token": secret}, "table": {"dynamoDB": {"name": "theirs"}}}),
     )
     .await;
     until_says(&world, reasons::NOT_ALLOWED, "the table theirs").await;
-    change(&world, &json!({"table": null, "logGroup": {"name": "theirs"}})).await;
+    change(
+        &world,
+        &json!({"table": null, "logs": {"cloudWatch": {"name": "theirs"}}}),
+    )
+    .await;
     until_says(&world, reasons::NOT_ALLOWED, "the log group theirs").await;
 
-    change(&world, &json!({"logGroup": null})).await;
+    change(&world, &json!({"logs": null})).await;
     until_says(&world, reasons::READY, "").await;
     world.job(&name, 0).await;
     operator.end().await;

@@ -85,10 +85,10 @@ impl World {
         let url = |name| format!("{endpoint}/000000000000/{}", self.aws.name(name));
         json!({"spec": {
             "evalai": {"apiServer": self.evalai.url(), "challenge": 1, "token": token},
-            "tracks": [{"name": "sensors", "codename": "SENSORS", "phase": 1}],
-            "storage": {"bucket": self.bucket(), "endpoint": endpoint},
-            "table": {"name": self.table(), "endpoint": endpoint},
-            "queue": {"url": url("queue"), "deadLetterURL": url("dead"), "endpoint": endpoint},
+            "tracks": [{"name": "sensors", "phase": 1}],
+            "storage": {"s3": {"bucket": self.bucket(), "endpoint": endpoint}},
+            "table": {"dynamoDB": {"name": self.table(), "endpoint": endpoint}},
+            "queue": {"sqs": {"url": url("queue"), "deadLetterURL": url("dead"), "endpoint": endpoint}},
         }})
     }
 
@@ -190,12 +190,12 @@ async fn what_is_missing_is_named_until_it_is_there() {
     world.make_bucket().await;
     // Nobody edits anything here: it is asked again by itself.
     let said = world.says("False", reasons::TABLE_UNREACHABLE).await;
-    assert!(said.message.contains("check table.name"), "{}", said.message);
+    assert!(said.message.contains("check table.dynamoDB.name"), "{}", said.message);
     world.make_table().await;
     world.edit(1).await;
     let said = world.says("False", reasons::QUEUE_UNREACHABLE).await;
     assert!(
-        said.message.contains("create it, or correct queue.url"),
+        said.message.contains("create it, or correct queue.sqs.url"),
         "{}",
         said.message
     );
@@ -244,7 +244,7 @@ async fn a_bucket_that_is_away_for_a_moment_changes_nothing() {
     world.make_bucket().await;
     let proxy = ministack::server().await.proxy().await;
     world
-        .apply(&json!({"spec": {"storage": {"bucket": world.bucket(), "endpoint": proxy.endpoint()}}}))
+        .apply(&json!({"spec": {"storage": {"s3": {"bucket": world.bucket(), "endpoint": proxy.endpoint()}}}}))
         .await;
     let before = world.says("True", reasons::READY).await;
     proxy.set_away(true);
@@ -273,7 +273,7 @@ async fn a_bucket_that_has_never_answered_is_not_known() {
     let listener = TcpListener::bind("127.0.0.1:0").await.unwrap();
     let endpoint = format!("http://{}", listener.local_addr().unwrap());
     world
-        .apply(&json!({"spec": {"storage": {"bucket": world.bucket(), "endpoint": endpoint}}}))
+        .apply(&json!({"spec": {"storage": {"s3": {"bucket": world.bucket(), "endpoint": endpoint}}}}))
         .await;
     let said = world.says("Unknown", reasons::BUCKET_UNREACHABLE).await;
     assert!(said.message.contains("did not answer within 10 s"), "{}", said.message);
@@ -289,8 +289,8 @@ async fn a_missing_table_stops_no_submission() {
     world.make_bucket().await;
     let endpoint = &world.aws.endpoint;
     let spec = json!({"spec": {
-        "storage": {"bucket": world.bucket(), "endpoint": endpoint},
-        "table": {"name": world.table(), "endpoint": endpoint},
+        "storage": {"s3": {"bucket": world.bucket(), "endpoint": endpoint}},
+        "table": {"dynamoDB": {"name": world.table(), "endpoint": endpoint}},
     }});
     world.apply(&spec).await;
     world.says("False", reasons::TABLE_UNREACHABLE).await;
@@ -312,9 +312,9 @@ async fn the_priority_class_of_a_track_has_to_be_there_and_must_not_preempt() {
     let world = World::new().await;
     world.make_bucket().await;
     let class = |name: &str| format!("{}-{name}", world.namespace);
-    let tracks = |class: String| json!([{"name": "sensors", "codename": "SENSORS", "priorityClassName": class}]);
+    let tracks = |class: String| json!([{"name": "sensors", "priorityClassName": class}]);
     let storage = json!({"bucket": world.bucket(), "endpoint": world.aws.endpoint});
-    let spec = json!({"spec": {"tracks": tracks(class("waits")), "storage": storage}});
+    let spec = json!({"spec": {"tracks": tracks(class("waits")), "storage": {"s3": storage}}});
     world.apply(&spec).await;
     let said = world.says("False", reasons::INVALID_POD).await;
     let expected = format!("PriorityClass {} of the track sensors does not exist.", class("waits"));

@@ -241,12 +241,12 @@ impl World {
                     "challenge": 1,
                     "token": {"secretKeyRef": {"name": "evalai", "key": "token"}}
                 },
-                "tracks": [{"name": "sensors", "codename": "SENSORS", "phase": phase}],
-                "leaderboardVersion": "V2",
-                "contents": {"image": "contents:1"},
-                "simulator": {"image": "simulator:1"},
-                "storage": {"bucket": "results"},
-                "queue": queue
+                "tracks": [{"name": "sensors", "phase": phase}],
+                "evaluation": {"carla": {
+                    "version": "V2", "contents": {"image": "contents:1"}, "simulator": {"image": "simulator:1"},
+                }},
+                "storage": {"s3": {"bucket": "results"}},
+                "queue": {"sqs": queue}
             }
         }));
         // As a person writes it: the API server fills in the rest.

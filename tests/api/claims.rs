@@ -37,7 +37,8 @@ impl World {
         let storage = json!({"bucket": world.aws.name("bucket"), "endpoint": world.aws.endpoint});
         let gpu = json!({"mode": "Claim", "claim": claim});
         let network = json!({"enforcement": "Disabled"});
-        let patch = json!({"spec": {"storage": storage, "gpu": gpu, "network": network, "agent": {"images": []}}});
+        let patch =
+            json!({"spec": {"storage": {"s3": storage}, "gpu": gpu, "network": network, "agent": {"images": []}}});
         let api = Kind::Leaderboard.api(&world.client, &world.namespace);
         let object = Kind::Leaderboard.object(NAME, &[&patch]);
         create(&api, object, false).await.unwrap();

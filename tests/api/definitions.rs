@@ -7,7 +7,7 @@ use leaderboard_api::{Leaderboard, Submission};
 use leaderboard_operator::crds;
 use serde_json::{Value, json};
 
-use super::objects::{Kind, causes, create};
+use super::objects::{Kind, causes, create, merge};
 use crate::support::apiserver::server;
 
 #[tokio::test]
@@ -67,13 +67,13 @@ async fn a_minimal_leaderboard_reads_back_whole() {
     assert_eq!(
         read.data["spec"],
         json!({
-        "tracks": [{"name": "sensors", "codename": "SENSORS"}],
-        "leaderboardVersion": "V2",
-        "contents": {"image": "contents:1"},
-        "simulator": {"image": "simulator:1", "display": "Offscreen"},
+        "tracks": [{"name": "sensors", "carla": {"codename": "SENSORS"}}],
+        "evaluation": {"carla": {
+            "version": "V2", "contents": {"image": "contents:1"},
+            "simulator": {"image": "simulator:1", "display": "Offscreen"}, "pairs": 4, "routes": 20,
+            "verify": "Warn",
+        }},
         "agent": {"logSizeLimit": "2Gi"},
-        "pairs": 4,
-        "routes": 20,
         "retries": {"perWorker": 3, "infrastructure": 2},
         "deadlines": {
             "pullSeconds": 5400,
@@ -84,11 +84,10 @@ async fn a_minimal_leaderboard_reads_back_whole() {
             "flushSeconds": 1800,
             "finalizeSeconds": 900,
         },
-        "storage": {"bucket": "results", "sizeLimit": "20Gi"},
+        "storage": {"s3": {"bucket": "results", "sizeLimit": "20Gi"}},
         "network": {"policy": "Managed", "enforcement": "Warn", "dns": "Cluster", "dnsServers": ["169.254.20.10"]},
         "concurrency": {},
         "paused": false,
-        "verify": "Warn",
         "syncPeriodSeconds": 10,
         "ttlSecondsAfterFinished": 604_800,
         "retention": {"finishedSeconds": 0},
@@ -156,6 +155,12 @@ fn half_filled_runs() -> Vec<HalfFilled> {
     ]
 }
 
+fn carla(simulator: Value, more: Value) -> Value {
+    let mut carla = json!({"version": "V2", "contents": {"image": "contents:1"}, "simulator": simulator});
+    merge(&mut carla, &more);
+    json!({ "carla": carla })
+}
+
 fn half_filled_pods() -> Vec<HalfFilled> {
     vec![
         (
@@ -176,16 +181,22 @@ fn half_filled_pods() -> Vec<HalfFilled> {
         ),
         (
             "tracks",
-            json!([{"name": "sensors", "codename": "SENSORS", "routeSubsets": ["0-4", "5-9", "10-14", "15-19"],
+            json!([{"name": "sensors", "carla": {"codename": "SENSORS", "routeSubsets": ["0-4", "5-9", "10-14", "15-19"]},
                     "deadlines": {"runSeconds": 3601}, "agent": {"resources": {"limits": {"memory": "1Gi"}}}}]),
-            json!([{"name": "sensors", "codename": "SENSORS", "routeSubsets": ["0-4", "5-9", "10-14", "15-19"],
+            json!([{"name": "sensors", "carla": {"codename": "SENSORS", "routeSubsets": ["0-4", "5-9", "10-14", "15-19"]},
                     "deadlines": {"runSeconds": 3601}, "agent": {"resources": {"limits": {"memory": "1Gi"}}}}]),
         ),
         ("concurrency", json!({"total": 3}), json!({"total": 3})),
         (
-            "simulator",
-            json!({"image": "simulator:1", "display": "X11Socket", "x11": {}}),
-            json!({"image": "simulator:1", "display": "X11Socket", "x11": {"display": ":0"}}),
+            "evaluation",
+            carla(
+                json!({"image": "simulator:1", "display": "X11Socket", "x11": {}}),
+                json!({}),
+            ),
+            carla(
+                json!({"image": "simulator:1", "display": "X11Socket", "x11": {"display": ":0"}}),
+                json!({"pairs": 4, "routes": 20, "verify": "Warn"}),
+            ),
         ),
         (
             "gpu",
@@ -210,43 +221,45 @@ fn half_filled_services() -> Vec<HalfFilled> {
     };
     let sent = |token: Value| json!({"apiServer": "https://eval.ai", "challenge": 1, "token": token});
     let secret = json!({"secretKeyRef": {"name": "evalai", "key": "token"}});
+    let named = json!({"name": "results"});
     let in_manager = |manager: Value| json!({ "secretsManager": manager });
-    let with_queue = |mut evalai: Value, queue: Value| {
-        evalai["queue"] = queue;
-        evalai
-    };
     vec![
         (
             "storage",
-            json!({"bucket": "results", "prefix": "a/"}),
-            json!({"bucket": "results", "prefix": "a/", "sizeLimit": "20Gi"}),
+            json!({"s3": {"bucket": "results", "prefix": "a/"}}),
+            json!({"s3": {"bucket": "results", "prefix": "a/", "sizeLimit": "20Gi"}}),
         ),
-        ("evalai", sent(secret.clone()), evalai(secret.clone(), "Hosts")),
+        ("evalai", sent(secret.clone()), evalai(secret, "Hosts")),
         (
             "evalai",
             sent(in_manager(json!({"id": "evalai"}))),
             evalai(in_manager(json!({"id": "evalai", "key": "auth_token"})), "Hosts"),
         ),
         (
-            "evalai",
-            with_queue(sent(secret.clone()), json!({"name": "carla-1"})),
-            with_queue(
-                evalai(secret, "Hosts"),
-                json!({"name": "carla-1", "unknownAfterSeconds": 900}),
-            ),
+            "queue",
+            json!({"evalai": {"name": "carla-1"}}),
+            json!({"evalai": {"name": "carla-1", "unknownAfterSeconds": 900}}),
         ),
         (
             "queue",
-            json!({"url": "https://sqs.example.org/1/a"}),
-            json!({"url": "https://sqs.example.org/1/a", "unknownAfterSeconds": 900, "foreign": "DeadLetter"}),
+            json!({"sqs": {"url": "https://sqs.example.org/1/a"}}),
+            json!({"sqs": {"url": "https://sqs.example.org/1/a", "unknownAfterSeconds": 900, "foreign": "DeadLetter"}}),
         ),
         (
             "podIdentity",
             json!({"secretName": "aws"}),
             json!({"secretName": "aws"}),
         ),
-        ("table", json!({"name": "results"}), json!({"name": "results"})),
-        ("logGroup", json!({"name": "results"}), json!({"name": "results"})),
+        (
+            "table",
+            json!({"dynamoDB": named.clone()}),
+            json!({"dynamoDB": named.clone()}),
+        ),
+        (
+            "logs",
+            json!({"cloudWatch": named.clone()}),
+            json!({"cloudWatch": named}),
+        ),
     ]
 }
 
@@ -292,23 +305,26 @@ async fn a_null_is_as_good_as_a_field_left_out() {
         .unwrap();
     let nulls = [
         json!({
-            "evalai": null, "repetitions": null, "queue": null, "table": null, "logGroup": null, "podIdentity": null,
+            "evalai": null, "queue": null, "table": null, "logs": null, "podIdentity": null,
             "runtimeClassName": null, "podOverrides": null, "agent": null, "retries": null, "deadlines": null, "network": null,
-            "concurrency": null, "paused": null, "verify": null, "syncPeriodSeconds": null, "pairs": null,
+            "concurrency": null, "paused": null, "syncPeriodSeconds": null,
         }),
         json!({
             "tracks": [{
-                "name": "sensors", "codename": "SENSORS", "phase": null, "pairs": null, "routeSubsets": null,
-                "routesFile": null,
+                "name": "sensors", "carla": {"codename": "SENSORS", "pairs": null, "routeSubsets": null, "routesFile": null}, "phase": null,
             }],
-            "storage": {
+            "storage": {"s3": {
                 "bucket": "results", "prefix": null, "region": null, "endpoint": null, "sizeLimit": null, "kmsKeyARN": null,
                 "storageClass": null,
-            },
+            }},
             "deadlines": {"scheduleSeconds": null, "runSeconds": null},
             "concurrency": {"total": null, "perTeam": null},
             "agent": {"command": null, "args": null, "resources": null, "logSizeLimit": null, "images": null},
-            "contents": {"image": "contents:1", "command": null, "args": null, "securityContext": null},
+            "evaluation": {"carla": {
+                "version": "V2", "simulator": {"image": "simulator:1"},
+                "contents": {"image": "contents:1", "command": null, "args": null, "securityContext": null},
+                "repetitions": null, "verify": null, "pairs": null,
+            }},
         }),
     ];
     for (number, spec) in nulls.iter().enumerate() {

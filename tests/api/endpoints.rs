@@ -118,11 +118,11 @@ impl Scene {
             "paused": true,
             "evalai": {"apiServer": evalai.url(), "challenge": 1,
                        "token": {"secretsManager": {"id": token, "endpoint": endpoint}}},
-            "tracks": [{"name": "sensors", "codename": "SENSORS", "phase": 1}],
+            "tracks": [{"name": "sensors", "phase": 1}],
             "agent": {"images": []},
-            "storage": {"bucket": bucket, "endpoint": endpoint},
-            "table": {"name": table, "endpoint": endpoint},
-            "queue": {"url": queue, "deadLetterURL": dead, "endpoint": endpoint},
+            "storage": {"s3": {"bucket": bucket, "endpoint": endpoint}},
+            "table": {"dynamoDB": {"name": table, "endpoint": endpoint}},
+            "queue": {"sqs": {"url": queue, "deadLetterURL": dead, "endpoint": endpoint}},
         }});
         Self {
             aws,

@@ -222,10 +222,10 @@ async fn assert_in_order(replicas: &[Replica; 2], ends: usize) {
 
 async fn measure(count: usize) {
     let world = World::new().await;
-    let spec = json!({"evalai": null, "tracks": [{"name": "sensors", "codename": "SENSORS"}]});
+    let spec = json!({"evalai": null, "tracks": [{"name": "sensors"}]});
     world.leaderboard_with("lb", 1, "Hosts", &spec).await;
     world
-        .leaderboard_with("hosts", 1, "Hosts", &json!({"storage": {"prefix": "hosts/"}}))
+        .leaderboard_with("hosts", 1, "Hosts", &json!({"storage": {"s3": {"prefix": "hosts/"}}}))
         .await;
     let traffic = Traffic::start(&world);
     let began = Timestamp::now();

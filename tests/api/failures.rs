@@ -77,7 +77,7 @@ async fn routes_that_an_agent_prints_are_for_hosts_unless_they_want_it_otherwise
 async fn a_result_that_a_hosts_rerun_cancels_in_evalai_is_shown_so() {
     let world = World::new().await;
     world
-        .leaderboard_with("lb", 1, "Hosts", &json!({"routes": ROUTES}))
+        .leaderboard_with("lb", 1, "Hosts", &json!({"evaluation": {"carla": {"routes": ROUTES}}}))
         .await;
     let _controller = world.controller();
     let (pk, name) = finishes(&world).await;

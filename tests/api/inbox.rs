@@ -24,7 +24,7 @@ const QUEUE: &str = "submissions";
 
 impl World {
     async fn leaderboard_with_inbox(&self, queue: &str) {
-        let more = json!({"evalai": {"queue": {"name": queue, "unknownAfterSeconds": 0}}});
+        let more = json!({"queue": {"evalai": {"name": queue, "unknownAfterSeconds": 0}}});
         self.leaderboard_with("lb", 1, "Hosts", &more).await;
     }
 
@@ -215,5 +215,5 @@ async fn a_queue_that_evalai_does_not_know_is_named() {
         message.contains("Challenge with queue name another-queue does not exist"),
         "{message}"
     );
-    assert!(message.contains("check evalai.queue.name"), "{message}");
+    assert!(message.contains("check queue.evalai.name"), "{message}");
 }

@@ -252,10 +252,10 @@ impl World {
                 "apiServer": self.evalai.url(), "challenge": 1, "requestsPerMinute": 6000,
                 "token": {"secretKeyRef": {"name": "evalai", "key": "token"}},
             },
-            "tracks": [{"name": "sensors", "codename": "SENSORS", "phase": PHASE}],
+            "tracks": [{"name": "sensors", "phase": PHASE}],
             "agent": {"images": []},
-            "storage": {"bucket": bucket, "endpoint": endpoint},
-            "queue": {"url": self.queue, "deadLetterURL": self.dead, "endpoint": endpoint, "unknownAfterSeconds": 0},
+            "storage": {"s3": {"bucket": bucket, "endpoint": endpoint}},
+            "queue": {"sqs": {"url": self.queue, "deadLetterURL": self.dead, "endpoint": endpoint, "unknownAfterSeconds": 0}},
             "concurrency": {"total": SLOTS},
         }});
         let boards = Kind::Leaderboard.api(&self.client, &self.namespace);

@@ -62,7 +62,7 @@ impl World {
     /// A Leaderboard whose bucket is at this endpoint.
     pub(super) async fn leaderboard_at(&self, endpoint: &str, network: &Value) {
         let storage = json!({"bucket": self.aws.name("bucket"), "endpoint": endpoint});
-        let patch = json!({"spec": {"storage": storage, "network": network}});
+        let patch = json!({"spec": {"storage": {"s3": storage}, "network": network}});
         let api = Kind::Leaderboard.api(&self.client, &self.namespace);
         create(&api, Kind::Leaderboard.object(NAME, &[&patch]), false)
             .await

@@ -42,10 +42,12 @@ async fn ended(world: &World, text: &str) -> (u64, String) {
         "attempt": 1, "jobName": format!("{name}-1"), "track": "sensors",
         "times": {"submitted": ago(600), "accepted": ago(500), "started": ago(400), "finished": ago(60)},
         "plan": {
-            "runId": pk.to_string(), "leaderboardVersion": "V2", "track": "sensors", "codename": "SENSORS", "phase": 1,
-            "slices": [{"first": 0, "last": 0}], "routes": 1, "repetitions": 1,
-            "storage": {"bucket": world.bucket, "endpoint": world.aws.endpoint},
-            "image": "r/team-a:1", "contentsImage": "contents:1", "simulatorImage": "simulator:1",
+            "runId": pk.to_string(),
+                "carla": {"version": "V2", "codename": "SENSORS", "slices": [{"first": 0, "last": 0}],
+                    "routes": 1, "repetitions": 1, "contentsImage": "contents:1", "simulatorImage": "simulator:1"},
+                "track": "sensors", "phase": 1,
+            "storage": {"s3": {"bucket": world.bucket, "endpoint": world.aws.endpoint}},
+            "image": "r/team-a:1",
         },
         "conditions": [
             condition("Accepted", "True", "Accepted"), condition("Archived", "True", "Stored"),

@@ -38,11 +38,11 @@ impl Kind {
     pub fn object(self, name: &str, patches: &[&Value]) -> Value {
         let spec = match self {
             Self::Leaderboard => json!({
-                "tracks": [{"name": "sensors", "codename": "SENSORS"}],
-                "leaderboardVersion": "V2",
-                "contents": {"image": "contents:1"},
-                "simulator": {"image": "simulator:1"},
-                "storage": {"bucket": "results"},
+                "tracks": [{"name": "sensors"}],
+                "evaluation": {"carla": {
+                    "version": "V2", "contents": {"image": "contents:1"}, "simulator": {"image": "simulator:1"},
+                }},
+                "storage": {"s3": {"bucket": "results"}},
             }),
             Self::Submission => json!({"leaderboardName": "local", "track": "sensors", "image": "agent:1"}),
         };

@@ -30,7 +30,9 @@ use tokio::task::JoinHandle;
 use crate::support::files::until_there;
 use crate::support::ministack::{self, server};
 use leaderboard_api::names::FAILURE_LOG_KEY;
-use leaderboard_api::{Attempt, LeaderboardVersion, LogGroup, RouteSlice, RunPlan, Storage, StorageClass, Verify};
+use leaderboard_api::{
+    Attempt, CarlaPlan, LeaderboardVersion, RouteSlice, RunPlan, S3Bucket, Storage, StorageClass, Verify,
+};
 use leaderboard_aws::archive::{Archive, Cause, Fetched, Kept};
 use leaderboard_aws::clients::Aws;
 use leaderboard_aws::logs::LogClient;
@@ -111,7 +113,7 @@ impl Pod {
 
     /// The same prefix seen by the Pod that replaces this one.
     async fn replaced(&self, uid: &str) -> Self {
-        let bucket = &self.setting.run.plan.storage.bucket;
+        let bucket = &self.setting.run.plan.storage.s3.bucket;
         let mut next = Self::on(&server().await.endpoint(), bucket, self.setting.run.clone()).await;
         uid.clone_into(&mut next.setting.pod_uid);
         next
@@ -253,25 +255,29 @@ fn run(bucket: &str) -> Run {
         attempt: Attempt(1),
         plan: RunPlan {
             run_id: "77".parse().unwrap(),
-            leaderboard_version: LeaderboardVersion::V2,
             track: "sensors".into(),
-            codename: "SENSORS".into(),
             phase: None,
-            slices: vec![RouteSlice { first: 0, last: 1 }, RouteSlice { first: 2, last: 3 }],
-            routes: 4,
-            repetitions: 1,
             storage: Storage {
-                bucket: bucket.to_owned(),
-                prefix: Some("runs/".to_owned()),
-                region: None,
-                endpoint: None,
-                size_limit: LIMIT.to_string().parse().unwrap(),
-                kms_key_arn: None,
-                storage_class: None,
+                s3: S3Bucket {
+                    bucket: bucket.to_owned(),
+                    prefix: Some("runs/".to_owned()),
+                    region: None,
+                    endpoint: None,
+                    size_limit: LIMIT.to_string().parse().unwrap(),
+                    kms_key_arn: None,
+                    storage_class: None,
+                },
             },
             image: "image".to_owned(),
-            contents_image: "contents".into(),
-            simulator_image: "simulator".into(),
+            carla: CarlaPlan {
+                version: LeaderboardVersion::V2,
+                codename: "SENSORS".into(),
+                slices: vec![RouteSlice { first: 0, last: 1 }, RouteSlice { first: 2, last: 3 }],
+                routes: 4,
+                repetitions: 1,
+                contents_image: "contents".into(),
+                simulator_image: "simulator".into(),
+            },
             resume: false,
             earlier_attempts: 0,
             submission_uid: None,
@@ -280,7 +286,7 @@ fn run(bucket: &str) -> Run {
         period_seconds: 1,
         flush_seconds: 60,
         cancel_seconds: 20,
-        log_group: None,
+        logs: None,
         isolation: None,
     }
 }

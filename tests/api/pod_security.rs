@@ -42,7 +42,7 @@ impl World {
 
     /// Makes a Leaderboard with this laid over its spec, without any way to EvalAI.
     async fn leaderboard(&self, name: &str, more: &Value) {
-        let without = json!({"evalai": null, "queue": null, "table": null, "logGroup": null});
+        let without = json!({"evalai": null, "queue": null, "table": null, "logs": null});
         let storage = json!({"bucket": self.aws.name("bucket"), "endpoint": self.aws.endpoint, "region": null});
         let mut spec = json!({"spec": more});
         merge(&mut spec["spec"], &without);
@@ -51,7 +51,7 @@ impl World {
             // Only EvalAI has phases.
             merge(track, &json!({"phase": null}));
         }
-        spec["spec"]["storage"] = storage;
+        spec["spec"]["storage"] = json!({ "s3": storage });
         let api = Kind::Leaderboard.api(&self.client, &self.namespace);
         create(&api, Kind::Leaderboard.object(name, &[&spec]), false)
             .await
@@ -140,7 +140,10 @@ async fn a_namespace_that_enforces_baseline_takes_the_pods_of_every_default_and_
     let role = json!({"serviceAccountName": "worker", "roleARN": "arn:aws:iam::123456789012:role/results"});
     for (name, more) in [
         ("default-2", json!({})),
-        ("default-1", json!({"leaderboardVersion": "V1", "pairs": 16})),
+        (
+            "default-1",
+            json!({"evaluation": {"carla": {"version": "V1", "pairs": 16}}}),
+        ),
         ("of-role", json!({"podIdentity": role})),
         ("of-secret", json!({"podIdentity": {"secretName": "aws"}})),
         ("example-20", example("leaderboard-20.yaml")),
@@ -159,7 +162,9 @@ async fn a_namespace_that_enforces_baseline_takes_the_pods_of_every_default_and_
         );
     }
     let simulator = json!({"image": "simulator:1", "securityContext": {"privileged": true}, "display": "X11Socket"});
-    let template = world.template("weaker", &json!({ "simulator": simulator })).await;
+    let template = world
+        .template("weaker", &json!({ "evaluation": {"carla": {"simulator": simulator}} }))
+        .await;
     let refused = pod(&world.client, &baseline, &template).await.unwrap_err();
     for what in ["privileged", "hostPath volumes"] {
         assert!(refused.contains(what), "{refused}");
@@ -177,7 +182,10 @@ async fn a_namespace_that_enforces_restricted_takes_the_pods_of_its_example() {
     let made = pod(&world.client, &restricted, &template).await;
     assert!(made.is_ok(), "{made:?}");
     let more = example("leaderboard-restricted.yaml");
-    assert_eq!(more["contents"]["securityContext"]["runAsNonRoot"], true);
+    assert_eq!(
+        more["evaluation"]["carla"]["contents"]["securityContext"]["runAsNonRoot"],
+        true
+    );
     world.operator.end().await;
 }
 

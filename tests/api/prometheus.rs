@@ -119,9 +119,9 @@ async fn make_board(world: &World, queue: &str) {
     make_table(&world.aws, &table).await;
     let dead = world.aws.queue("prometheus-dead").await;
     let more = json!({
-        "routes": ROUTES,
-        "queue": {"url": queue, "deadLetterURL": dead, "endpoint": world.aws.endpoint, "unknownAfterSeconds": 0},
-        "table": {"name": table, "endpoint": world.aws.endpoint},
+        "evaluation": {"carla": {"routes": ROUTES}},
+        "queue": {"sqs": {"url": queue, "deadLetterURL": dead, "endpoint": world.aws.endpoint, "unknownAfterSeconds": 0}},
+        "table": {"dynamoDB": {"name": table, "endpoint": world.aws.endpoint}},
         "concurrency": {"total": 2},
     });
     world.leaderboard_with("lb", 1, "Hosts", &more).await;

@@ -118,7 +118,7 @@ async fn a_queue_that_cannot_be_used_is_named_with_what_to_do() {
         "{text}"
     );
     assert!(
-        text.ends_with("check queue.url, queue.region and queue.endpoint of its Leaderboards"),
+        text.ends_with("check queue.sqs.url, queue.sqs.region and queue.sqs.endpoint of its Leaderboards"),
         "{text}"
     );
     let port = std::net::TcpListener::bind(("127.0.0.1", 0))

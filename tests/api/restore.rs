@@ -50,13 +50,13 @@ impl Season {
         let world = World::new().await;
         let table = world.aws.name("restored-rows");
         make_table(&world.aws, &table).await;
-        let spec = json!({"routes": ROUTES, "table": {"name": table, "endpoint": world.aws.endpoint}});
+        let spec = json!({"evaluation": {"carla": {"routes": ROUTES}}, "table": {"dynamoDB": {"name": table, "endpoint": world.aws.endpoint}}});
         world.leaderboard_with("lb", 1, "Hosts", &spec).await;
         world
             .leaderboard_with("held", 2, "Hosts", &json!({"paused": true}))
             .await;
         let local = json!({
-            "evalai": null, "routes": ROUTES, "tracks": [{"name": "sensors", "codename": "SENSORS"}],
+            "evalai": null, "evaluation": {"carla": {"routes": ROUTES}}, "tracks": [{"name": "sensors"}],
         });
         world.leaderboard_with("local", 1, "Hosts", &local).await;
         let controller = world.controller();

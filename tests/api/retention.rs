@@ -61,7 +61,8 @@ fn resumed_by_a_host(world: &World, pk: u64) {
 async fn what_has_ended_is_deleted_after_its_time_and_only_a_resume_runs_again() {
     let world = World::new().await;
     let table = table(&world).await;
-    let short = json!({"table": table, "ttlSecondsAfterFinished": 1, "retention": {"finishedSeconds": 1}});
+    let short =
+        json!({"table": {"dynamoDB": table}, "ttlSecondsAfterFinished": 1, "retention": {"finishedSeconds": 1}});
     world.leaderboard_with("short", 1, "Hosts", &short).await;
     world.leaderboard("long", 2, "Hosts").await;
     let _controller = world.controller();

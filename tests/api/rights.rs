@@ -197,8 +197,7 @@ async fn the_charts_rights_in_two_namespaces_are_enough_for_a_whole_life() {
 
     world.leaderboard("lb", 1, "Hosts").await;
     until_ready(&world.client, release, "lb").await;
-    let storage =
-        json!({"spec": {"storage": {"bucket": world.bucket, "prefix": "second/", "endpoint": world.aws.endpoint}}});
+    let storage = json!({"spec": {"storage": {"s3": {"bucket": world.bucket, "prefix": "second/", "endpoint": world.aws.endpoint}}}});
     let api = Kind::Leaderboard.api(&world.client, &second);
     create(&api, Kind::Leaderboard.object("lb", &[&storage]), false)
         .await

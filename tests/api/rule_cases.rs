@@ -82,7 +82,7 @@ fn evalai() -> Value {
 }
 
 fn track(more: &Value) -> Value {
-    let mut track = json!({"name": "sensors", "codename": "SENSORS"});
+    let mut track = json!({"name": "sensors", "carla": {"codename": "SENSORS"}});
     super::objects::merge(&mut track, more);
     track
 }
@@ -103,27 +103,27 @@ fn names() -> Vec<Case> {
 fn kept() -> Vec<Case> {
     let paused = json!({"paused": true});
     let served = json!({"evalai": evalai(), "tracks": [track(&json!({"phase": 7}))]});
-    let prefix = |prefix: &Value| json!({"storage": {"prefix": prefix}});
+    let prefix = |prefix: &Value| json!({"storage": {"s3": {"prefix": prefix}}});
     let keeps = |message, from: &Value, bad: &Value| update(Leaderboard, message, from, bad, &paused);
     vec![
         keeps(
-            "leaderboardVersion is immutable",
+            "evaluation.carla.version is immutable",
             &json!({}),
-            &json!({"leaderboardVersion": "V1"}),
+            &json!({"evaluation": {"carla": {"version": "V1"}}}),
         ),
         keeps(
-            "storage.bucket is immutable",
+            "storage.s3.bucket is immutable",
             &json!({}),
-            &json!({"storage": {"bucket": "other"}}),
+            &json!({"storage": {"s3": {"bucket": "other"}}}),
         ),
-        keeps("storage.prefix is immutable", &json!({}), &prefix(&json!("a/"))),
+        keeps("storage.s3.prefix is immutable", &json!({}), &prefix(&json!("a/"))),
         keeps(
-            "storage.prefix is immutable",
+            "storage.s3.prefix is immutable",
             &prefix(&json!("a/")),
             &prefix(&json!("b/")),
         ),
         keeps(
-            "storage.prefix is immutable",
+            "storage.s3.prefix is immutable",
             &prefix(&json!("a/")),
             &prefix(&Value::Null),
         ),
@@ -147,9 +147,9 @@ fn kept() -> Vec<Case> {
         ),
         update(
             Leaderboard,
-            "leaderboardVersion is immutable",
+            "evaluation.carla.version is immutable",
             &json!({}),
-            &json!({"leaderboardVersion": "V1"}),
+            &json!({"evaluation": {"carla": {"version": "V1"}}}),
             &served,
         ),
     ]
@@ -161,10 +161,11 @@ fn one_track(more: &Value) -> Value {
 
 fn tracks() -> Vec<Case> {
     let two = |second: i64| {
-        let more = json!({"name": "map", "codename": "MAP", "phase": second});
+        let more = json!({"name": "map", "carla": {"codename": "MAP"}, "phase": second});
         json!({"evalai": evalai(), "tracks": [track(&json!({"phase": 7})), more]})
     };
-    let drives = |pairs: i64, routes: i64| json!({"pairs": pairs, "routes": routes});
+    let drives = |pairs: i64, routes: i64| json!({"evaluation": {"carla": {"pairs": pairs, "routes": routes}}});
+    let of_track = |pairs: i64, routes: i64| one_track(&json!({"carla": {"pairs": pairs, "routes": routes}}));
     let phase = one_track(&json!({"phase": 7}));
     let no_phase = one_track(&json!({}));
     let case = |message, good: &Value, bad: &Value| create(Leaderboard, message, good, bad);
@@ -173,19 +174,14 @@ fn tracks() -> Vec<Case> {
         case("no track has a phase", &served(&json!({})), &no_phase),
         case("but evalai is missing", &no_phase, &phase),
         case("more pairs than routes", &drives(4, 4), &drives(4, 3)),
-        case(
-            "more pairs than routes",
-            &one_track(&drives(2, 2)),
-            &one_track(&drives(2, 1)),
-        ),
+        case("more pairs than routes", &of_track(2, 2), &of_track(2, 1)),
     ]
 }
 
 fn subsets() -> Vec<Case> {
-    let subsets = |list: &Value| one_track(&json!({"pairs": 2, "routeSubsets": list}));
+    let subsets = |list: &Value| one_track(&json!({"carla": {"pairs": 2, "routeSubsets": list}}));
     let uneven = subsets(&json!(["0-14", "15-19"]));
-    let v1 =
-        json!({"leaderboardVersion": "V1", "tracks": [track(&json!({"scenariosFile": "/workspace/scenarios.json"}))]});
+    let v1 = json!({"evaluation": {"carla": {"version": "V1"}}, "tracks": [track(&json!({"carla": {"scenariosFile": "/workspace/scenarios.json"}}))]});
     let case = |message, bad: &Value| create(Leaderboard, message, &uneven, &subsets(bad));
     vec![
         case("one entry for each of its pairs", &json!(["0-19"])),
@@ -196,16 +192,19 @@ fn subsets() -> Vec<Case> {
             Leaderboard,
             "only V1 reads one",
             &v1,
-            &json!({"leaderboardVersion": "V2"}),
+            &json!({"evaluation": {"carla": {"version": "V2"}}}),
         ),
     ]
 }
 
 fn containers() -> Vec<Case> {
-    let ran = |part: &str, run: &Value| json!({ part: run });
+    let ran = |part: &str, run: &Value| match part {
+        "agent" => json!({ "agent": run }),
+        part => json!({"evaluation": {"carla": {part: run}}}),
+    };
     ["agent", "contents", "simulator"]
         .into_iter()
-        .zip(["agent.args", "contents.args", "simulator.args"])
+        .zip(["agent.args", "carla.contents.args", "carla.simulator.args"])
         .map(|(part, message)| {
             let good = ran(part, &json!({"command": ["/bin/sh"], "args": ["-c", "true"]}));
             create(Leaderboard, message, &good, &ran(part, &json!({"command": null})))
@@ -281,14 +280,23 @@ fn server() -> Vec<Case> {
     let nowhere = json!({"evalai": {"token": {"secretKeyRef": null}}});
     let case = |message, good: &Value, bad: &Value| create(Leaderboard, message, good, bad);
     let one_place = "exactly one of secretKeyRef and secretsManager";
-    let mode = |mode: &str| served(&json!({"evalai": {"mode": mode}, "storage": {"prefix": "observe/"}}));
+    let mode = |mode: &str| served(&json!({"evalai": {"mode": mode}, "storage": {"s3": {"prefix": "observe/"}}}));
     let observe = mode("Observe");
-    let only_observed = "evalai.mode Observe needs a storage.prefix";
-    let queue = json!({"queue": {"url": "https://sqs.example.org/1/a"}});
+    let only_observed = "evalai.mode Observe needs a storage.s3.prefix";
+    let queue = json!({"queue": {"sqs": {"url": "https://sqs.example.org/1/a"}}});
     vec![
         case(only_observed, &observe, &queue),
-        case(only_observed, &observe, &json!({"table": {"name": "rows"}})),
-        case(only_observed, &observe, &json!({"storage": {"prefix": null}})),
+        case(
+            only_observed,
+            &observe,
+            &json!({"queue": {"evalai": {"name": "carla-1"}}}),
+        ),
+        case(
+            only_observed,
+            &observe,
+            &json!({"table": {"dynamoDB": {"name": "rows"}}}),
+        ),
+        case(only_observed, &observe, &json!({"storage": {"s3": {"prefix": null}}})),
         update(
             Leaderboard,
             "evalai.mode is immutable",
@@ -318,14 +326,20 @@ fn server() -> Vec<Case> {
 fn queue() -> Vec<Case> {
     let queue = |url: &str, dead: &str| {
         let at = |name: &str| format!("https://sqs.example.org/1/{name}");
-        json!({"queue": {"url": at(url), "deadLetterURL": at(dead)}})
+        json!({"queue": {"sqs": {"url": at(url), "deadLetterURL": at(dead)}}})
     };
     let case = |message, good: &Value, bad: &Value| create(Leaderboard, message, good, bad);
-    let alone = json!({"queue": {"url": "https://sqs.example.org/1/a"}});
-    let inbox = json!({"evalai": {"queue": {"name": "carla-1"}}});
+    let alone = json!({"queue": {"sqs": {"url": "https://sqs.example.org/1/a"}}});
+    let inbox = json!({"queue": {"evalai": {"name": "carla-1"}}});
     vec![
         case("queue needs evalai", &json!({}), &alone),
-        case("two ways to the challenge's messages", &served(&inbox), &alone),
+        case("queue needs evalai", &json!({}), &inbox),
+        case("queue needs exactly one of sqs and evalai", &served(&inbox), &alone),
+        case(
+            "queue needs exactly one of sqs and evalai",
+            &served(&inbox),
+            &json!({"queue": {"evalai": null}}),
+        ),
         case("is the queue itself", &served(&queue("a", "b")), &queue("a", "a")),
         case(
             "needs a FIFO dead-letter queue",
@@ -370,7 +384,7 @@ fn identities_and_tables() -> Vec<Case> {
     let role = "arn:aws:iam::123456789012:role/pods";
     let secret = identity(json!({"secretName": "aws", "serviceAccountName": "pods"}));
     let assumed = identity(json!({"roleARN": role, "serviceAccountName": "pods"}));
-    let table = |sort_key: &Value| json!({"table": {"name": "rows", "partitionKey": "team_id", "sortKey": sort_key}});
+    let table = |sort_key: &Value| json!({"table": {"dynamoDB": {"name": "rows", "partitionKey": "team_id", "sortKey": sort_key}}});
     let both = table(&json!("submission_id"));
     let case = |message, good: &Value, bad: &Value| create(Leaderboard, message, good, bad);
     let one_way = "exactly one of roleARN and secretName";
@@ -389,9 +403,9 @@ fn identities_and_tables() -> Vec<Case> {
 
 /// A password in any of these would be shown by conditions and logs.
 fn endpoints() -> Vec<Case> {
-    let storage = |endpoint: &str| json!({"storage": {"endpoint": endpoint}});
-    let table = |endpoint: &str| json!({"table": {"name": "rows", "endpoint": endpoint}});
-    let group = |endpoint: &str| json!({"logGroup": {"name": "logs", "endpoint": endpoint}});
+    let storage = |endpoint: &str| json!({"storage": {"s3": {"endpoint": endpoint}}});
+    let table = |endpoint: &str| json!({"table": {"dynamoDB": {"name": "rows", "endpoint": endpoint}}});
+    let group = |endpoint: &str| json!({"logs": {"cloudWatch": {"name": "logs", "endpoint": endpoint}}});
     let entry = |endpoint: &str| {
         let manager = json!({"id": "evalai", "endpoint": endpoint});
         served(&json!({"evalai": {"token": {"secretsManager": manager, "secretKeyRef": null}}}))
@@ -399,7 +413,7 @@ fn endpoints() -> Vec<Case> {
     let queue = |field: &str, url: &str| {
         let mut queue = json!({"url": "https://sqs.example.org/1/a", "deadLetterURL": "https://sqs.example.org/1/b"});
         queue[field] = url.into();
-        served(&json!({ "queue": queue }))
+        served(&json!({ "queue": {"sqs": queue} }))
     };
     let mut cases = Vec::new();
     for bad in [
@@ -409,14 +423,14 @@ fn endpoints() -> Vec<Case> {
     ] {
         let good = "http://aws:4566/path";
         let mut case = |message, good: Value, bad: Value| cases.push(create(Leaderboard, message, &good, &bad));
-        case("storage.endpoint may hold neither", storage(good), storage(bad));
-        case("table.endpoint may hold neither", table(good), table(bad));
-        case("logGroup.endpoint may hold neither", group(good), group(bad));
+        case("storage.s3.endpoint may hold neither", storage(good), storage(bad));
+        case("table.dynamoDB.endpoint may hold neither", table(good), table(bad));
+        case("logs.cloudWatch.endpoint may hold neither", group(good), group(bad));
         case("secretsManager.endpoint may hold neither", entry(good), entry(bad));
         for (field, message) in [
-            ("url", "queue.url may hold neither"),
-            ("deadLetterURL", "queue.deadLetterURL may hold neither"),
-            ("endpoint", "queue.endpoint may hold neither"),
+            ("url", "queue.sqs.url may hold neither"),
+            ("deadLetterURL", "queue.sqs.deadLetterURL may hold neither"),
+            ("endpoint", "queue.sqs.endpoint may hold neither"),
         ] {
             case(message, queue(field, good), queue(field, bad));
         }
@@ -428,14 +442,14 @@ fn sizes_and_images() -> Vec<Case> {
     let case = |message, good: &Value, bad: &Value| create(Leaderboard, message, good, bad);
     vec![
         case(
-            "storage.sizeLimit must be 1Ti",
-            &json!({"storage": {"sizeLimit": "0.5Ti"}}),
-            &json!({"storage": {"sizeLimit": "1.5Ti"}}),
+            "storage.s3.sizeLimit must be 1Ti",
+            &json!({"storage": {"s3": {"sizeLimit": "0.5Ti"}}}),
+            &json!({"storage": {"s3": {"sizeLimit": "1.5Ti"}}}),
         ),
         case(
-            "storage.sizeLimit must be 16Mi",
-            &json!({"storage": {"sizeLimit": 16_777_216}}),
-            &json!({"storage": {"sizeLimit": 16_000_000}}),
+            "storage.s3.sizeLimit must be 16Mi",
+            &json!({"storage": {"s3": {"sizeLimit": 16_777_216}}}),
+            &json!({"storage": {"s3": {"sizeLimit": 16_000_000}}}),
         ),
         case(
             "agent.shmSize must be 1Mi",
@@ -448,14 +462,14 @@ fn sizes_and_images() -> Vec<Case> {
             &json!({"agent": {"shmSize": "1025Gi"}}),
         ),
         case(
-            "logGroup.retentionDays must be",
-            &json!({"logGroup": {"name": "logs", "retentionDays": 30}}),
-            &json!({"logGroup": {"name": "logs", "retentionDays": 31}}),
+            "logs.cloudWatch.retentionDays must be",
+            &json!({"logs": {"cloudWatch": {"name": "logs", "retentionDays": 30}}}),
+            &json!({"logs": {"cloudWatch": {"name": "logs", "retentionDays": 31}}}),
         ),
         case(
-            "logGroup.tags are for",
-            &json!({"logGroup": {"name": "logs", "retentionDays": 30, "tags": {"team": "challenge"}}}),
-            &json!({"logGroup": {"name": "logs", "retentionDays": null, "tags": {"team": "challenge"}}}),
+            "logs.cloudWatch.tags are for",
+            &json!({"logs": {"cloudWatch": {"name": "logs", "retentionDays": 30, "tags": {"team": "challenge"}}}}),
+            &json!({"logs": {"cloudWatch": {"name": "logs", "retentionDays": null, "tags": {"team": "challenge"}}}}),
         ),
         case(
             "agent.logSizeLimit must be 1Mi",

@@ -31,7 +31,7 @@ impl Operator {
     async fn start(world: World, phase: u64, queue: &str, dead: &str) -> Self {
         let endpoint = &world.aws.endpoint;
         let more = json!({
-            "queue": {"url": queue, "deadLetterURL": dead, "endpoint": endpoint, "foreign": "Leave", "unknownAfterSeconds": 1},
+            "queue": {"sqs": {"url": queue, "deadLetterURL": dead, "endpoint": endpoint, "foreign": "Leave", "unknownAfterSeconds": 1}},
             "evalai": {"requestsPerMinute": HALF},
         });
         let name = format!("lb-{phase}");

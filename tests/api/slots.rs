@@ -29,7 +29,7 @@ impl World {
             namespace: server().await.namespace("slots").await,
         };
         let storage = json!({"bucket": world.aws.name("bucket"), "endpoint": world.aws.endpoint});
-        let patch = json!({"spec": {"storage": storage, "concurrency": {"total": 1}}});
+        let patch = json!({"spec": {"storage": {"s3": storage}, "concurrency": {"total": 1}}});
         let api = Kind::Leaderboard.api(&server().await.client(), &world.namespace);
         create(&api, Kind::Leaderboard.object(NAME, &[&patch]), false)
             .await
@@ -128,7 +128,7 @@ async fn a_check_starts_while_the_leaderboard_is_paused_and_others_wait() {
     let api: Api<Submission> = Api::namespaced(server().await.client(), &world.namespace);
     let status = api.get("check-one").await.unwrap().status.unwrap();
     let plan = status.plan.unwrap();
-    assert_eq!((plan.slices.len(), plan.routes, plan.repetitions), (1, 1, 1));
+    assert_eq!((plan.workers(), plan.carla.routes, plan.carla.repetitions), (1, 1, 1));
     assert_eq!(api.get("check-one").await.unwrap().finalizers().len(), 0);
 
     // One without a Job ends at once.

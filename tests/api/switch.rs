@@ -83,7 +83,7 @@ async fn what_the_old_pipeline_runs_is_left_alone_until_it_has_ended_there() {
     let world = World::new().await;
     let table = world.aws.name("old-rows");
     make_table(&world.aws, &table).await;
-    let spec = json!({"table": {"name": table, "endpoint": world.aws.endpoint}});
+    let spec = json!({"table": {"dynamoDB": {"name": table, "endpoint": world.aws.endpoint}}});
     world.leaderboard_with("lb", 1, "Hosts", &spec).await;
     // The pipeline takes both messages before the operator begins.
     let (finishes, fails) = (world.submit("lb", 1).await, world.submit("lb", 1).await);
@@ -127,7 +127,7 @@ async fn a_prefix_in_use_holds_a_submission_back_until_a_person_hands_it_over() 
     let world = World::new().await;
     let table = world.aws.name("rows");
     make_table(&world.aws, &table).await;
-    let spec = json!({"table": {"name": table, "endpoint": world.aws.endpoint}});
+    let spec = json!({"table": {"dynamoDB": {"name": table, "endpoint": world.aws.endpoint}}});
     world.leaderboard_with("lb", 1, "Hosts", &spec).await;
     let (pk, name) = world.submit("lb", 1).await;
     let _controller = world.controller();
@@ -153,13 +153,13 @@ async fn a_submission_that_nobody_has_begun_starts_with_one_look() {
     let world = World::new().await;
     let table = world.aws.name("new-rows");
     make_table(&world.aws, &table).await;
-    let spec: Value = json!({"table": {"name": table, "endpoint": world.aws.endpoint}});
+    let spec: Value = json!({"table": {"dynamoDB": {"name": table, "endpoint": world.aws.endpoint}}});
     world.leaderboard_with("lb", 1, "Hosts", &spec).await;
     let _controller = world.controller();
     let (_, name) = world.submit("lb", 1).await;
     assert_eq!(resume(&world.job(&name, 0).await), "");
     // A Leaderboard whose table does not exist yet: nobody's row is there, and its status names the fault.
-    let gone = json!({"table": {"name": world.aws.name("gone"), "endpoint": world.aws.endpoint}});
+    let gone = json!({"table": {"dynamoDB": {"name": world.aws.name("gone"), "endpoint": world.aws.endpoint}}});
     world.leaderboard_with("other", 2, "Hosts", &gone).await;
     let (_, name) = world.submit("other", 2).await;
     world.job(&name, 0).await;
@@ -168,7 +168,7 @@ async fn a_submission_that_nobody_has_begun_starts_with_one_look() {
 #[tokio::test(flavor = "multi_thread", worker_threads = 2)]
 async fn what_is_only_observed_is_run_and_never_written_to_evalai() {
     let world = World::new().await;
-    let spec = json!({"evalai": {"mode": "Observe"}, "storage": {"prefix": "observe/"}});
+    let spec = json!({"evalai": {"mode": "Observe"}, "storage": {"s3": {"prefix": "observe/"}}});
     world.leaderboard_with("lb", 1, "Hosts", &spec).await;
     let (pk, name) = world.submit("lb", 1).await;
     // The other program was faster.

@@ -24,12 +24,12 @@ fn client(stand_in: &StandIn) -> aws_sdk_dynamodb::Client {
     stand_in.aws.dynamodb(None, Some(&stand_in.endpoint))
 }
 
-fn named(stand_in: &StandIn, name: &str) -> api::Table {
+fn named(stand_in: &StandIn, name: &str) -> api::DynamoTable {
     serde_json::from_value(json!({"name": stand_in.name(name), "endpoint": stand_in.endpoint})).unwrap()
 }
 
 /// A new table with these keys, and its description.
-pub(super) async fn table(stand_in: &StandIn, name: &str, keys: &[(&str, ScalarAttributeType)]) -> api::Table {
+pub(super) async fn table(stand_in: &StandIn, name: &str, keys: &[(&str, ScalarAttributeType)]) -> api::DynamoTable {
     let mut request = client(stand_in)
         .create_table()
         .table_name(stand_in.name(name))
@@ -48,7 +48,7 @@ pub(super) async fn table(stand_in: &StandIn, name: &str, keys: &[(&str, ScalarA
     named(stand_in, name)
 }
 
-async fn usual(stand_in: &StandIn) -> (api::Table, Table) {
+async fn usual(stand_in: &StandIn) -> (api::DynamoTable, Table) {
     let keys = [
         ("team_id", ScalarAttributeType::S),
         ("submission_id", ScalarAttributeType::S),
@@ -323,7 +323,7 @@ async fn a_table_that_cannot_be_used_is_shown_with_the_next_step() {
         "{missing}"
     );
     assert!(
-        missing.ends_with("check table.name, table.region and table.endpoint"),
+        missing.ends_with("check table.dynamoDB.name, table.dynamoDB.region and table.dynamoDB.endpoint"),
         "{missing}"
     );
     let single = table(&stand_in, "single", &[("team_id", ScalarAttributeType::S)]).await;
@@ -380,7 +380,7 @@ fn key(name: &str) -> ObjectKey {
     }
 }
 
-fn record(table: &api::Table, status: &str, is_end: bool) -> Record {
+fn record(table: &api::DynamoTable, status: &str, is_end: bool) -> Record {
     Record {
         table: table.clone(),
         row: row(1, status).into(),

@@ -278,7 +278,7 @@ async fn every_line_about_a_submission_that_fails_has_its_names_and_its_trace() 
     let world = world::World::new().await;
     let table = world.aws.name("traces");
     make_table(&world.aws, &table).await;
-    let more = json!({"table": {"name": table, "endpoint": world.aws.endpoint}});
+    let more = json!({"table": {"dynamoDB": {"name": table, "endpoint": world.aws.endpoint}}});
     world.leaderboard_with("lb", 1, "Hosts", &more).await;
     let lines = Lines::default();
     let _second = Dispatch::new(tracing_subscriber::registry());

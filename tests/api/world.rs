@@ -16,7 +16,7 @@ use kube::api::{ApiResource, DynamicObject, ListParams, Patch, PatchParams, Post
 use kube::runtime::wait::await_condition;
 use kube::{Api, Client, ResourceExt};
 use leaderboard_api::{
-    Attempt, JobNumber, Leaderboard, Storage, Submission, SubmissionStatus, conditions, names, reasons,
+    Attempt, JobNumber, Leaderboard, S3Bucket, Submission, SubmissionStatus, conditions, names, reasons,
 };
 use leaderboard_aws::archive::Archive;
 use leaderboard_base::shutdown::Stop;
@@ -192,12 +192,13 @@ impl World {
                     "apiServer": self.evalai.url(), "challenge": 1, "requestsPerMinute": 6000, "logTail": log_tail,
                     "token": {"secretKeyRef": {"name": "evalai", "key": "token"}},
                 },
-                "tracks": [{"name": "sensors", "codename": "SENSORS", "phase": phase}],
-                "leaderboardVersion": "V2",
-                "contents": {"image": "contents:1"}, "simulator": {"image": "simulator:1"},
-                "agent": {"images": []},
-                "pairs": 1, "routes": 1, "retries": {"perWorker": 0}, "syncPeriodSeconds": 1,
-                "storage": {"bucket": self.bucket, "endpoint": self.aws.endpoint},
+                "tracks": [{"name": "sensors", "phase": phase}],
+                "evaluation": {"carla": {
+                    "version": "V2", "contents": {"image": "contents:1"}, "simulator": {"image": "simulator:1"},
+                    "pairs": 1, "routes": 1,
+                }},
+                "agent": {"images": []}, "retries": {"perWorker": 0}, "syncPeriodSeconds": 1,
+                "storage": {"s3": {"bucket": self.bucket, "endpoint": self.aws.endpoint}},
             },
         });
         merge(&mut leaderboard, &json!({ "spec": more }));
@@ -265,7 +266,7 @@ impl World {
 
     pub(super) fn archive(&self, run: u64) -> Archive {
         let storage = json!({"bucket": self.bucket, "endpoint": self.aws.endpoint});
-        let storage: Storage = serde_json::from_value(storage).unwrap();
+        let storage: S3Bucket = serde_json::from_value(storage).unwrap();
         Archive::of_run(&self.aws.aws, &storage, &run.to_string().parse().unwrap())
     }
 

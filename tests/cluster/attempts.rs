@@ -60,7 +60,7 @@ async fn evalai_hears_of_no_end_between_the_attempts() {
     scenario("restart-evalai", async |scene: &Scene| {
         let evalai = Evalai::start(scene).await;
         let mut spec = spec();
-        (spec["pairs"], spec["routes"]) = (json!(2), json!(20));
+        spec["evaluation"] = json!({"carla": {"pairs": 2, "routes": 20}});
         scene.evalai_leaderboard("lb", &evalai, spec).await;
         let _operator = [controller(scene), bridge(scene)];
         let pk = evalai.submit(&scene.lab.challenge("agent:standard"), 1).await;

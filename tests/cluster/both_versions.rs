@@ -55,10 +55,11 @@ async fn leaderboard_10_comes_from_a_message_over_a_resume_to_its_score() {
     scenario("leaderboard-10", async |scene: &Scene| {
         let evalai = Evalai::start(scene).await;
         let change = json!({
-            "leaderboardVersion": "V1",
+            "evaluation": {"carla": {
+                "version": "V1", "pairs": 2, "routes": 6, "repetitions": 2,
+            }},
             "evalai": {"challenge": 2},
-            "tracks": [{"name": "map", "codename": "MAP", "phase": 4, "routesFile": ROUTES, "scenariosFile": SCENARIOS}],
-            "pairs": 2, "routes": 6, "repetitions": 2,
+            "tracks": [{"name": "map", "carla": {"codename": "MAP", "routesFile": ROUTES, "scenariosFile": SCENARIOS}, "phase": 4}],
             "retries": {"perWorker": 0},
             "agent": {"env": [prints(), {"name": "AGENT_KNOBS", "value": "pair=2,crash@4"}]},
         });
@@ -231,21 +232,23 @@ impl Original {
     async fn apply(&self, scene: &Scene, evalai: &Evalai) {
         let is_first = self.metrics == 12;
         let track = |(codename, phase): (&str, u64)| {
-            let mut track = json!({"name": codename.to_lowercase(), "codename": codename, "phase": phase});
+            let mut track = json!({"name": codename.to_lowercase(), "carla": {"codename": codename}, "phase": phase});
             if is_first {
-                track["scenariosFile"] = SCENARIOS.into();
+                track["carla"]["scenariosFile"] = SCENARIOS.into();
             }
             track
         };
         let tracks: Vec<Value> = TRACKS.into_iter().zip(self.phases).map(track).collect();
         let change = json!({
-            "leaderboardVersion": if is_first { "V1" } else { "V2" },
+            "evaluation": {"carla": {
+                "version": if is_first { "V1" } else { "V2" }, "pairs": 1, "routes": 2,
+                "repetitions": if is_first { 2 } else { 1 },
+            }},
             "tracks": tracks,
-            "pairs": 1, "routes": 2, "repetitions": if is_first { 2 } else { 1 },
             "agent": {"env": [prints()]},
             "evalai": {"requestsPerMinute": 600},
-            "storage": {"prefix": format!("{}{}/", scene.cloud.prefix, self.folder)},
-            "table": {"name": self.table(scene)},
+            "storage": {"s3": {"prefix": format!("{}{}/", scene.cloud.prefix, self.folder)}},
+            "table": {"dynamoDB": {"name": self.table(scene)}},
         });
         scene.evalai_leaderboard(self.name, evalai, change).await;
     }

@@ -22,7 +22,7 @@ const TRIES: u32 = 3;
 async fn bad_messages_land_in_the_dead_letter_queue_with_their_reasons() {
     scenario("dead-letters", async |scene: &Scene| {
         let evalai = Evalai::start(scene).await;
-        let queue = json!({"queue": {"unknownAfterSeconds": UNKNOWN_AFTER_SECONDS}});
+        let queue = json!({"queue": {"sqs": {"unknownAfterSeconds": UNKNOWN_AFTER_SECONDS}}});
         scene.evalai_leaderboard("lb", &evalai, queue).await;
         let _bridge = bridge(scene);
         let foreign = r#"{"challenge_pk": "999", "phase_pk": "1", "submission_pk": 5}"#;
@@ -70,7 +70,7 @@ async fn a_message_delivered_again_and_again_runs_once_and_only_a_resume_runs_ag
         let evalai = Evalai::start(scene).await;
         scene.cloud.set_visibility(3).await;
         let change = json!({
-            "pairs": 2, "routes": 6,
+            "evaluation": {"carla": {"pairs": 2, "routes": 6}},
             "retries": {"perWorker": 0},
             // At every start: what it has left takes less time than a stop needs to reach it.
             "agent": {"env": [{"name": "AGENT_KNOBS", "value": "pair=2,crash@3"}]},
@@ -128,9 +128,9 @@ async fn a_leaderboard_applied_after_its_message_still_serves_it() {
         let evalai = Evalai::start(scene).await;
         let tracks = |name: &str, phase: u64| {
             json!({
-                "pairs": 2, "routes": 6,
-                "tracks": [{"name": name, "codename": name.to_uppercase(), "phase": phase}],
-                "storage": {"prefix": format!("{}{name}/", scene.cloud.prefix)},
+                "evaluation": {"carla": {"pairs": 2, "routes": 6}},
+                "tracks": [{"name": name, "carla": {"codename": name.to_uppercase()}, "phase": phase}],
+                "storage": {"s3": {"prefix": format!("{}{name}/", scene.cloud.prefix)}},
             })
         };
         scene.evalai_leaderboard("early", &evalai, tracks("map", 2)).await;

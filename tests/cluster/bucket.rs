@@ -22,7 +22,7 @@ async fn a_killed_logcopy_and_two_minutes_without_s3_lose_no_score() {
     scenario("no-s3", async |scene: &Scene| {
         let s3 = Gate::open(&scene.lab.host, &scene.cloud.endpoint).await;
         let change = json!({
-            "storage": {"endpoint": s3.url},
+            "storage": {"s3": {"endpoint": s3.url}},
             "agent": {"env": [{"name": "ROUTE_MS", "value": "3000"}]},
         });
         scene.leaderboard("lb", change).await;

@@ -65,7 +65,7 @@ async fn a_good_leaderboard_passes_while_it_is_paused() {
         logs.create_log_group().log_group_name(group).send().await.unwrap();
         let log_group = json!({"name": group, "region": region, "endpoint": endpoint});
         let contents = json!({"command": ["/bin/bash", "-c", COPIES]});
-        let change = json!({"table": table, "paused": true, "logGroup": log_group, "contents": contents});
+        let change = json!({"table": {"dynamoDB": table}, "paused": true, "logs": {"cloudWatch": log_group}, "evaluation": {"carla": {"contents": contents}}});
         scene.leaderboard("lb", change).await;
         let _controller = controller(scene);
         scene.ready("lb").await;
@@ -102,19 +102,19 @@ fn broken_parts(missing: &str) -> [(&'static str, Value, &'static str, &'static 
     [
         (
             "image",
-            json!({"simulator": {"image": missing}}),
+            json!({"evaluation": {"carla": {"simulator": {"image": missing}}}}),
             "agent:standard",
             &["ImagePull: ", "The image of simulator-1 cannot be pulled"],
         ),
         (
             "bucket",
-            json!({"storage": {"bucket": "leaderboard-tests-none"}}),
+            json!({"storage": {"s3": {"bucket": "leaderboard-tests-none"}}}),
             "agent:standard",
             &["Ready:       False, BucketUnreachable:"],
         ),
         (
             "contents",
-            json!({"contents": {"env": root}}),
+            json!({"evaluation": {"carla": {"contents": {"env": root}}}}),
             "agent:standard",
             &["StartDeadline: ", "ontents"],
         ),

@@ -127,11 +127,10 @@ impl Rehearsal<'_> {
     /// The Leaderboard for MAP alone; the other phase's messages are the old pipeline's.
     async fn apply_leaderboard(&self) {
         let change = json!({
-            "pairs": PAIRS,
-            "routes": PAIRS * ROUTES_A_PAIR,
-            "tracks": [{"name": "map", "codename": "MAP", "phase": MAP}],
+            "evaluation": {"carla": {"pairs": PAIRS, "routes": PAIRS * ROUTES_A_PAIR}},
+            "tracks": [{"name": "map", "carla": {"codename": "MAP"}, "phase": MAP}],
             "evalai": {"requestsPerMinute": REQUESTS, "sweepSeconds": 15},
-            "queue": {"foreign": "Leave"},
+            "queue": {"sqs": {"foreign": "Leave"}},
         });
         self.scene.evalai_leaderboard("lb", self.evalai, change).await;
     }
@@ -238,15 +237,15 @@ impl Rehearsal<'_> {
         let cloud = &self.scene.cloud;
         let change = json!({
             "tracks": [
-                {"name": "sensors", "codename": "SENSORS", "phase": SENSORS},
-                {"name": "map", "codename": "MAP", "phase": MAP},
+                {"name": "sensors", "carla": {"codename": "SENSORS"}, "phase": SENSORS},
+                {"name": "map", "carla": {"codename": "MAP"}, "phase": MAP},
             ],
-            "queue": {
+            "queue": {"sqs": {
                 "url": cloud.queue_url,
                 "deadLetterURL": cloud.dead_url,
                 "region": crate::aws::REGION,
                 "endpoint": self.scene.gate.url,
-            },
+            }},
         });
         self.scene.change_leaderboard("lb", &change).await;
         let _reader = bridge(self.scene);

@@ -22,9 +22,9 @@ async fn a_run_ends_as_it_began_whatever_becomes_of_its_leaderboard() {
             .submission("steady", "4 routes are done", Duration::from_mins(3), under_way)
             .await;
         let change = json!({
-            "pairs": 2,
-            "routes": 6,
-            "simulator": {"image": scene.lab.challenge("simulator:missing")},
+            "evaluation": {"carla": {
+                "pairs": 2, "routes": 6, "simulator": {"image": scene.lab.challenge("simulator:missing")},
+            }},
         });
         scene.change_leaderboard("lb", &change).await;
 

@@ -13,7 +13,7 @@ use crate::scene::{Scene, scenario};
 async fn an_agent_that_always_crashes_fails_in_every_system() {
     scenario("crash-always", async |scene: &Scene| {
         let evalai = Evalai::start(scene).await;
-        let change = json!({"pairs": 2, "routes": 6, "retries": {"perWorker": 1}});
+        let change = json!({"evaluation": {"carla": {"pairs": 2, "routes": 6}}, "retries": {"perWorker": 1}});
         scene.evalai_leaderboard("lb", &evalai, change).await;
         let (_controller, _bridge) = (controller(scene), bridge(scene));
         let pk = evalai.submit(&scene.lab.challenge("agent:crash-always"), 1).await;

@@ -207,11 +207,11 @@ async fn run_with(scene: &Scene, gpu: Value, more: Value) -> Containers {
 
 async fn leaderboard(scene: &Scene, gpu: Value, more: Value) {
     let mut change = json!({
-        "pairs": 2,
-        "routes": 2,
+        "evaluation": {"carla": {
+            "pairs": 2, "routes": 2,
+            "simulator": {"env": [{"name": "VK_DRIVER_FILES", "value": "/home/carla/CarlaUE4.sh"}]},
+        }},
         "gpu": gpu,
-        // In place of a driver's file.
-        "simulator": {"env": [{"name": "VK_DRIVER_FILES", "value": "/home/carla/CarlaUE4.sh"}]},
         "agent": {"env": [{"name": "AGENT_KNOBS", "value": "hang@1"}]},
         "retries": {"infrastructure": 0, "perWorker": 0},
     });

@@ -76,11 +76,13 @@ fn decisions(scene: &Scene) -> Value {
     json!({
         "evalai": {"token": {"secretsManager": {"endpoint": endpoint}}},
         "gpu": {"mode": "None", "resourceName": null},
-        "simulator": {"resources": resources, "securityContext": null, "display": "Offscreen"},
+        "evaluation": {"carla": {
+            "simulator": {"resources": resources, "securityContext": null, "display": "Offscreen"},
+        }},
         "agent": {"resources": resources, "images": [], "env": [{"name": "ROUTE_MS", "value": "100"}]},
-        "storage": {"region": region, "endpoint": endpoint, "prefix": scene.cloud.prefix},
-        "table": {"region": region, "endpoint": scene.gate.url},
-        "queue": {"region": region, "endpoint": scene.gate.url, "deadLetterURL": scene.cloud.dead_url},
+        "storage": {"s3": {"region": region, "endpoint": endpoint, "prefix": scene.cloud.prefix}},
+        "table": {"dynamoDB": {"region": region, "endpoint": scene.gate.url}},
+        "queue": {"sqs": {"region": region, "endpoint": scene.gate.url, "deadLetterURL": scene.cloud.dead_url}},
         "podIdentity": {"secretName": "aws", "serviceAccountName": null, "roleARN": null},
         "network": {
             "dns": "None", "enforcement": "Disabled", "egress": [{"cidr": format!("{}/32", scene.lab.host), "ports": [443]}],

@@ -21,8 +21,7 @@ pub(super) const REPEATED: &str = "Finished; at most one route of a pair repeate
 /// Six routes for two pairs, one in 9 s: when the status has two, the run is far from its end on a busy machine too.
 fn slow() -> Value {
     json!({
-        "pairs": 2,
-        "routes": 6,
+        "evaluation": {"carla": {"pairs": 2, "routes": 6}},
         "agent": {"env": [{"name": "ROUTE_MS", "value": "9000"}]},
     })
 }

@@ -42,11 +42,10 @@ async fn evalai_and_its_users_do_what_they_may() {
 
 pub async fn board(scene: &Scene, evalai: &Evalai, phase: u64, change: Value) {
     let mut base = json!({
-        "pairs": 1,
-        "routes": 2,
+        "evaluation": {"carla": {"pairs": 1, "routes": 2}},
         "retries": {"infrastructure": 0},
         "evalai": {"requestsPerMinute": 600},
-        "tracks": [{"name": "sensors", "codename": "SENSORS", "phase": phase}],
+        "tracks": [{"name": "sensors", "carla": {"codename": "SENSORS"}, "phase": phase}],
     });
     lay_over(&mut base, change);
     scene.evalai_leaderboard(&format!("lb-{phase}"), evalai, base).await;
@@ -179,11 +178,10 @@ async fn two_servers_with_the_same_ids_stay_apart() {
         let other = Evalai::start_from(scene, OTHER_KEYS).await;
         for (name, evalai) in [("one", &one), ("other", &other)] {
             let change = json!({
-                "pairs": 1,
-                "routes": 2,
+                "evaluation": {"carla": {"pairs": 1, "routes": 2}},
                 "evalai": {"requestsPerMinute": 600, "sweepSeconds": 10},
-                "tracks": [{"name": "sensors", "codename": "SENSORS", "phase": FIRST_PHASE}],
-                "storage": {"prefix": format!("{}{name}/", scene.cloud.prefix)},
+                "tracks": [{"name": "sensors", "carla": {"codename": "SENSORS"}, "phase": FIRST_PHASE}],
+                "storage": {"s3": {"prefix": format!("{}{name}/", scene.cloud.prefix)}},
                 // Nobody reads the queue: what is submitted is found by the sweep.
                 "queue": null,
             });

@@ -23,7 +23,7 @@ async fn an_api_server_out_of_reach_costs_nothing() {
         let mut case = Case::open("API server out of reach", "Finished; 1 Job");
         let server = Config::infer().await.unwrap().cluster_url.to_string();
         let api_server = Gate::open(&scene.lab.host, server.trim_end_matches('/')).await;
-        let slow = json!({"pairs": 1, "routes": 4, "agent": {"env": [{"name": "ROUTE_MS", "value": "5000"}]}});
+        let slow = json!({"evaluation": {"carla": {"pairs": 1, "routes": 4}}, "agent": {"env": [{"name": "ROUTE_MS", "value": "5000"}]}});
         scene.leaderboard("lb", slow).await;
         let mut cut_off = controller_through(scene, &api_server);
         scene.submit("alone", "agent:standard").await;
@@ -58,7 +58,11 @@ async fn the_endpoints_of_a_leaderboard_win_over_the_environment() {
         let elsewhere = Gate::open("127.0.0.1", &scene.cloud.endpoint).await;
         elsewhere.shut();
         scene
-            .evalai_leaderboard("lb", &evalai, json!({"pairs": 1, "routes": 2}))
+            .evalai_leaderboard(
+                "lb",
+                &evalai,
+                json!({"evaluation": {"carla": {"pairs": 1, "routes": 2}}}),
+            )
             .await;
         let _operator = both_with(scene, "AWS_ENDPOINT_URL", &elsewhere.url);
         let pk = evalai.submit(&scene.lab.challenge("agent:standard"), 1).await;

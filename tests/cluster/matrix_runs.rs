@@ -77,7 +77,7 @@ fn agent(knobs: &str) -> Value {
 }
 
 fn simulator(knobs: &str) -> Value {
-    json!({"simulator": {"env": [{"name": "SIM_KNOBS", "value": knobs}]}})
+    json!({"evaluation": {"carla": {"simulator": {"env": [{"name": "SIM_KNOBS", "value": knobs}]}}}})
 }
 
 /// The second pair's simulator crashes once, and the first pair's agent, which drives on, listens on its port from then on.
@@ -89,7 +89,7 @@ fn taken_port() -> Value {
     ]);
     with(
         simulator("pair=2,crash@2"),
-        json!({"pairs": 2, "routes": 8, "agent": {"env": agent}}),
+        json!({"evaluation": {"carla": {"pairs": 2, "routes": 8}}, "agent": {"env": agent}}),
     )
 }
 
@@ -122,7 +122,7 @@ fn of_images(other_machines: String, private: &Registry) -> Vec<Row> {
             then: Then::GiveUp("couldn't parse image name"),
             ..row(
                 "name of the contents' image that is none",
-                json!({"contents": {"image": "leaderboard.example/Contents:1"}}),
+                json!({"evaluation": {"carla": {"contents": {"image": "leaderboard.example/Contents:1"}}}}),
                 "Pending ImagePull; Failed ImagePull (infrastructure, not charged); EvalAI failed",
             )
         },
@@ -189,7 +189,7 @@ fn of_results() -> Vec<Row> {
     vec![
         row(
             "results implausible",
-            with(agent("forge"), json!({"verify": "Refuse"})),
+            with(agent("forge"), json!({"evaluation": {"carla": {"verify": "Refuse"}}})),
             "Failed InvalidResults (participant, charged); EvalAI failed",
         ),
         row(
@@ -258,12 +258,11 @@ async fn each_failure_ends_with_its_reason_and_whose_it_is() {
 async fn board(scene: &Scene, evalai: &Evalai, phase: u64, change: Value) -> String {
     let name = format!("lb-{phase}");
     let base = json!({
-        "pairs": 1,
-        "routes": 2,
+        "evaluation": {"carla": {"pairs": 1, "routes": 2}},
         "retries": {"perWorker": 1, "infrastructure": 0},
         "deadlines": {"cancelSeconds": 20},
         "evalai": {"requestsPerMinute": 600},
-        "tracks": [{"name": "sensors", "codename": "SENSORS", "phase": phase}],
+        "tracks": [{"name": "sensors", "carla": {"codename": "SENSORS"}, "phase": phase}],
     });
     scene.evalai_leaderboard(&name, evalai, with(base, change)).await;
     name

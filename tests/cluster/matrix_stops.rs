@@ -44,8 +44,7 @@ async fn a_cancel_ends_a_submission_at_every_stage() {
 
 fn small(change: Value) -> Value {
     let mut base = json!({
-        "pairs": 1,
-        "routes": 2,
+        "evaluation": {"carla": {"pairs": 1, "routes": 2}},
         "retries": {"infrastructure": 0},
         "deadlines": {"cancelSeconds": CANCEL_SECONDS},
     });
@@ -109,7 +108,7 @@ async fn while_an_image_is_pulled(scene: &Scene) {
 async fn in_the_contents(scene: &Scene) {
     let mut case = Case::open("cancel in the contents", "Pending Preparing; Cancelled");
     // Reads what nobody writes: there is no `sleep` in the image.
-    let waits = json!({"contents": {"command": ["/bin/bash", "-c", "trap 'exit 143' TERM; read -r <> <(:)"]}});
+    let waits = json!({"evaluation": {"carla": {"contents": {"command": ["/bin/bash", "-c", "trap 'exit 143' TERM; read -r <> <(:)"]}}}});
     board(scene, "contents", waits).await;
     scene.submit_to("contents", "contents", "agent:standard").await;
     let pod = scene.first_pod("contents", LIMIT).await.name_any();
@@ -131,7 +130,9 @@ async fn between_tries(scene: &Scene) {
     let mut case = Case::open("cancel between two tries", "Pending Replacing; Cancelled");
     let crashes = json!({
         "retries": {"perWorker": 0, "infrastructure": 4},
-        "simulator": {"env": [{"name": "SIM_KNOBS", "value": "crash@1"}]},
+        "evaluation": {"carla": {
+            "simulator": {"env": [{"name": "SIM_KNOBS", "value": "crash@1"}]},
+        }},
     });
     board(scene, "tries", crashes).await;
     scene.submit_to("tries", "tries", "agent:standard").await;
@@ -144,7 +145,7 @@ async fn between_tries(scene: &Scene) {
 async fn evalai_board(scene: &Scene, evalai: &Evalai, phase: u64, change: Value) {
     let mut base = small(json!({
         "evalai": {"requestsPerMinute": 600},
-        "tracks": [{"name": "sensors", "codename": "SENSORS", "phase": phase}],
+        "tracks": [{"name": "sensors", "carla": {"codename": "SENSORS"}, "phase": phase}],
     }));
     lay_over(&mut base, change);
     scene.evalai_leaderboard(&format!("lb-{phase}"), evalai, base).await;

@@ -62,8 +62,7 @@ async fn board(scene: &Scene, name: &str, change: Value) {
 
 fn small(change: Value) -> Value {
     let mut base = json!({
-        "pairs": 1,
-        "routes": 2,
+        "evaluation": {"carla": {"pairs": 1, "routes": 2}},
         "retries": {"perWorker": 1, "infrastructure": 0},
         "deadlines": {"cancelSeconds": 1},
     });
@@ -104,8 +103,8 @@ async fn unknown_leaderboard(scene: &Scene) {
 async fn unknown_track(scene: &Scene) {
     let mut case = Case::open("unknown track", "Pending TrackNotFound; Finished");
     let (other, both) = (
-        json!({"name": "map", "codename": "MAP"}),
-        json!({"name": "sensors", "codename": "SENSORS"}),
+        json!({"name": "map", "carla": {"codename": "MAP"}}),
+        json!({"name": "sensors", "carla": {"codename": "SENSORS"}}),
     );
     board(scene, "track-later", json!({"tracks": [other]})).await;
     case.cause();
@@ -160,7 +159,7 @@ async fn contents_fail(scene: &Scene) {
         "contents fail",
         "Pending Preparing; Failed StartDeadline (infrastructure, not charged)",
     );
-    let fails = json!({"contents": {"command": ["/bin/bash", "-c", "echo no such town >&2; exit 3"]}});
+    let fails = json!({"evaluation": {"carla": {"contents": {"command": ["/bin/bash", "-c", "echo no such town >&2; exit 3"]}}}});
     board(scene, "contents", fails).await;
     scene.submit_to("contents", "contents", "agent:standard").await;
     has_failed(scene, "contents", "contents").await;
@@ -193,7 +192,7 @@ async fn no_s3_in_the_pod(scene: &Scene) {
         "Pending Preparing; Failed StartDeadline (infrastructure, not charged)",
     );
     // On loopback, where the operator is and no Pod.
-    board(scene, "no-s3", json!({"storage": {"endpoint": scene.gate.url}})).await;
+    board(scene, "no-s3", json!({"storage": {"s3": {"endpoint": scene.gate.url}}})).await;
     scene.submit_to("no-s3", "no-s3", "agent:standard").await;
     has_failed(scene, "no-s3", "workspace").await;
     case.cause();
@@ -205,7 +204,7 @@ async fn no_s3_in_the_pod(scene: &Scene) {
 
 /// A track whose nodes do not exist.
 fn nowhere() -> Value {
-    json!([{"name": "sensors", "codename": "SENSORS", "nodeSelector": {NODE_LABEL: "nowhere"}}])
+    json!([{"name": "sensors", "carla": {"codename": "SENSORS"}, "nodeSelector": {NODE_LABEL: "nowhere"}}])
 }
 
 async fn no_node(scene: &Scene) {
@@ -272,7 +271,7 @@ async fn table_denied(scene: &Scene) {
     );
     scene.gate.deny("DynamoDB_20120810.UpdateItem");
     let table = json!({"name": scene.cloud.table, "region": crate::aws::REGION, "endpoint": scene.gate.url});
-    board(scene, "denied", json!({"table": table})).await;
+    board(scene, "denied", json!({"table": {"dynamoDB": table}})).await;
     scene.submit_to("denied", "denied", "agent:standard").await;
     let recorded = |s: &Submission| {
         let all = s
@@ -313,7 +312,7 @@ async fn evalai_away(scene: &Scene, name: &'static str, answer: Failure) {
     evalai.fail_finals(answer, 1);
     let board = format!("lb-{}", evalai.url.rsplit(':').next().unwrap());
     let prefix = format!("{}{board}/", scene.cloud.prefix);
-    let mut change = small(json!({"storage": {"prefix": prefix}}));
+    let mut change = small(json!({"storage": {"s3": {"prefix": prefix}}}));
     // The servers' first submissions have the same key: no table, and nobody reads the queue.
     change["queue"] = Value::Null;
     change["table"] = Value::Null;
@@ -360,7 +359,7 @@ async fn node_lost(scene: &Scene) {
 async fn on_the_lost_node(case: &mut Case, scene: &Scene, nodes: &Api<Node>, label: &str) {
     let track = json!({
         "name": "sensors",
-        "codename": "SENSORS",
+        "carla": {"codename": "SENSORS"},
         "nodeSelector": {NODE_LABEL: label},
         "tolerations": [{"key": NODE_LABEL, "operator": "Exists"}],
     });

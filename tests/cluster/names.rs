@@ -23,9 +23,8 @@ async fn a_pod_that_can_ask_no_server_stores_its_results_by_the_hosts_aliases() 
         let endpoint = scene.cloud.endpoint.replacen(host, NAME, 1);
         assert!(endpoint.contains(NAME), "{endpoint} is not at {host}");
         let change = json!({
-            "pairs": 1,
-            "routes": 2,
-            "storage": {"endpoint": endpoint},
+            "evaluation": {"carla": {"pairs": 1, "routes": 2}},
+            "storage": {"s3": {"endpoint": endpoint}},
             "network": {"dns": "None"},
             // A Pod must name a server: its own loopback, where no program answers.
             "podOverrides": {"spec": {

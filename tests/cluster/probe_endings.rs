@@ -14,7 +14,7 @@ use crate::scene::{Scene, lay_over, scenario};
 /// Runs at once: each has three or five containers.
 const WIDTH: usize = 4;
 const LIMIT: Duration = Duration::from_mins(5);
-/// What the agents' own files may come to in the case that grows one: half of its `storage.sizeLimit`.
+/// What the agents' own files may come to in the case that grows one: half of its `storage.s3.sizeLimit`.
 const GROWN: i64 = 8 << 20;
 
 #[tokio::test]
@@ -30,8 +30,7 @@ async fn a_hostile_agent_gains_nothing_by_how_it_ends() {
 /// Nothing is tried again within a Pod; a failure of the infrastructure gets two more Jobs, which would be seen.
 fn base(ending: &Ending) -> Value {
     json!({
-        "pairs": 1,
-        "routes": 2,
+        "evaluation": {"carla": {"pairs": 1, "routes": 2}},
         "retries": {"perWorker": 0, "infrastructure": 2},
         "deadlines": {"readySeconds": 60, "idleSeconds": 60, "cancelSeconds": 20, "flushSeconds": 120},
         "agent": {"env": [{"name": VARIABLE, "value": ending.id}]},

@@ -34,7 +34,7 @@ type Run = (String, BTreeMap<String, Seen>);
 async fn no_probe_of_a_hostile_image_gets_through() {
     scenario("probes", async |scene: &Scene| {
         for version in VERSIONS {
-            let change = with_network(json!({"leaderboardVersion": version}));
+            let change = with_network(json!({"evaluation": {"carla": {"version": version}}}));
             scene.leaderboard(&version.to_lowercase(), change).await;
         }
         make_service(scene).await;
@@ -65,9 +65,7 @@ async fn make_service(scene: &Scene) {
 /// Two pairs, so that there is another agent's folder; everything outside open, so that it shows what is never opened.
 fn with_network(change: Value) -> Value {
     let mut base = json!({
-        "pairs": 2,
-        "routes": 2,
-        "repetitions": 1,
+        "evaluation": {"carla": {"pairs": 2, "routes": 2, "repetitions": 1}},
         "network": {"dns": "None", "egress": [{"cidr": "0.0.0.0/0"}, {"cidr": "::/0"}], "enforcement": "Disabled"},
     });
     crate::scene::lay_over(&mut base, change);
@@ -121,8 +119,7 @@ async fn the_probes_see_what_a_container_with_more_rights_may_do() {
             "DAC_READ_SEARCH",
         ];
         let change = json!({
-            "pairs": 1,
-            "routes": 1,
+            "evaluation": {"carla": {"pairs": 1, "routes": 1}},
             "agent": {"securityContext": {
                 "allowPrivilegeEscalation": true,
                 "capabilities": {"add": rights},

@@ -130,7 +130,7 @@ fn assert_requests(requests: &[Entry]) {
 async fn a_table_keyed_with_hyphens_gets_its_row_too() {
     scenario("hyphens", async |scene: &Scene| {
         let evalai = Evalai::start(scene).await;
-        let change = json!({"pairs": 2, "routes": 6, "table": {"name": scene.cloud.hyphen_table}});
+        let change = json!({"evaluation": {"carla": {"pairs": 2, "routes": 6}}, "table": {"dynamoDB": {"name": scene.cloud.hyphen_table}}});
         scene.evalai_leaderboard("lb", &evalai, change).await;
         let (_controller, _bridge) = (controller(scene), bridge(scene));
         let pk = evalai.submit(&scene.lab.challenge("agent:standard"), 2).await;

@@ -22,8 +22,7 @@ fn board(replays: [&str; 4]) -> Value {
         .map(|(pair, file)| format!("pair={pair},replay=real/{file}"));
     let knobs = knobs.collect::<Vec<_>>().join(";");
     json!({
-        "pairs": 4,
-        "routes": 16,
+        "evaluation": {"carla": {"pairs": 4, "routes": 16}},
         "retries": {"perWorker": 1, "infrastructure": 0},
         "agent": {"env": [{"name": "AGENT_KNOBS", "value": knobs}]},
     })
@@ -71,7 +70,8 @@ async fn a_route_whose_simulation_crashed_and_cannot_be_loaded_again_is_missing_
     scenario("real-crashed", async |scene: &Scene| {
         let mut change = board(["done-1.json", "done-2.json", "done-3.json", "crashed.json"]);
         // The first server of pair 4 loads nothing, because its evaluator only replays.
-        change["simulator"] = json!({"env": [{"name": "SIM_KNOBS", "value": "pair=4,crash-loading@1"}]});
+        change["evaluation"]["carla"]["simulator"] =
+            json!({"env": [{"name": "SIM_KNOBS", "value": "pair=4,crash-loading@1"}]});
         scene.leaderboard("lb", change).await;
         let _controller = controller(scene);
         scene.submit("crashed", "agent:standard").await;

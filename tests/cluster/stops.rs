@@ -22,8 +22,7 @@ const LIMIT: Duration = Duration::from_mins(3);
 /// Six routes for two pairs. Both stop in their second ones, so that the run waits for what ends it.
 fn endless() -> Value {
     json!({
-        "pairs": 2,
-        "routes": 6,
+        "evaluation": {"carla": {"pairs": 2, "routes": 6}},
         "agent": {"env": [{"name": "AGENT_KNOBS", "value": "hang@2"}]},
         "deadlines": {"cancelSeconds": CANCEL_SECONDS, "idleSeconds": 600},
     })

@@ -149,10 +149,10 @@ fn merged(report: &Report) -> Option<(u64, String)> {
 async fn sixteen_pairs_with_the_largest_checkpoints_stay_below_logcopys_memory() {
     let (sink, endpoint, serving) = serve().await;
     let mut submission = Submission::on(&endpoint, "bucket", LeaderboardVersion::V2, &mut Rng::new()).await;
-    submission.run.plan.slices = (0..PAIRS).map(two_routes).collect();
-    submission.run.plan.routes = i32::try_from(2 * PAIRS).unwrap();
+    submission.run.plan.carla.slices = (0..PAIRS).map(two_routes).collect();
+    submission.run.plan.carla.routes = i32::try_from(2 * PAIRS).unwrap();
     // Half of it is for the agents' files, so the sparse ones are sent in part.
-    submission.run.plan.storage.size_limit = leaderboard_api::ByteQuantity::gibibytes(1);
+    submission.run.plan.storage.s3.size_limit = leaderboard_api::ByteQuantity::gibibytes(1);
     let limits = results_plan(&submission.run).unwrap().limits_of(0);
     // With more values the merged file, which has a line for each, would be larger than it may be.
     let (most, values) = (limits.bytes, limits.values / 4);

@@ -95,7 +95,7 @@ async fn a_log_of_5_gb_is_stored_in_bounded_memory() {
     let (sink, endpoint, serving) = serve().await;
     let bucket = server().await.bucket().await;
     let mut submission = Submission::on(&endpoint, &bucket, LeaderboardVersion::V2, &mut Rng::new()).await;
-    submission.run.plan.storage.size_limit = leaderboard_api::ByteQuantity::gibibytes(16);
+    submission.run.plan.storage.s3.size_limit = leaderboard_api::ByteQuantity::gibibytes(16);
     // What is in the air after that time and a minute is cut.
     submission.run.period_seconds = 60;
     let kubelet = Kubelet::new(&submission);

@@ -170,7 +170,7 @@ async fn a_last_route_without_a_record_is_driven_although_the_progress_counts_it
 async fn complete_files_of_a_real_evaluator_without_sensors_finish_with_the_originals_merge() {
     let mut submission = submission(LeaderboardVersion::V2, "replay=real/done-{pair}.json").await;
     let plan = &mut submission.run.plan;
-    (plan.slices, plan.routes) = (leaderboard_api::effective::slices(16, PAIRS.into()), 16);
+    (plan.carla.slices, plan.carla.routes) = (leaderboard_api::effective::slices(16, PAIRS.into()), 16);
     let mut kubelet = Kubelet::new(&submission);
     kubelet.make_pod();
     let last = to_the_end(&submission, &mut kubelet).await;

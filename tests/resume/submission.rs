@@ -6,7 +6,7 @@ use std::path::{Path, PathBuf};
 use std::sync::OnceLock;
 use std::sync::atomic::{AtomicU32, Ordering};
 
-use leaderboard_api::{Attempt, ByteQuantity, LeaderboardVersion, RunPlan, Storage, Verify};
+use leaderboard_api::{Attempt, ByteQuantity, CarlaPlan, LeaderboardVersion, RunPlan, S3Bucket, Storage, Verify};
 use leaderboard_aws::archive::Archive;
 use leaderboard_contract::run::{ENV_POD_UID, ENV_RUN, Run, SCHEMA};
 use leaderboard_pod::places::Places;
@@ -146,7 +146,7 @@ impl Submission {
         let checkpoint = work.join("agent_results.json");
         let path = ["CARLA/PythonAPI/carla", "scenario_runner", "leaderboard"].map(contents);
         let path = std::env::join_paths(path).unwrap();
-        let slice = &self.run.plan.slices[usize::from(member.pair.get()) - 1];
+        let slice = &self.run.plan.carla.slices[usize::from(member.pair.get()) - 1];
         // No route needs the file's content.
         let team_agent = contents("leaderboard/README.md");
         command
@@ -155,7 +155,7 @@ impl Submission {
             .args(["--idle-seconds=60", "--python-path", path.to_str().unwrap()])
             .arg(format!(
                 "--route-runs={}",
-                slice.routes() * u32::try_from(self.run.plan.repetitions).unwrap()
+                slice.routes() * u32::try_from(self.run.plan.carla.repetitions).unwrap()
             ))
             .arg("--")
             .arg(&programs().agent)
@@ -180,7 +180,7 @@ impl Submission {
             let copy = places.status().join(member.to_string()).join(KEPT_CHECKPOINT);
             command.env("ROUTE_COPY", copy);
         }
-        match self.run.plan.leaderboard_version {
+        match self.run.plan.carla.version {
             LeaderboardVersion::V1 => {
                 let scenarios = contents("leaderboard/data/all_towns_traffic_scenarios_private.json");
                 command.arg(format!("--scenarios={}", scenarios.display()));
@@ -222,25 +222,29 @@ fn run(endpoint: &str, bucket: &str, id: &str, format: LeaderboardVersion) -> Ru
         attempt: Attempt(1),
         plan: RunPlan {
             run_id: id.parse().unwrap(),
-            leaderboard_version: format,
             track: "sensors".into(),
-            codename: "SENSORS".into(),
             phase: None,
-            slices: leaderboard_api::effective::slices(20, 4),
-            routes: 20,
-            repetitions: 1,
             storage: Storage {
-                bucket: bucket.to_owned(),
-                prefix: Some("runs/".to_owned()),
-                region: None,
-                endpoint: Some(endpoint.to_owned()),
-                size_limit: ByteQuantity::gibibytes(1),
-                kms_key_arn: None,
-                storage_class: None,
+                s3: S3Bucket {
+                    bucket: bucket.to_owned(),
+                    prefix: Some("runs/".to_owned()),
+                    region: None,
+                    endpoint: Some(endpoint.to_owned()),
+                    size_limit: ByteQuantity::gibibytes(1),
+                    kms_key_arn: None,
+                    storage_class: None,
+                },
             },
             image: "image".to_owned(),
-            contents_image: "contents".into(),
-            simulator_image: "simulator".into(),
+            carla: CarlaPlan {
+                version: format,
+                codename: "SENSORS".into(),
+                slices: leaderboard_api::effective::slices(20, 4),
+                routes: 20,
+                repetitions: 1,
+                contents_image: "contents".into(),
+                simulator_image: "simulator".into(),
+            },
             resume: false,
             earlier_attempts: 0,
             submission_uid: None,
@@ -250,7 +254,7 @@ fn run(endpoint: &str, bucket: &str, id: &str, format: LeaderboardVersion) -> Ru
         period_seconds: 0,
         flush_seconds: 60,
         cancel_seconds: 20,
-        log_group: None,
+        logs: None,
         isolation: None,
     }
 }

@@ -189,18 +189,18 @@ impl Scene {
     pub async fn leaderboard(&self, name: &str, change: Value) {
         let disk = json!({"requests": {"ephemeral-storage": "16Mi"}, "limits": {"ephemeral-storage": "4Gi"}});
         let spec = json!({
-            "leaderboardVersion": "V2",
-            "tracks": [{"name": "sensors", "codename": "SENSORS"}, {"name": "map", "codename": "MAP"}],
-            "contents": {"image": self.lab.challenge("contents:1")},
-            // The defaults of many Pods at once are more than the disk of a small machine.
-            "simulator": {"image": self.lab.challenge("simulator:1"), "resources": disk},
+            "evaluation": {"carla": {
+                "version": "V2", "contents": {"image": self.lab.challenge("contents:1")},
+                "simulator": {"image": self.lab.challenge("simulator:1"), "resources": disk},
+            }},
+            "tracks": [{"name": "sensors", "carla": {"codename": "SENSORS"}}, {"name": "map", "carla": {"codename": "MAP"}}],
             "agent": {"resources": disk, "images": []},
-            "storage": {
+            "storage": {"s3": {
                 "bucket": BUCKET,
                 "prefix": self.cloud.prefix,
                 "region": REGION,
                 "endpoint": self.cloud.endpoint,
-            },
+            }},
             "podIdentity": {"secretName": "aws"},
             // Nothing enforces policies here; only the test of that waits the minute until it is certain.
             "network": {
@@ -225,16 +225,16 @@ impl Scene {
                 "token": {"secretKeyRef": {"name": "evalai", "key": "auth_token"}},
             },
             "tracks": [
-                {"name": "sensors", "codename": "SENSORS", "phase": 1},
-                {"name": "map", "codename": "MAP", "phase": 2},
+                {"name": "sensors", "carla": {"codename": "SENSORS"}, "phase": 1},
+                {"name": "map", "carla": {"codename": "MAP"}, "phase": 2},
             ],
-            "queue": {
+            "queue": {"sqs": {
                 "url": self.cloud.queue_url,
                 "deadLetterURL": self.cloud.dead_url,
                 "region": REGION,
                 "endpoint": self.gate.url,
-            },
-            "table": {"name": self.cloud.table, "region": REGION, "endpoint": self.gate.url},
+            }},
+            "table": {"dynamoDB": {"name": self.cloud.table, "region": REGION, "endpoint": self.gate.url}},
         });
         lay_over(&mut spec, change);
         self.leaderboard(name, spec).await;

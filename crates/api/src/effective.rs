@@ -4,8 +4,8 @@
 
 use k8s_openapi::api::core::v1::ResourceRequirements;
 
-use super::leaderboard_parts::{Deadlines, LeaderboardVersion, Storage, Track, TrackContainer};
-use super::{LeaderboardSpec, RouteSlice, RunId, RunPlan};
+use super::leaderboard_parts::{Deadlines, S3Bucket, Track, TrackContainer};
+use super::{CarlaPlan, LeaderboardSpec, LeaderboardVersion, RouteSlice, RunId, RunPlan};
 
 /// How many of what one track runs.
 #[derive(Clone, Debug, PartialEq, Eq)]
@@ -22,18 +22,15 @@ pub struct Shape {
 
 /// What a track of this Leaderboard runs.
 pub fn shape(spec: &LeaderboardSpec, track: &Track) -> Shape {
-    let pairs = positive(track.pairs.unwrap_or(spec.pairs));
-    let routes = positive(track.routes.unwrap_or(spec.routes));
-    let repetitions = positive(
-        track
-            .repetitions
-            .or(spec.repetitions)
-            .unwrap_or(match spec.leaderboard_version {
-                LeaderboardVersion::V1 => 5,
-                LeaderboardVersion::V2 => 1,
-            }),
-    );
-    let subsets = track.route_subsets.as_ref();
+    let (own, carla) = (&track.carla, &spec.evaluation.carla);
+    let pairs = positive(own.pairs.unwrap_or(carla.pairs));
+    let routes = positive(own.routes.unwrap_or(carla.routes));
+    let usual = match carla.version {
+        LeaderboardVersion::V1 => 5,
+        LeaderboardVersion::V2 => 1,
+    };
+    let repetitions = positive(own.repetitions.or(carla.repetitions).unwrap_or(usual));
+    let subsets = own.route_subsets.as_ref();
     let slices = subsets.map_or_else(
         || slices(routes, pairs),
         |subsets| subsets.iter().map(|subset| subset.0).collect(),
@@ -79,35 +76,37 @@ pub fn resources(
 }
 
 /// Key prefix of a run in its bucket, with the final slash.
-pub fn key_prefix(storage: &Storage, run_id: &RunId) -> String {
-    format!("{}{run_id}/", storage.prefix.as_deref().unwrap_or_default())
+pub fn key_prefix(bucket: &S3Bucket, run_id: &RunId) -> String {
+    format!("{}{run_id}/", bucket.prefix.as_deref().unwrap_or_default())
 }
 
 /// Address of a run's results for people.
-pub fn results_url(storage: &Storage, run_id: &RunId) -> String {
+pub fn results_url(bucket: &S3Bucket, run_id: &RunId) -> String {
     format!(
         "s3://{}/{}{run_id}",
-        storage.bucket,
-        storage.prefix.as_deref().unwrap_or_default()
+        bucket.bucket,
+        bucket.prefix.as_deref().unwrap_or_default()
     )
 }
 
 /// The plan of a submission's first attempt. `image` is the participant's, `resume` means that stored results are taken up.
 pub fn plan(spec: &LeaderboardSpec, track: &Track, run_id: RunId, image: String, resume: bool) -> RunPlan {
-    let shape = shape(spec, track);
+    let (shape, carla) = (shape(spec, track), &spec.evaluation.carla);
     RunPlan {
         run_id,
-        leaderboard_version: spec.leaderboard_version,
         track: track.name.as_str().into(),
-        codename: track.codename.as_str().into(),
         phase: track.phase,
-        slices: shape.slices,
-        routes: i32::try_from(shape.routes).unwrap_or(i32::MAX),
-        repetitions: i32::try_from(shape.repetitions).unwrap_or(i32::MAX),
         storage: spec.storage.clone(),
         image,
-        contents_image: spec.contents.image.as_str().into(),
-        simulator_image: spec.simulator.image.as_str().into(),
+        carla: CarlaPlan {
+            version: carla.version,
+            codename: track.carla.codename.as_ref().unwrap_or(&track.name).into(),
+            slices: shape.slices,
+            routes: i32::try_from(shape.routes).unwrap_or(i32::MAX),
+            repetitions: i32::try_from(shape.repetitions).unwrap_or(i32::MAX),
+            contents_image: carla.contents.image.as_str().into(),
+            simulator_image: carla.simulator.image.as_str().into(),
+        },
         resume,
         earlier_attempts: 0,
         submission_uid: None,

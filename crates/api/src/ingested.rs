@@ -17,7 +17,7 @@ pub struct Ingested {
     pub message: String,
     /// When it was sent, in milliseconds since 1970; of the sweep, when EvalAI's row asked to be run.
     pub sent: i64,
-    /// The attempt that it began; none of an older operator's.
+    /// The attempt that it began. Absent: no message began one.
     #[serde(default, skip_serializing_if = "Option::is_none")]
     pub attempt: Option<Attempt>,
     /// The attempts that began without a message since the last one that came.

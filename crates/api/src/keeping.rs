@@ -1,6 +1,6 @@
 //! How AWS keeps what is stored: the storage class of objects, and what a log group that the operator makes is like.
 //!
-//! Owned by `api`; parts of `storage` and `logGroup`.
+//! Owned by `api`; parts of `storage` and `logs.cloudWatch`.
 
 use serde::{Deserialize, Serialize};
 

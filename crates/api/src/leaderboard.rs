@@ -10,13 +10,14 @@ use kube::KubeSchema;
 use kube::ResourceExt;
 use serde::{Deserialize, Serialize};
 
+use super::carla::CarlaShape;
 use super::conditions::{self, Condition};
 use super::evalai_mode::EvalaiMode;
+use super::evalai_queue::EvalaiQueue;
 use super::leaderboard_parts::{
-    AgentContainer, CheckImage, Concurrency, ContentsContainer, Deadlines, Evalai, Gpu, LogGroup, Network, PodIdentity,
-    Queue, Retries, SimulatorContainer, Storage, Table, Track,
+    AgentContainer, CheckImage, Concurrency, Deadlines, DynamoTable, Evalai, Evaluation, Gpu, LogGroup, Logs, Network,
+    PodIdentity, Queue, Retries, SqsQueue, Storage, Table, Track,
 };
-use super::leaderboard_parts::{LeaderboardVersion, Verify};
 use super::retention::Retention;
 use super::submission_use::{MAX_USING_TEAMS, TeamUse};
 
@@ -47,31 +48,30 @@ use super::submission_use::{MAX_USING_TEAMS, TeamUse};
 )]
 #[serde(rename_all = "camelCase")]
 #[x_kube(
-    validation = Rule::new("self.leaderboardVersion == oldSelf.leaderboardVersion").message("leaderboardVersion is immutable: checkpoints of one format cannot be merged with the other's; make a new Leaderboard"),
-    validation = Rule::new("self.storage.bucket == oldSelf.storage.bucket").message("storage.bucket is immutable: finished results would no longer be found; make a new Leaderboard"),
-    validation = Rule::new("has(self.storage.prefix) == has(oldSelf.storage.prefix) && (!has(self.storage.prefix) || self.storage.prefix == oldSelf.storage.prefix)").message("storage.prefix is immutable: finished results would no longer be found; make a new Leaderboard"),
+    validation = Rule::new("self.evaluation.carla.version == oldSelf.evaluation.carla.version").message("evaluation.carla.version is immutable: checkpoints of one format cannot be merged with the other's; make a new Leaderboard"),
+    validation = Rule::new("self.storage.s3.bucket == oldSelf.storage.s3.bucket").message("storage.s3.bucket is immutable: finished results would no longer be found; make a new Leaderboard"),
+    validation = Rule::new("has(self.storage.s3.prefix) == has(oldSelf.storage.s3.prefix) && (!has(self.storage.s3.prefix) || self.storage.s3.prefix == oldSelf.storage.s3.prefix)").message("storage.s3.prefix is immutable: finished results would no longer be found; make a new Leaderboard"),
     validation = Rule::new("!has(oldSelf.evalai) || has(self.evalai)").message("evalai cannot be removed: its submissions would never be published; make a new Leaderboard"),
     validation = Rule::new("!has(oldSelf.evalai) || !has(self.evalai) || self.evalai.challenge == oldSelf.evalai.challenge").message("evalai.challenge is immutable: its submissions belong to that challenge; make a new Leaderboard"),
     validation = Rule::new("!has(oldSelf.evalai) || !has(self.evalai) || self.evalai.mode == oldSelf.evalai.mode").message("evalai.mode is immutable: what was only observed would be published; make a new Leaderboard"),
-    validation = Rule::new("!has(self.evalai) || self.evalai.mode != 'Observe' || (!has(self.queue) && !has(self.table) && has(self.storage.prefix))").message("evalai.mode Observe needs a storage.prefix of its own, no queue and no table: those are the other program's"),
+    validation = Rule::new("!has(self.evalai) || self.evalai.mode != 'Observe' || (!has(self.queue) && !has(self.table) && has(self.storage.s3.prefix))").message("evalai.mode Observe needs a storage.s3.prefix of its own, no queue and no table: those are the other program's"),
     validation = Rule::new("self.tracks.filter(t, has(t.phase)).all(t, self.tracks.exists_one(u, has(u.phase) && u.phase == t.phase))").message("two tracks have the same phase: a message could not be told which one it is for"),
     validation = Rule::new("!has(self.evalai) || self.tracks.exists(t, has(t.phase))").message("evalai is set but no track has a phase: no submission of the challenge could be served; give a track the id of its phase"),
     validation = Rule::new("has(self.evalai) || !self.tracks.exists(t, has(t.phase))").message("a track has a phase but evalai is missing: set evalai, or leave the phase out for a local leaderboard"),
     validation = Rule::new("!has(self.queue) || has(self.evalai)").message("queue needs evalai: its messages name a challenge and a phase of it"),
-    validation = Rule::new("!has(self.queue) || !has(self.evalai) || !has(self.evalai.queue)").message("queue and evalai.queue are two ways to the challenge's messages: set queue if it is your own in SQS, evalai.queue if it is EvalAI's"),
-    validation = Rule::new("self.tracks.all(t, (has(t.pairs) ? t.pairs : self.pairs) <= (has(t.routes) ? t.routes : self.routes))").message("a track has more pairs than routes, so a pair would have nothing to drive; lower pairs, or set the track's own"),
-    validation = Rule::new("self.tracks.all(t, !has(t.routeSubsets) || size(t.routeSubsets) == (has(t.pairs) ? t.pairs : self.pairs))").message("a track's routeSubsets must have one entry for each of its pairs"),
-    validation = Rule::new("self.tracks.all(t, !has(t.routeSubsets) || t.routeSubsets.map(s, int(s.split('-')[1]) - int(s.split('-')[0]) + 1).sum() == (has(t.routes) ? t.routes : self.routes))").message("a track's routeSubsets must hold each of its routes once: their lengths do not add up to routes"),
-    validation = Rule::new("self.leaderboardVersion == 'V1' || !self.tracks.exists(t, has(t.scenariosFile))").message("a track has a scenariosFile, but only V1 reads one: the scenarios of V2 are in its routes; leave it out"),
+    validation = Rule::new("self.tracks.all(t, (has(t.carla) && has(t.carla.pairs) ? t.carla.pairs : self.evaluation.carla.pairs) <= (has(t.carla) && has(t.carla.routes) ? t.carla.routes : self.evaluation.carla.routes))").message("a track has more pairs than routes, so a pair would have nothing to drive; lower pairs, or set the track's own"),
+    validation = Rule::new("self.tracks.all(t, !has(t.carla) || !has(t.carla.routeSubsets) || size(t.carla.routeSubsets) == (has(t.carla) && has(t.carla.pairs) ? t.carla.pairs : self.evaluation.carla.pairs))").message("a track's routeSubsets must have one entry for each of its pairs"),
+    validation = Rule::new("self.tracks.all(t, !has(t.carla) || !has(t.carla.routeSubsets) || t.carla.routeSubsets.map(s, int(s.split('-')[1]) - int(s.split('-')[0]) + 1).sum() == (has(t.carla) && has(t.carla.routes) ? t.carla.routes : self.evaluation.carla.routes))").message("a track's routeSubsets must hold each of its routes once: their lengths do not add up to routes"),
+    validation = Rule::new("self.evaluation.carla.version == 'V1' || !self.tracks.exists(t, has(t.carla) && has(t.carla.scenariosFile))").message("a track has a scenariosFile, but only V1 reads one: the scenarios of V2 are in its routes; leave it out"),
     validation = Rule::new("self.tracks.all(t, !has(t.deadlines) || !has(t.deadlines.runSeconds) || (self.deadlines.idleSeconds < t.deadlines.runSeconds && self.deadlines.readySeconds < t.deadlines.runSeconds))").message("a track's deadlines.runSeconds must be longer than deadlines.idleSeconds and deadlines.readySeconds: the run would end before they could be reached"),
     validation = Rule::new("self.retention.finishedSeconds == 0 || self.retention.finishedSeconds >= self.ttlSecondsAfterFinished").message("retention.finishedSeconds must be 0 or at least ttlSecondsAfterFinished: the Job would be removed with its Submission before its own time; raise one or lower the other"),
-    validation = Rule::new("!has(self.gpu) || !has(self.gpu.resourceName) || !(has(self.simulator.resources) && ((has(self.simulator.resources.limits) && self.gpu.resourceName in self.simulator.resources.limits) || (has(self.simulator.resources.requests) && self.gpu.resourceName in self.simulator.resources.requests)))").message("simulator.resources names gpu.resourceName too; leave it out there: the operator requests it as gpu.mode says"),
-    validation = Rule::new("!has(self.gpu) || !has(self.gpu.resourceName) || !self.tracks.exists(t, (has(t.simulator) && (has(t.simulator.resources) && ((has(t.simulator.resources.limits) && self.gpu.resourceName in t.simulator.resources.limits) || (has(t.simulator.resources.requests) && self.gpu.resourceName in t.simulator.resources.requests)))))").message("the simulator.resources of a track name gpu.resourceName too; leave it out there: the operator requests it as gpu.mode says"),
-    validation = Rule::new("has(self.gpu) || !(has(self.simulator.resources) && ((has(self.simulator.resources.limits) && 'nvidia.com/gpu' in self.simulator.resources.limits) || (has(self.simulator.resources.requests) && 'nvidia.com/gpu' in self.simulator.resources.requests)))").message("simulator.resources names nvidia.com/gpu and gpu is missing, so the other container of a pair would have no GPU; write gpu.resourceName: nvidia.com/gpu in place of it, or gpu.mode: None if that is meant"),
+    validation = Rule::new("!has(self.gpu) || !has(self.gpu.resourceName) || !(has(self.evaluation.carla.simulator.resources) && ((has(self.evaluation.carla.simulator.resources.limits) && self.gpu.resourceName in self.evaluation.carla.simulator.resources.limits) || (has(self.evaluation.carla.simulator.resources.requests) && self.gpu.resourceName in self.evaluation.carla.simulator.resources.requests)))").message("evaluation.carla.simulator.resources names gpu.resourceName too; leave it out there: the operator requests it as gpu.mode says"),
+    validation = Rule::new("!has(self.gpu) || !has(self.gpu.resourceName) || !self.tracks.exists(t, (has(t.carla) && has(t.carla.simulator) && (has(t.carla.simulator.resources) && ((has(t.carla.simulator.resources.limits) && self.gpu.resourceName in t.carla.simulator.resources.limits) || (has(t.carla.simulator.resources.requests) && self.gpu.resourceName in t.carla.simulator.resources.requests)))))").message("the carla.simulator.resources of a track name gpu.resourceName too; leave it out there: the operator requests it as gpu.mode says"),
+    validation = Rule::new("has(self.gpu) || !(has(self.evaluation.carla.simulator.resources) && ((has(self.evaluation.carla.simulator.resources.limits) && 'nvidia.com/gpu' in self.evaluation.carla.simulator.resources.limits) || (has(self.evaluation.carla.simulator.resources.requests) && 'nvidia.com/gpu' in self.evaluation.carla.simulator.resources.requests)))").message("evaluation.carla.simulator.resources names nvidia.com/gpu and gpu is missing, so the other container of a pair would have no GPU; write gpu.resourceName: nvidia.com/gpu in place of it, or gpu.mode: None if that is meant"),
     validation = Rule::new("!has(self.gpu) || !has(self.gpu.resourceName) || !(has(self.agent.resources) && ((has(self.agent.resources.limits) && self.gpu.resourceName in self.agent.resources.limits) || (has(self.agent.resources.requests) && self.gpu.resourceName in self.agent.resources.requests)))").message("agent.resources names gpu.resourceName too; leave it out there: the operator requests it as gpu.mode says"),
     validation = Rule::new("!has(self.gpu) || !has(self.gpu.resourceName) || !self.tracks.exists(t, (has(t.agent) && (has(t.agent.resources) && ((has(t.agent.resources.limits) && self.gpu.resourceName in t.agent.resources.limits) || (has(t.agent.resources.requests) && self.gpu.resourceName in t.agent.resources.requests)))))").message("the agent.resources of a track name gpu.resourceName too; leave it out there: the operator requests it as gpu.mode says"),
     validation = Rule::new("has(self.gpu) || !(has(self.agent.resources) && ((has(self.agent.resources.limits) && 'nvidia.com/gpu' in self.agent.resources.limits) || (has(self.agent.resources.requests) && 'nvidia.com/gpu' in self.agent.resources.requests)))").message("agent.resources names nvidia.com/gpu and gpu is missing, so the other container of a pair would have no GPU; write gpu.resourceName: nvidia.com/gpu in place of it, or gpu.mode: None if that is meant"),
-    validation = Rule::new("self.leaderboardVersion == 'V2' || !has(self.simulator.graphicsAdapter)").message("simulator.graphicsAdapter is for V2: the simulator of V1 draws with OpenGL, which takes no adapter; leave it out"),
+    validation = Rule::new("self.evaluation.carla.version == 'V2' || !has(self.evaluation.carla.simulator.graphicsAdapter)").message("evaluation.carla.simulator.graphicsAdapter is for V2: the simulator of V1 draws with OpenGL, which takes no adapter; leave it out"),
     validation = Rule::new("self.deadlines.idleSeconds > self.syncPeriodSeconds").message("deadlines.idleSeconds must be longer than syncPeriodSeconds: an agent would be stopped before its first report")
 )]
 pub struct LeaderboardSpec {
@@ -82,12 +82,8 @@ pub struct LeaderboardSpec {
     #[schemars(length(min = 1, max = 32))]
     #[x_kube(merge_strategy = ListMerge::Map(vec!["name".into()]))]
     pub tracks: Vec<Track>,
-    /// V1 is Leaderboard 1.0, V2 is 2.0 and later: the format of the checkpoints, the flags of the programs and some defaults.
-    pub leaderboard_version: LeaderboardVersion,
-    /// The init container that brings the private contents.
-    pub contents: ContentsContainer,
-    /// The simulator of each pair.
-    pub simulator: SimulatorContainer,
+    /// The kind of evaluation: exactly one member.
+    pub evaluation: Evaluation,
     /// How the submitted image is run.
     #[serde(default)]
     pub agent: AgentContainer,
@@ -97,35 +93,23 @@ pub struct LeaderboardSpec {
     /// What `kubectl leaderboard check` runs.
     #[serde(default, skip_serializing_if = "Option::is_none")]
     pub check: Option<CheckImage>,
-    /// Simulator-agent pairs that share out the routes.
-    #[serde(default = "defaults::pairs")]
-    #[schemars(range(min = 1, max = 16))]
-    pub pairs: i32,
-    /// Routes of a run, not counting repetitions.
-    #[serde(default = "defaults::routes")]
-    #[schemars(range(min = 1, max = 10000))]
-    pub routes: i32,
-    /// How often each route is run. Default: 5 in V1, 1 in V2.
-    #[serde(default, skip_serializing_if = "Option::is_none")]
-    #[schemars(range(min = 1, max = 100))]
-    pub repetitions: Option<i32>,
     /// Crashes and infrastructure failures that are forgiven.
     #[serde(default)]
     pub retries: Retries,
     /// When waiting, starting, running and stopping have taken too long.
     #[serde(default)]
     pub deadlines: Deadlines,
-    /// The SQS queue that the bridge polls.
+    /// The queue of the challenge's messages. Absent: EvalAI is asked for submissions that wait, and no message is read.
     #[serde(default, skip_serializing_if = "Option::is_none")]
     pub queue: Option<Queue>,
-    /// The S3 bucket of results and logs.
+    /// The store of results and logs.
     pub storage: Storage,
-    /// The DynamoDB table of submissions.
+    /// The table of submissions. Absent: no row is written.
     #[serde(default, skip_serializing_if = "Option::is_none")]
     pub table: Option<Table>,
-    /// The CloudWatch log group of container logs.
+    /// The store of container logs. Absent: they are in the store of the results alone.
     #[serde(default, skip_serializing_if = "Option::is_none")]
-    pub log_group: Option<LogGroup>,
+    pub logs: Option<Logs>,
     /// Who the Pod's own containers are towards S3.
     #[serde(default, skip_serializing_if = "Option::is_none")]
     pub pod_identity: Option<PodIdentity>,
@@ -142,9 +126,6 @@ pub struct LeaderboardSpec {
     /// No new submission starts while true; running ones go on.
     #[serde(default)]
     pub paused: bool,
-    /// What is done with scores that do not follow from their infractions.
-    #[serde(default)]
-    pub verify: Verify,
     /// A partial PodTemplateSpec laid over ours: objects deep, lists by name, `simulator` and `agent` address all pairs, null removes.
     #[serde(default, skip_serializing_if = "Option::is_none")]
     #[schemars(schema_with = "super::leaderboard_parts::raw_object")]
@@ -178,6 +159,26 @@ impl LeaderboardSpec {
         self.evalai
             .as_ref()
             .is_some_and(|evalai| evalai.mode == EvalaiMode::Observe)
+    }
+
+    /// The queue in SQS.
+    pub fn sqs(&self) -> Option<&SqsQueue> {
+        self.queue.as_ref()?.sqs.as_ref()
+    }
+
+    /// The queue in EvalAI's account.
+    pub fn evalai_queue(&self) -> Option<&EvalaiQueue> {
+        self.queue.as_ref()?.evalai.as_ref()
+    }
+
+    /// The table of DynamoDB.
+    pub fn dynamo_table(&self) -> Option<&DynamoTable> {
+        self.table.as_ref().map(|table| &table.dynamo_db)
+    }
+
+    /// The log group of CloudWatch Logs.
+    pub fn log_group(&self) -> Option<&LogGroup> {
+        self.logs.as_ref().map(|logs| &logs.cloud_watch)
     }
 
     /// How long Kubernetes keeps a finished Job. A shorter time of the host's is carried out by the controller.
@@ -278,12 +279,8 @@ pub struct TrackStatus {
     /// Name of the track.
     #[schemars(length(max = 32))]
     pub name: String,
-    /// Simulator-agent pairs.
-    pub pairs: i32,
-    /// Routes, not counting repetitions.
-    pub routes: i32,
-    /// Repetitions of each route.
-    pub repetitions: i32,
+    /// The numbers of CARLA's evaluation.
+    pub carla: CarlaShape,
 }
 
 /// Submissions of a Leaderboard by state; `resumed` counts as running.
@@ -302,12 +299,6 @@ pub struct Counts {
 }
 
 mod defaults {
-    pub(super) fn pairs() -> i32 {
-        4
-    }
-    pub(super) fn routes() -> i32 {
-        20
-    }
     pub(super) fn sync_period_seconds() -> i64 {
         10
     }

@@ -16,78 +16,36 @@ use schemars::{JsonSchema, Schema, SchemaGenerator, json_schema};
 use serde::{Deserialize, Serialize};
 
 pub use super::byte_quantity::ByteQuantity;
+use super::carla::{Carla, TrackCarla};
 pub use super::gpu::*;
 use super::image_pattern::ImagePattern;
 pub use super::leaderboard_network::*;
 pub use super::leaderboard_services::*;
-pub use super::route_subset::RouteSubset;
 
-/// A version of CARLA Leaderboard: it chooses the format of the checkpoints, the flags of the programs and some defaults.
-#[derive(Serialize, Deserialize, JsonSchema, Clone, Copy, Debug, PartialEq, Eq)]
-pub enum LeaderboardVersion {
-    /// Leaderboard 1.0.
-    V1,
-    /// Leaderboard 2.0 and later.
-    V2,
-}
-
-/// What is done with scores that do not follow from their infractions.
-#[derive(Serialize, Deserialize, JsonSchema, Clone, Copy, Debug, Default, PartialEq, Eq)]
-pub enum Verify {
-    /// Nothing is recomputed.
-    Disabled,
-    /// A difference is shown, the results count.
-    #[default]
-    Warn,
-    /// A difference makes the results invalid.
-    Refuse,
+/// A kind of evaluation, and what it runs.
+#[derive(Serialize, Deserialize, JsonSchema, Clone, Debug, PartialEq)]
+pub struct Evaluation {
+    /// The CARLA Leaderboard: pairs of a simulator and an agent drive routes.
+    pub carla: Carla,
 }
 
 /// A track: what one phase of the challenge asks for.
 #[derive(Serialize, Deserialize, KubeSchema, Clone, Debug, PartialEq)]
 #[serde(rename_all = "camelCase")]
-#[x_kube(validation = Rule::new("!has(self.routeSubsets) || self.routeSubsets.all(s, int(s.split('-')[0]) <= int(s.split('-')[1]))").message("an entry of routeSubsets ends before it begins; write first-last, for example 5-9"))]
 pub struct Track {
     /// Name of the track in this Leaderboard, a DNS label.
     #[schemars(length(min = 1, max = 32), regex(pattern = r"^[a-z0-9]([-a-z0-9]*[a-z0-9])?$"))]
     pub name: String,
-    /// What the agent gets as CHALLENGE_TRACK_CODENAME, for example `SENSORS`.
-    #[schemars(length(min = 1, max = 64), regex(pattern = r"^[A-Za-z0-9_.-]+$"))]
-    pub codename: String,
     /// Id of the EvalAI phase; absent for a local track.
     #[serde(default, skip_serializing_if = "Option::is_none")]
     #[schemars(range(min = 1))]
     pub phase: Option<i64>,
-    /// Overrides the Leaderboard's routes.
-    #[serde(default, skip_serializing_if = "Option::is_none")]
-    #[schemars(range(min = 1, max = 10000))]
-    pub routes: Option<i32>,
-    /// Overrides the Leaderboard's repetitions.
-    #[serde(default, skip_serializing_if = "Option::is_none")]
-    #[schemars(range(min = 1, max = 100))]
-    pub repetitions: Option<i32>,
-    /// Overrides the Leaderboard's pairs.
-    #[serde(default, skip_serializing_if = "Option::is_none")]
-    #[schemars(range(min = 1, max = 16))]
-    pub pairs: Option<i32>,
-    /// ROUTES_SUBSET of each pair in place of equal slices, each as `first-last`.
-    #[serde(default, skip_serializing_if = "Option::is_none")]
-    #[schemars(length(min = 1, max = 16))]
-    pub route_subsets: Option<Vec<RouteSubset>>,
-    /// File of the routes in the contents.
-    #[serde(default, skip_serializing_if = "Option::is_none")]
-    #[schemars(length(max = 512), regex(pattern = r"^/[A-Za-z0-9_./-]+$"))]
-    pub routes_file: Option<String>,
-    /// File of the scenarios in the contents (V1).
-    #[serde(default, skip_serializing_if = "Option::is_none")]
-    #[schemars(length(max = 512), regex(pattern = r"^/[A-Za-z0-9_./-]+$"))]
-    pub scenarios_file: Option<String>,
+    /// Overrides fields of `evaluation.carla`.
+    #[serde(default, skip_serializing_if = "TrackCarla::is_empty")]
+    pub carla: TrackCarla,
     /// Overrides deadlines of the Leaderboard.
     #[serde(default, skip_serializing_if = "Option::is_none")]
     pub deadlines: Option<TrackDeadlines>,
-    /// Overrides of the Leaderboard's simulator.
-    #[serde(default, skip_serializing_if = "Option::is_none")]
-    pub simulator: Option<TrackContainer>,
     /// Overrides of the Leaderboard's agent.
     #[serde(default, skip_serializing_if = "Option::is_none")]
     pub agent: Option<TrackContainer>,
@@ -129,72 +87,6 @@ pub struct TrackContainer {
     /// Requests and limits, in place of all of the Leaderboard's.
     #[serde(default, skip_serializing_if = "Option::is_none")]
     pub resources: Option<ResourceRequirements>,
-}
-
-/// The init container that copies the private contents into shared volumes.
-#[derive(Serialize, Deserialize, KubeSchema, Clone, Debug, PartialEq)]
-#[serde(rename_all = "camelCase")]
-#[x_kube(validation = Rule::new("!has(self.args) || has(self.command)").message("contents.args without contents.command would be added to the default command; write the command too"))]
-pub struct ContentsContainer {
-    /// Image with the private contents.
-    #[schemars(length(min = 1, max = 512), regex(pattern = r"^[^\s]+$"))]
-    pub image: String,
-    /// Default: copies `$LEADERBOARD_ROOT`, `$SCENARIO_RUNNER_ROOT` and `$CARLA_PYTHON_API_ROOT`.
-    #[serde(default, skip_serializing_if = "Option::is_none")]
-    pub command: Option<Vec<String>>,
-    /// Arguments of the command.
-    #[serde(default, skip_serializing_if = "Option::is_none")]
-    pub args: Option<Vec<String>>,
-    /// Further environment.
-    #[serde(default, skip_serializing_if = "Vec::is_empty")]
-    #[x_kube(merge_strategy = ListMerge::Map(vec!["name".into()]))]
-    pub env: Vec<EnvVar>,
-    /// Requests and limits.
-    #[serde(default, skip_serializing_if = "Option::is_none")]
-    pub resources: Option<ResourceRequirements>,
-    /// Laid over the safe default field by field. To remove one of its fields, set it to null in podOverrides.
-    #[serde(default, skip_serializing_if = "Option::is_none")]
-    pub security_context: Option<SecurityContext>,
-}
-
-/// The simulator container of each pair.
-#[derive(Serialize, Deserialize, KubeSchema, Clone, Debug, PartialEq)]
-#[serde(rename_all = "camelCase")]
-#[x_kube(
-    validation = Rule::new("!has(self.args) || has(self.command)").message("simulator.args without simulator.command would be added to the default command; write the command too"),
-    validation = Rule::new("!has(self.x11) || self.display == 'X11Socket'").message("simulator.x11 is for simulator.display X11Socket; set that display, or leave x11 out"),
-    validation = Rule::new("!has(self.graphicsAdapter) || !has(self.command)").message("simulator.graphicsAdapter is a flag of the default command; write it into simulator.command")
-)]
-pub struct SimulatorContainer {
-    /// Image of the simulator.
-    #[schemars(length(min = 1, max = 512), regex(pattern = r"^[^\s]+$"))]
-    pub image: String,
-    /// Default: CARLA's start script with the flags of the version.
-    #[serde(default, skip_serializing_if = "Option::is_none")]
-    pub command: Option<Vec<String>>,
-    /// Arguments of the command.
-    #[serde(default, skip_serializing_if = "Option::is_none")]
-    pub args: Option<Vec<String>>,
-    /// Further environment.
-    #[serde(default, skip_serializing_if = "Vec::is_empty")]
-    #[x_kube(merge_strategy = ListMerge::Map(vec!["name".into()]))]
-    pub env: Vec<EnvVar>,
-    /// Requests and limits; GPUs are requested by the field `gpu` of the Leaderboard.
-    #[serde(default, skip_serializing_if = "Option::is_none")]
-    pub resources: Option<ResourceRequirements>,
-    /// Laid over the safe default field by field. To remove one of its fields, set it to null in podOverrides.
-    #[serde(default, skip_serializing_if = "Option::is_none")]
-    pub security_context: Option<SecurityContext>,
-    /// `Offscreen`: on no screen; SDL_VIDEODRIVER is `offscreen` in V1 and `dummy` in V2, and the simulator has no DISPLAY and no XAUTHORITY of its image. `X11Socket`: on the node's X server, by its socket in /tmp/.X11-unix; the namespace then needs Pod Security `privileged`. What `env` sets takes precedence.
-    #[serde(default)]
-    pub display: Display,
-    /// The node's X server, for `X11Socket`.
-    #[serde(default, skip_serializing_if = "Option::is_none")]
-    pub x11: Option<X11>,
-    /// The graphics adapter of every simulator, for nodes where Vulkan counts otherwise than the devices. Default: the one GPU that a simulator sees; if it sees several, that of its pair. V2 only.
-    #[serde(default, skip_serializing_if = "Option::is_none")]
-    #[schemars(range(min = 0, max = 255))]
-    pub graphics_adapter: Option<i32>,
 }
 
 /// What `kubectl leaderboard check` runs.

@@ -58,9 +58,6 @@ pub struct Evalai {
     /// Who may read the tail of a failed submission's log.
     #[serde(default)]
     pub log_tail: LogTail,
-    /// The challenge's queue, if it is in EvalAI's account; a queue in SQS is `spec.queue`.
-    #[serde(default, skip_serializing_if = "Option::is_none")]
-    pub queue: Option<EvalaiQueue>,
     /// Whether results go to EvalAI, or the submissions of another program are only run once more.
     #[serde(default)]
     pub mode: EvalaiMode,
@@ -131,17 +128,29 @@ pub enum Foreign {
     Leave,
 }
 
+/// The queue of the challenge's messages: a queue in SQS, or EvalAI's own.
+#[derive(Serialize, Deserialize, KubeSchema, Clone, Debug, Default, PartialEq)]
+#[x_kube(validation = Rule::new("has(self.sqs) != has(self.evalai)").message("queue needs exactly one of sqs and evalai: sqs if the queue is your own, evalai if it is EvalAI's"))]
+pub struct Queue {
+    /// A queue in SQS, which the bridge polls.
+    #[serde(default, skip_serializing_if = "Option::is_none")]
+    pub sqs: Option<SqsQueue>,
+    /// The challenge's queue in EvalAI's account, which the controller reads.
+    #[serde(default, skip_serializing_if = "Option::is_none")]
+    pub evalai: Option<EvalaiQueue>,
+}
+
 /// The SQS queue that EvalAI puts its messages in.
 #[derive(Serialize, Deserialize, KubeSchema, Clone, Debug, PartialEq)]
 #[serde(rename_all = "camelCase")]
 #[x_kube(
-    validation = Rule::new("!has(self.deadLetterURL) || self.deadLetterURL != self.url").message("queue.deadLetterURL is the queue itself: a bad message would come back endlessly"),
-    validation = Rule::new("!(self.url.contains('?') || self.url.contains('#') || self.url.contains('@'))").message("queue.url may hold neither a query nor credentials: the operator's own identity signs what it asks there"),
-    validation = Rule::new("!has(self.deadLetterURL) || !(self.deadLetterURL.contains('?') || self.deadLetterURL.contains('#') || self.deadLetterURL.contains('@'))").message("queue.deadLetterURL may hold neither a query nor credentials: the operator's own identity signs what it sends there"),
-    validation = Rule::new(PLAIN_ENDPOINT).message("queue.endpoint may hold neither a query nor credentials: the operator's own identity signs what it asks there"),
+    validation = Rule::new("!has(self.deadLetterURL) || self.deadLetterURL != self.url").message("queue.sqs.deadLetterURL is the queue itself: a bad message would come back endlessly"),
+    validation = Rule::new("!(self.url.contains('?') || self.url.contains('#') || self.url.contains('@'))").message("queue.sqs.url may hold neither a query nor credentials: the operator's own identity signs what it asks there"),
+    validation = Rule::new("!has(self.deadLetterURL) || !(self.deadLetterURL.contains('?') || self.deadLetterURL.contains('#') || self.deadLetterURL.contains('@'))").message("queue.sqs.deadLetterURL may hold neither a query nor credentials: the operator's own identity signs what it sends there"),
+    validation = Rule::new(PLAIN_ENDPOINT).message("queue.sqs.endpoint may hold neither a query nor credentials: the operator's own identity signs what it asks there"),
     validation = Rule::new("!has(self.deadLetterURL) || self.url.endsWith('.fifo') == self.deadLetterURL.endsWith('.fifo')").message("a FIFO queue needs a FIFO dead-letter queue, a standard queue a standard one")
 )]
-pub struct Queue {
+pub struct SqsQueue {
     /// URL of the queue.
     #[schemars(length(max = 512), regex(pattern = r"^https?://\S+$"))]
     pub url: String,
@@ -166,15 +175,22 @@ pub struct Queue {
     pub foreign: Foreign,
 }
 
+/// The store of results and logs.
+#[derive(Serialize, Deserialize, JsonSchema, Clone, Debug, PartialEq, Eq)]
+pub struct Storage {
+    /// A bucket of S3.
+    pub s3: S3Bucket,
+}
+
 /// The S3 bucket of results and logs.
 #[derive(Serialize, Deserialize, KubeSchema, Clone, Debug, PartialEq, Eq)]
 #[serde(rename_all = "camelCase")]
 #[x_kube(
-    validation = Rule::new("!has(self.sizeLimit) || quantity(string(self.sizeLimit)).compareTo(quantity('16Mi')) >= 0").message("storage.sizeLimit must be 16Mi or more"),
-    validation = Rule::new("!has(self.sizeLimit) || quantity(string(self.sizeLimit)).compareTo(quantity('1Ti')) <= 0").message("storage.sizeLimit must be 1Ti or less"),
-    validation = Rule::new(PLAIN_ENDPOINT).message("storage.endpoint may hold neither a query nor credentials: podIdentity and the operator's own identity sign what is asked there")
+    validation = Rule::new("!has(self.sizeLimit) || quantity(string(self.sizeLimit)).compareTo(quantity('16Mi')) >= 0").message("storage.s3.sizeLimit must be 16Mi or more"),
+    validation = Rule::new("!has(self.sizeLimit) || quantity(string(self.sizeLimit)).compareTo(quantity('1Ti')) <= 0").message("storage.s3.sizeLimit must be 1Ti or less"),
+    validation = Rule::new(PLAIN_ENDPOINT).message("storage.s3.endpoint may hold neither a query nor credentials: podIdentity and the operator's own identity sign what is asked there")
 )]
-pub struct Storage {
+pub struct S3Bucket {
     /// Name of the bucket.
     #[schemars(length(min = 3, max = 63), regex(pattern = r"^[a-z0-9][a-z0-9.-]*[a-z0-9]$"))]
     pub bucket: String,
@@ -212,15 +228,23 @@ pub struct Storage {
     pub storage_class: Option<StorageClass>,
 }
 
+/// The table of submissions.
+#[derive(Serialize, Deserialize, JsonSchema, Clone, Debug, PartialEq)]
+pub struct Table {
+    /// A table of DynamoDB.
+    #[serde(rename = "dynamoDB")]
+    pub dynamo_db: DynamoTable,
+}
+
 /// The DynamoDB table of submissions.
 #[derive(Serialize, Deserialize, KubeSchema, Clone, Debug, PartialEq)]
 #[serde(rename_all = "camelCase")]
 #[x_kube(
-    validation = Rule::new(PLAIN_ENDPOINT).message("table.endpoint may hold neither a query nor credentials: the operator's own identity signs what it asks there"),
-    validation = Rule::new("has(self.partitionKey) == has(self.sortKey)").message("table.partitionKey and table.sortKey are set together, or both are read from the table"),
-    validation = Rule::new("!has(self.partitionKey) || !has(self.sortKey) || self.partitionKey != self.sortKey").message("table.partitionKey and table.sortKey are the same key")
+    validation = Rule::new(PLAIN_ENDPOINT).message("table.dynamoDB.endpoint may hold neither a query nor credentials: the operator's own identity signs what it asks there"),
+    validation = Rule::new("has(self.partitionKey) == has(self.sortKey)").message("table.dynamoDB.partitionKey and table.dynamoDB.sortKey are set together, or both are read from the table"),
+    validation = Rule::new("!has(self.partitionKey) || !has(self.sortKey) || self.partitionKey != self.sortKey").message("table.dynamoDB.partitionKey and table.dynamoDB.sortKey are the same key")
 )]
-pub struct Table {
+pub struct DynamoTable {
     /// Name of the table.
     #[schemars(length(min = 3, max = 255), regex(pattern = r"^[A-Za-z0-9_.-]+$"))]
     pub name: String,
@@ -242,13 +266,21 @@ pub struct Table {
     pub sort_key: Option<String>,
 }
 
+/// The store of container logs.
+#[derive(Serialize, Deserialize, JsonSchema, Clone, Debug, PartialEq, Eq)]
+#[serde(rename_all = "camelCase")]
+pub struct Logs {
+    /// A log group of CloudWatch Logs.
+    pub cloud_watch: LogGroup,
+}
+
 /// The CloudWatch log group of container logs.
 #[derive(Serialize, Deserialize, KubeSchema, Clone, Debug, PartialEq, Eq)]
 #[serde(rename_all = "camelCase")]
 #[x_kube(
-    validation = Rule::new("!has(self.retentionDays) || self.retentionDays in [1, 3, 5, 7, 14, 30, 60, 90, 120, 150, 180, 365, 400, 545, 731, 1096, 1827, 2192, 2557, 2922, 3288, 3653]").message("logGroup.retentionDays must be a number of days that CloudWatch Logs knows: 1, 3, 5, 7, 14, 30, 60, 90, 120, 150, 180, 365, 400, 545, 731, 1096, 1827, 2192, 2557, 2922, 3288 or 3653"),
-    validation = Rule::new(PLAIN_ENDPOINT).message("logGroup.endpoint may hold neither a query nor credentials: podIdentity and the operator's own identity sign what is asked there"),
-    validation = Rule::new("!has(self.tags) || has(self.retentionDays)").message("logGroup.tags are for a group that the controller makes: set logGroup.retentionDays too, or tag the group yourself")
+    validation = Rule::new("!has(self.retentionDays) || self.retentionDays in [1, 3, 5, 7, 14, 30, 60, 90, 120, 150, 180, 365, 400, 545, 731, 1096, 1827, 2192, 2557, 2922, 3288, 3653]").message("logs.cloudWatch.retentionDays must be a number of days that CloudWatch Logs knows: 1, 3, 5, 7, 14, 30, 60, 90, 120, 150, 180, 365, 400, 545, 731, 1096, 1827, 2192, 2557, 2922, 3288 or 3653"),
+    validation = Rule::new(PLAIN_ENDPOINT).message("logs.cloudWatch.endpoint may hold neither a query nor credentials: podIdentity and the operator's own identity sign what is asked there"),
+    validation = Rule::new("!has(self.tags) || has(self.retentionDays)").message("logs.cloudWatch.tags are for a group that the controller makes: set logs.cloudWatch.retentionDays too, or tag the group yourself")
 )]
 pub struct LogGroup {
     /// Name of the log group.

@@ -4,6 +4,7 @@
 
 mod attempt;
 pub mod byte_quantity;
+mod carla;
 #[cfg(feature = "client-errors")]
 pub mod client_errors;
 pub mod conditions;
@@ -45,6 +46,7 @@ mod worker_status;
 pub use kube::ResourceExt;
 
 pub use attempt::Attempt;
+pub use carla::*;
 pub use conditions::Condition;
 pub use evalai_mode::EvalaiMode;
 pub use evalai_queue::EvalaiQueue;

@@ -1,4 +1,4 @@
-//! Consecutive routes: of a pair in a plan, and as `routeSubsets` and the evaluator write them.
+//! Consecutive routes: of a pair in a plan, and as `carla.routeSubsets` and the evaluator write them.
 //!
 //! Pure.
 

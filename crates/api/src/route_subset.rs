@@ -7,7 +7,7 @@ use serde::{Deserialize, Serialize};
 
 use super::route_slice::{NotASlice, RouteSlice};
 
-/// An entry of `routeSubsets`, such as `5-9`.
+/// An entry of `carla.routeSubsets`, such as `5-9`.
 #[derive(Serialize, Deserialize, Clone, Copy, Debug, PartialEq, Eq)]
 #[serde(try_from = "String", into = "String")]
 pub struct RouteSubset(pub RouteSlice);

@@ -4,47 +4,50 @@
 
 use k8s_openapi::api::core::v1::{EnvVar, ResourceRequirements, SecurityContext};
 
-use super::{LeaderboardSpec, RouteSlice, RunPlan, Track, effective};
+use super::{CarlaPlan, LeaderboardSpec, RouteSlice, RunPlan, Track, effective};
 
 impl RunPlan {
     /// How many workers share the work.
     pub fn workers(&self) -> usize {
-        self.slices.len()
+        self.carla.slices.len()
     }
 
     /// Units of work of one worker, which counts from 1; 0 if the plan has no such worker.
     pub fn total_of(&self, worker: i32) -> i32 {
         let index = usize::try_from(worker).ok().and_then(|worker| worker.checked_sub(1));
-        let slice = index.and_then(|index| self.slices.get(index));
-        let units = slice.and_then(|slice| i32::try_from(slice.routes()).ok()?.checked_mul(self.repetitions));
+        let slice = index.and_then(|index| self.carla.slices.get(index));
+        let units = slice.and_then(|slice| i32::try_from(slice.routes()).ok()?.checked_mul(self.carla.repetitions));
         units.unwrap_or(0)
     }
 
     /// The plan of a check: the first unit of work, once, with one worker.
     #[must_use]
     pub fn of_check(self) -> Self {
-        let first = self.slices.first().map_or(0, |slice| slice.first);
-        Self {
+        let first = self.carla.slices.first().map_or(0, |slice| slice.first);
+        let carla = CarlaPlan {
             slices: vec![RouteSlice { first, last: first }],
             routes: 1,
             repetitions: 1,
-            ..self
-        }
+            ..self.carla
+        };
+        Self { carla, ..self }
     }
 
     /// The plan with the images that the Leaderboard names now, but for the participant's.
     #[must_use]
     pub fn renewed(self, spec: &LeaderboardSpec) -> Self {
-        Self {
-            contents_image: spec.contents.image.as_str().into(),
-            simulator_image: spec.simulator.image.as_str().into(),
-            ..self
-        }
+        let now = &spec.evaluation.carla;
+        let carla = CarlaPlan {
+            contents_image: now.contents.image.as_str().into(),
+            simulator_image: now.simulator.image.as_str().into(),
+            ..self.carla
+        };
+        Self { carla, ..self }
     }
 
     /// Gives back memory that its lists do not need.
     pub fn shrink_to_fit(&mut self) {
-        self.slices.shrink_to_fit();
+        self.carla.slices.shrink_to_fit();
     }
 }
 
@@ -72,21 +75,22 @@ pub struct Given<'a> {
 impl LeaderboardSpec {
     /// What the host writes of a container, with the overrides of a track.
     pub fn given<'a>(&'a self, track: Option<&Track>, part: Part) -> Given<'a> {
+        let carla = &self.evaluation.carla;
         match part {
             Part::Contents => Given {
-                path: "contents",
-                env: &self.contents.env,
-                resources: self.contents.resources.clone(),
-                security: self.contents.security_context.as_ref(),
+                path: "evaluation.carla.contents",
+                env: &carla.contents.env,
+                resources: carla.contents.resources.clone(),
+                security: carla.contents.security_context.as_ref(),
             },
             Part::Host => Given {
-                path: "simulator",
-                env: &self.simulator.env,
+                path: "evaluation.carla.simulator",
+                env: &carla.simulator.env,
                 resources: effective::resources(
-                    track.and_then(|track| track.simulator.as_ref()),
-                    self.simulator.resources.as_ref(),
+                    track.and_then(|track| track.carla.simulator.as_ref()),
+                    carla.simulator.resources.as_ref(),
                 ),
-                security: self.simulator.security_context.as_ref(),
+                security: carla.simulator.security_context.as_ref(),
             },
             Part::Agent => Given {
                 path: "agent",
@@ -102,7 +106,8 @@ impl LeaderboardSpec {
 
     /// Images of the host, which are nobody's submission.
     pub fn host_images(&self) -> [&str; 2] {
-        [&self.contents.image, &self.simulator.image]
+        let carla = &self.evaluation.carla;
+        [&carla.contents.image, &carla.simulator.image]
     }
 }
 
@@ -113,13 +118,17 @@ mod tests {
 
     #[test]
     fn a_check_does_the_first_unit_once() {
-        let plan = json!({"runId": "check-lb-1", "leaderboardVersion": "V1", "track": "sensors", "codename": "SENSORS",
-                          "slices": [{"first": 4, "last": 9}, {"first": 10, "last": 15}], "routes": 12, "repetitions": 5,
-                          "storage": {"bucket": "b"}, "image": "a:1", "contentsImage": "c:1", "simulatorImage": "s:1"});
+        let plan = json!({
+            "runId": "check-lb-1", "track": "sensors", "storage": {"s3": {"bucket": "b"}}, "image": "a:1",
+            "carla": {
+                "version": "V1", "codename": "SENSORS", "slices": [{"first": 4, "last": 9}, {"first": 10, "last": 15}],
+                "routes": 12, "repetitions": 5, "contentsImage": "c:1", "simulatorImage": "s:1",
+            },
+        });
         let plan: RunPlan = serde_json::from_value(plan).unwrap();
         assert_eq!([plan.total_of(0), plan.total_of(1), plan.total_of(3)], [0, 30, 0]);
         let plan = plan.of_check();
-        assert_eq!(plan.slices, [RouteSlice { first: 4, last: 4 }]);
-        assert_eq!((plan.routes, plan.repetitions, plan.total_of(1)), (1, 1, 1));
+        assert_eq!(plan.carla.slices, [RouteSlice { first: 4, last: 4 }]);
+        assert_eq!((plan.carla.routes, plan.carla.repetitions, plan.total_of(1)), (1, 1, 1));
     }
 }

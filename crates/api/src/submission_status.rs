@@ -8,11 +8,11 @@ use schemars::JsonSchema;
 use serde::{Deserialize, Serialize};
 
 use super::attempt::Attempt;
+use super::carla::CarlaPlan;
 use super::conditions::Condition;
 use super::failed_node::{FailedNode, MAX_FAILED_NODES};
-use super::leaderboard_parts::{LeaderboardVersion, Storage};
+use super::leaderboard_parts::Storage;
 use super::progress::{MAX_METRICS, Metric, Progress, Score};
-use super::route_slice::RouteSlice;
 use super::run_id::RunId;
 use super::shared_text::SharedText;
 use super::submission_use::{Interruptions, Use};
@@ -194,9 +194,9 @@ impl SubmissionStatus {
         let of_plan = self.plan.iter_mut().flat_map(|plan| {
             [
                 &mut plan.track,
-                &mut plan.codename,
-                &mut plan.contents_image,
-                &mut plan.simulator_image,
+                &mut plan.carla.codename,
+                &mut plan.carla.contents_image,
+                &mut plan.carla.simulator_image,
             ]
         });
         let of_conditions = self.conditions.iter_mut().flat_map(Condition::shared_texts);
@@ -217,35 +217,19 @@ pub struct RunPlan {
     /// Run id: S3 prefix, sort key, log streams.
     #[schemars(length(max = 128))]
     pub run_id: RunId,
-    /// Which Leaderboard it is of: chooses the format of the checkpoints, flags and defaults.
-    pub leaderboard_version: LeaderboardVersion,
     /// Name of the track.
     #[schemars(length(max = 32))]
     pub track: SharedText,
-    /// CHALLENGE_TRACK_CODENAME.
-    #[schemars(length(max = 64))]
-    pub codename: SharedText,
     /// EvalAI phase.
     #[serde(default, skip_serializing_if = "Option::is_none")]
     pub phase: Option<i64>,
-    /// Routes of each pair; their number is the number of pairs.
-    #[schemars(length(max = 16))]
-    pub slices: Vec<RouteSlice>,
-    /// Routes, not counting repetitions.
-    pub routes: i32,
-    /// Repetitions of each route.
-    pub repetitions: i32,
     /// Where the results go.
     pub storage: Storage,
     /// The participant's image.
     #[schemars(length(max = 1024))]
     pub image: String,
-    /// Image of the contents, renewed by each attempt.
-    #[schemars(length(max = 512))]
-    pub contents_image: SharedText,
-    /// Image of the simulator, renewed by each attempt.
-    #[schemars(length(max = 512))]
-    pub simulator_image: SharedText,
+    /// The plan of CARLA's evaluation.
+    pub carla: CarlaPlan,
     /// True if the stored results of an earlier run are taken up.
     #[serde(default)]
     pub resume: bool,

@@ -17,7 +17,7 @@ use tokio::io::AsyncWriteExt;
 
 use crate::clients::Aws;
 use crate::metered::Metered;
-use leaderboard_api::{RunId, Storage, effective};
+use leaderboard_api::{RunId, S3Bucket, effective};
 use leaderboard_base::meter::Meter;
 
 pub use error::{ArchiveError, Cause};
@@ -96,12 +96,12 @@ impl Archive {
     }
 
     /// The prefix of a run.
-    pub fn of_run(aws: &Aws, storage: &Storage, run_id: &RunId) -> Self {
+    pub fn of_run(aws: &Aws, storage: &S3Bucket, run_id: &RunId) -> Self {
         Self::of_storage(aws, storage).at_prefix(effective::key_prefix(storage, run_id))
     }
 
     /// The prefix of all runs.
-    pub fn of_storage(aws: &Aws, storage: &Storage) -> Self {
+    pub fn of_storage(aws: &Aws, storage: &S3Bucket) -> Self {
         let client = aws.s3(storage.region.as_deref(), storage.endpoint.as_deref());
         Self {
             meter: aws.meter().clone(),

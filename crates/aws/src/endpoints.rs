@@ -6,7 +6,7 @@ use aws_sdk_sts::config::endpoint as sts_endpoint;
 use reqwest::Url;
 
 use crate::clients::USUAL_REGION;
-use leaderboard_api::{LeaderboardSpec, LogGroup, Storage};
+use leaderboard_api::{LeaderboardSpec, LogGroup, S3Bucket};
 use logs_endpoint::ResolveEndpoint as _;
 use s3_endpoint::ResolveEndpoint as _;
 use sts_endpoint::ResolveEndpoint as _;
@@ -30,18 +30,18 @@ macro_rules! endpoint {
 /// Hosts that `workspace` and `logcopy` of a Leaderboard's Pods connect to, in a Pod whose environment has this region: names in small letters,
 /// or addresses.
 pub async fn of_pods(spec: &LeaderboardSpec, region: Option<&str>) -> Result<Vec<String>, String> {
-    let region = region.or(spec.storage.region.as_deref());
-    let mut hosts = vec![s3(&spec.storage, region).await?];
+    let region = region.or(spec.storage.s3.region.as_deref());
+    let mut hosts = vec![s3(&spec.storage.s3, region).await?];
     if spec.has_role() {
-        hosts.push(sts(&spec.storage, region).await?);
+        hosts.push(sts(&spec.storage.s3, region).await?);
     }
-    if let Some(group) = &spec.log_group {
+    if let Some(group) = spec.log_group() {
         hosts.push(logs(group, region).await?);
     }
     Ok(hosts)
 }
 
-async fn s3(storage: &Storage, region: Option<&str>) -> Result<String, String> {
+async fn s3(storage: &S3Bucket, region: Option<&str>) -> Result<String, String> {
     let params = s3_endpoint::Params::builder()
         .bucket(&storage.bucket)
         .region(storage.region.as_deref().or(region).unwrap_or(USUAL_REGION))
@@ -50,7 +50,7 @@ async fn s3(storage: &Storage, region: Option<&str>) -> Result<String, String> {
     host("S3", endpoint!(s3_endpoint, params))
 }
 
-async fn sts(storage: &Storage, region: Option<&str>) -> Result<String, String> {
+async fn sts(storage: &S3Bucket, region: Option<&str>) -> Result<String, String> {
     let region = storage.region.as_deref().or(region).unwrap_or(USUAL_REGION);
     let params = sts_endpoint::Params::builder().region(region);
     host("STS", endpoint!(sts_endpoint, params))
@@ -77,7 +77,7 @@ mod tests {
 
     use super::*;
 
-    fn storage(more: &serde_json::Value) -> Storage {
+    fn storage(more: &serde_json::Value) -> S3Bucket {
         let mut storage = json!({"bucket": "results"});
         for (key, value) in more.as_object().unwrap() {
             storage[key] = value.clone();

@@ -1,6 +1,6 @@
 //! Log groups that a Leaderboard wants kept: made if they are missing, with the days that their lines are kept.
 //!
-//! Called by the controller's checks of a Leaderboard, and only where `logGroup.retentionDays` is set. The Pods write streams
+//! Called by the controller's checks of a Leaderboard, and only where `logs.cloudWatch.retentionDays` is set. The Pods write streams
 //! into the group and have no right to make one.
 
 use aws_sdk_cloudwatchlogs::Client;
@@ -32,14 +32,15 @@ impl LogGroupError {
     fn next_step(&self) -> String {
         match self.fault {
             Fault::Denied => format!(
-                "give the controller's AWS identity logs:{}, or make the group yourself and leave logGroup.retentionDays out",
+                "give the controller's AWS identity logs:{}, or make the group yourself and leave logs.cloudWatch.retentionDays out",
                 self.action
             ),
             Fault::Refused | Fault::Missing => {
-                "check logGroup.name, logGroup.tags, logGroup.region and logGroup.endpoint".to_owned()
+                "check logs.cloudWatch.name, logs.cloudWatch.tags, logs.cloudWatch.region and logs.cloudWatch.endpoint"
+                    .to_owned()
             }
             Fault::Throttled | Fault::Unavailable | Fault::Conflict => {
-                "it is retried; check logGroup.endpoint and the network if this stays".to_owned()
+                "it is retried; check logs.cloudWatch.endpoint and the network if this stays".to_owned()
             }
         }
     }

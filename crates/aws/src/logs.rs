@@ -75,7 +75,7 @@ impl Miss {
     }
 }
 
-const HINT: &str = "Check that logGroup of the leaderboard exists (the controller makes it where logGroup.retentionDays \
+const HINT: &str = "Check that logs.cloudWatch of the leaderboard exists (the controller makes it where logs.cloudWatch.retentionDays \
                     is set), and logs:CreateLogStream, logs:PutLogEvents and logs:GetLogEvents of the Pod's identity; \
                     results do not depend on it.";
 

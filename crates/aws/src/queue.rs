@@ -28,10 +28,12 @@ impl QueueError {
             Fault::Denied => {
                 "the controller cannot check whether it exists: give its AWS identity sqs:GetQueueAttributes on it"
             }
-            Fault::Missing => "create it, or correct queue.url, queue.deadLetterURL, queue.region and queue.endpoint",
-            Fault::Refused => "check queue.url, queue.deadLetterURL, queue.region and queue.endpoint",
+            Fault::Missing => {
+                "create it, or correct queue.sqs.url, queue.sqs.deadLetterURL, queue.sqs.region and queue.sqs.endpoint"
+            }
+            Fault::Refused => "check queue.sqs.url, queue.sqs.deadLetterURL, queue.sqs.region and queue.sqs.endpoint",
             Fault::Throttled | Fault::Unavailable | Fault::Conflict => {
-                "it is retried; check queue.endpoint and the network if this stays"
+                "it is retried; check queue.sqs.endpoint and the network if this stays"
             }
         }
     }
@@ -66,7 +68,7 @@ impl Reading {
 }
 
 /// Checks whether a queue answers: the one that is read, or its dead-letter queue.
-pub async fn check(aws: &Aws, queue: &api::Queue, url: &str) -> Result<Reading, QueueError> {
+pub async fn check(aws: &Aws, queue: &api::SqsQueue, url: &str) -> Result<Reading, QueueError> {
     let client = aws.sqs(queue.region.as_deref(), queue.endpoint.as_deref());
     let request = client.get_queue_attributes().queue_url(url);
     let request = request.set_attribute_names(Some(Reading::ATTRIBUTES.to_vec())).send();

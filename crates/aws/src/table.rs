@@ -137,7 +137,9 @@ pub enum TableError {
         text: String,
     },
     /// There is no such table.
-    #[error("table {table} does not exist: {text}; check table.name, table.region and table.endpoint")]
+    #[error(
+        "table {table} does not exist: {text}; check table.dynamoDB.name, table.dynamoDB.region and table.dynamoDB.endpoint"
+    )]
     Missing { table: String, text: String },
     /// DynamoDB may accept it later.
     #[error("table {table}: {action} failed: {text}; it is retried")]
@@ -157,7 +159,9 @@ pub enum TableError {
     #[error("table {table} has no sort key; it needs a partition key for the team and a sort key for the submission")]
     NoSortKey { table: String },
     /// The keys that are set are not the table's.
-    #[error("table {table} has the keys {found} but table.partitionKey and table.sortKey are {set}; leave both out")]
+    #[error(
+        "table {table} has the keys {found} but table.dynamoDB.partitionKey and table.dynamoDB.sortKey are {set}; leave both out"
+    )]
     OtherKeys { table: String, found: String, set: String },
     /// A key's value is not of the type that the table wants.
     #[error("table {table}: key {key} {problem}")]
@@ -191,7 +195,7 @@ pub struct Table {
 impl Table {
     /// Asks the table for the names and types of its keys. Where that is not allowed, keys that are set are taken
     /// for strings.
-    pub async fn describe(aws: &Aws, table: &api::Table) -> Result<Self, TableError> {
+    pub async fn describe(aws: &Aws, table: &api::DynamoTable) -> Result<Self, TableError> {
         let client = aws.dynamodb(table.region.as_deref(), table.endpoint.as_deref());
         let name = table.name.clone();
         let set = table.partition_key.clone().zip(table.sort_key.clone());

@@ -1,5 +1,5 @@
 //! What the controller and the programs in a Pod agree on: what a Pod is given (`run`), what it reports (`report`), what `workspace`
-//! ends with (`verdict`), the names of what is stored (`keys`), and which versions of these documents are read (`schema`).
+//! ends with (`verdict`), and the names of what is stored (`keys`).
 //!
 //! Pods and controller may be of different versions, so that each document has a number. Golden files hold each version that was.
 #![cfg_attr(not(test), deny(clippy::indexing_slicing, clippy::arithmetic_side_effects))]
@@ -7,5 +7,6 @@
 pub mod keys;
 pub mod report;
 pub mod run;
-pub mod schema;
+#[cfg(test)]
+mod schema;
 pub mod verdict;

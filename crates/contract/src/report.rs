@@ -9,7 +9,6 @@ use jiff::Timestamp;
 use serde::{Deserialize, Serialize};
 use sha2::{Digest, Sha256};
 
-use super::schema::is_read;
 use leaderboard_api::text::one_line;
 use leaderboard_api::{Attempt, MAX_METRICS, MAX_NAME, Metric, WorkerState};
 
@@ -53,7 +52,7 @@ impl Owner {
     /// Reads a stored mark; `None` for one of an unknown version, which no Pod of this version wrote.
     pub fn parse(bytes: &[u8]) -> Option<Self> {
         let owner: Self = serde_json::from_slice(bytes).ok()?;
-        is_read(owner.schema, OWNER_SCHEMA).then_some(owner)
+        (owner.schema == OWNER_SCHEMA).then_some(owner)
     }
 }
 
@@ -106,8 +105,7 @@ pub struct Report {
     pub logs: Option<Logs>,
     /// Text of `evalai/results.json`.
     pub results: String,
-    /// The same with the metrics over the routes done so far, in which `results` has zeros; only while the run goes on, and not
-    /// from an older operator's Pod.
+    /// The same with the metrics over the routes done so far, in which `results` has zeros; only while the run goes on.
     #[serde(default, skip_serializing_if = "Option::is_none")]
     pub partial_results: Option<String>,
     /// Most of what is on the volume of the logs, and enough to fill one, is in the agents' folders.
@@ -131,7 +129,7 @@ pub struct ReportWorker {
     pub crashes: u32,
     /// What it does.
     pub state: WorkerState,
-    /// Its checkpoint has a record that names a crash of the simulation; not from an older operator's Pod.
+    /// Its checkpoint has a record that names a crash of the simulation.
     #[serde(default, skip_serializing_if = "std::ops::Not::not")]
     pub names_crash: bool,
 }
@@ -164,7 +162,7 @@ pub enum ReportError {
     #[error("the report is not one of ours: {0}")]
     Malformed(String),
     /// Of a version that is not read.
-    #[error("the report has schema {0}, and {SCHEMA} and the one before are read")]
+    #[error("the report has schema {0}, and this operator reads {SCHEMA}")]
     Schema(u32),
     /// A number that no run can have.
     #[error("the report is implausible: {0}")]
@@ -200,7 +198,7 @@ impl Report {
 
     fn check(&self) -> Result<(), ReportError> {
         let implausible = |what: &str| Err(ReportError::Implausible(what.into()));
-        if !is_read(self.schema, SCHEMA) {
+        if self.schema != SCHEMA {
             return Err(ReportError::Schema(self.schema));
         }
         if self.done > self.total {

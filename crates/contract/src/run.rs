@@ -4,7 +4,7 @@
 
 use serde::{Deserialize, Serialize};
 
-use leaderboard_api::{Attempt, Enforcement, LogGroup, RunPlan, Verify};
+use leaderboard_api::{Attempt, Enforcement, LogGroup, Logs, RunPlan, Verify};
 use leaderboard_protocol::files::Pair;
 
 /// Environment variable with the JSON of [`Run`].
@@ -70,12 +70,19 @@ pub struct Run {
     pub flush_seconds: u64,
     /// Seconds from a cancel to the end.
     pub cancel_seconds: u64,
-    /// CloudWatch log group, if container logs go there.
+    /// The store of container logs; absent: they are in the store of the results alone.
     #[serde(default, skip_serializing_if = "Option::is_none")]
-    pub log_group: Option<LogGroup>,
+    pub logs: Option<Logs>,
     /// How `workspace` measures whether the Pod's NetworkPolicy is enforced; absent: not at all.
     #[serde(default, skip_serializing_if = "Option::is_none")]
     pub isolation: Option<Isolation>,
+}
+
+impl Run {
+    /// The log group of CloudWatch Logs.
+    pub fn log_group(&self) -> Option<&LogGroup> {
+        self.logs.as_ref().map(|logs| &logs.cloud_watch)
+    }
 }
 
 /// What is to be measured, and what follows.

@@ -2,8 +2,6 @@
 
 use serde::{Deserialize, Serialize};
 
-use super::schema::is_read;
-
 /// Version of the verdict.
 pub const VERDICT_SCHEMA: u32 = 1;
 /// Most bytes of a verdict: eleven containers share 12 KiB.
@@ -20,7 +18,7 @@ pub enum WorkspaceReason {
     StorageFailed,
     /// A volume of the Pod can't be used.
     VolumeFailed,
-    /// The Pod's NetworkPolicy has to be enforced, and is not. Of older runners: or it is not known.
+    /// The Pod's NetworkPolicy has to be enforced, and is not.
     NotIsolated,
     /// The Pod's NetworkPolicy has to be enforced, and whether it is could not be measured.
     NotKnownIsolated,
@@ -35,8 +33,7 @@ pub enum WorkspaceReason {
 /// The container's termination message.
 #[derive(Serialize, Deserialize, Clone, Debug, PartialEq, Eq)]
 pub struct WorkspaceVerdict {
-    /// [`VERDICT_SCHEMA`]; what had no number yet is version 0.
-    #[serde(default)]
+    /// [`VERDICT_SCHEMA`].
     pub schema: u32,
     /// For the controller.
     pub reason: WorkspaceReason,
@@ -51,7 +48,7 @@ pub enum NotAVerdict {
     #[error("the termination message has {0} bytes, more than the {VERDICT_BYTES} of a verdict of `workspace`")]
     TooLong(usize),
     /// Of a version that is not read.
-    #[error("the verdict of `workspace` has schema {0}, and {VERDICT_SCHEMA} and the one before are read")]
+    #[error("the verdict of `workspace` has schema {0}, and this operator reads {VERDICT_SCHEMA}")]
     Schema(u32),
     /// Not the JSON of a verdict.
     #[error("the termination message is no verdict of `workspace`: {0}")]
@@ -86,7 +83,6 @@ impl WorkspaceVerdict {
     pub fn parse(message: &str) -> Result<Self, NotAVerdict> {
         #[derive(Deserialize)]
         struct Numbered {
-            #[serde(default)]
             schema: u32,
         }
         if message.len() > VERDICT_BYTES {
@@ -95,7 +91,7 @@ impl WorkspaceVerdict {
         let malformed = |error: serde_json::Error| NotAVerdict::Malformed(error.to_string());
         // Another version may know other reasons.
         let Numbered { schema } = serde_json::from_str(message).map_err(malformed)?;
-        if !is_read(schema, VERDICT_SCHEMA) {
+        if schema != VERDICT_SCHEMA {
             return Err(NotAVerdict::Schema(schema));
         }
         serde_json::from_str(message).map_err(malformed)

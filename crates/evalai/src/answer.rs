@@ -237,7 +237,7 @@ fn next_step(status: u16, body: &Body) -> Option<&'static str> {
             Some("these metrics are no labels of the phase's leaderboard: add them there")
         }
         _ if has("Challenge Phase Split does not exist") => Some("check evalai.split and the track's phase"),
-        _ if has("Challenge with queue name") => Some("check evalai.queue.name, the challenge's queue in EvalAI"),
+        _ if has("Challenge with queue name") => Some("check queue.evalai.name, the challenge's queue in EvalAI"),
         _ if has("not authorized to access this submission") => Some("the token's user is no host of its challenge"),
         _ if has(NOT_AUTHORIZED) => Some(
             "the token's user is no host of this challenge, or there is no such challenge: check evalai.challenge, and \

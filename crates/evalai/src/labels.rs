@@ -51,7 +51,7 @@ pub enum Misfit {
     #[error("the leaderboard of phase {phase} has no {}; add these labels to its schema", .labels.join(", "))]
     Unknown { phase: i64, labels: Vec<String> },
     /// The leaderboard has metrics that are never sent: EvalAI shows them as `#`.
-    #[error("the leaderboard of phase {phase} also has {}, which the operator never sends and which stay empty; remove them from its schema, or check spec.leaderboardVersion", .labels.join(", "))]
+    #[error("the leaderboard of phase {phase} also has {}, which the operator never sends and which stay empty; remove them from its schema, or check evaluation.carla.version", .labels.join(", "))]
     Unsent { phase: i64, labels: Vec<String> },
 }
 

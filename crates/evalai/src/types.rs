@@ -11,7 +11,7 @@ use jiff::Timestamp;
 use super::row::Row;
 use crate::token::Token;
 use leaderboard_api::evalai_status::{Outcome, Progress, Status};
-use leaderboard_api::{Attempt, Storage};
+use leaderboard_api::{Attempt, S3Bucket};
 pub use leaderboard_base::object_key::ObjectKey as Key;
 use leaderboard_base::spans::LogSpan;
 use leaderboard_contract::report::ContentId;
@@ -133,7 +133,7 @@ pub struct Outline {
 /// The results and texts that one report names.
 #[derive(Clone, Debug, PartialEq, Eq)]
 pub struct StoredResult {
-    pub storage: Storage,
+    pub storage: S3Bucket,
     /// Key prefix of the run, with the final slash.
     pub prefix: String,
     /// The report that was decided on.

@@ -5,7 +5,9 @@ use std::path::Path;
 
 use leaderboard_protocol::files::{Mark, Member, Pair, Side, StatusFile};
 
-use leaderboard_api::{Attempt, ByteQuantity, LeaderboardVersion, RouteSlice, RunPlan, Storage, Verify};
+use leaderboard_api::{
+    Attempt, ByteQuantity, CarlaPlan, LeaderboardVersion, RouteSlice, RunPlan, S3Bucket, Storage, Verify,
+};
 use leaderboard_contract::run::{Run, SCHEMA, STATUS_FOLDER};
 
 /// Two pairs of two routes each, once.
@@ -18,25 +20,29 @@ pub fn run() -> Run {
         attempt: Attempt(1),
         plan: RunPlan {
             run_id: "77".parse().unwrap(),
-            leaderboard_version: LeaderboardVersion::V2,
             track: "sensors".into(),
-            codename: "SENSORS".into(),
             phase: None,
-            slices: vec![RouteSlice { first: 0, last: 1 }, RouteSlice { first: 2, last: 3 }],
-            routes: 4,
-            repetitions: 1,
             storage: Storage {
-                bucket: "results".to_owned(),
-                prefix: Some("2026/".to_owned()),
-                region: None,
-                endpoint: None,
-                size_limit: ByteQuantity::gibibytes(1),
-                kms_key_arn: None,
-                storage_class: None,
+                s3: S3Bucket {
+                    bucket: "results".to_owned(),
+                    prefix: Some("2026/".to_owned()),
+                    region: None,
+                    endpoint: None,
+                    size_limit: ByteQuantity::gibibytes(1),
+                    kms_key_arn: None,
+                    storage_class: None,
+                },
             },
             image: "image".to_owned(),
-            contents_image: "contents".into(),
-            simulator_image: "simulator".into(),
+            carla: CarlaPlan {
+                version: LeaderboardVersion::V2,
+                codename: "SENSORS".into(),
+                slices: vec![RouteSlice { first: 0, last: 1 }, RouteSlice { first: 2, last: 3 }],
+                routes: 4,
+                repetitions: 1,
+                contents_image: "contents".into(),
+                simulator_image: "simulator".into(),
+            },
             resume: false,
             earlier_attempts: 0,
             submission_uid: None,
@@ -45,7 +51,7 @@ pub fn run() -> Run {
         period_seconds: 1,
         flush_seconds: 60,
         cancel_seconds: 20,
-        log_group: None,
+        logs: None,
         isolation: None,
     }
 }

@@ -91,12 +91,12 @@ pub struct Column {
 
 /// The kind of evaluation of a Leaderboard.
 pub fn of(spec: &LeaderboardSpec) -> Box<dyn Evaluation> {
-    Box::new(carla::Carla::new(spec.leaderboard_version))
+    Box::new(carla::Carla::new(spec.evaluation.carla.version))
 }
 
 /// The kind of evaluation of a plan.
 pub fn of_plan(plan: &RunPlan) -> Box<dyn Evaluation> {
-    Box::new(carla::Carla::new(plan.leaderboard_version))
+    Box::new(carla::Carla::new(plan.carla.version))
 }
 
 /// The words of a plan's kind.

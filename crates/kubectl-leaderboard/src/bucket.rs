@@ -1,9 +1,9 @@
 //! Commands about a run's objects in its bucket, for people to copy: the plugin itself reads no bucket.
 
-use leaderboard_api::Storage;
+use leaderboard_api::S3Bucket;
 
 /// Prints one object.
-pub fn print(object: &str, storage: Option<&Storage>) -> String {
+pub fn print(object: &str, storage: Option<&S3Bucket>) -> String {
     format!("aws s3 cp {} -{}", word(object), flags(storage))
 }
 
@@ -18,7 +18,7 @@ fn word(text: &str) -> String {
 }
 
 /// Where a bucket is, as flags of `aws`.
-fn flags(storage: Option<&Storage>) -> String {
+fn flags(storage: Option<&S3Bucket>) -> String {
     let flag = |name: &str, value: Option<&String>| value.map(|v| format!(" {name} {}", word(v))).unwrap_or_default();
     let region = flag("--region", storage.and_then(|s| s.region.as_ref()));
     let endpoint = flag("--endpoint-url", storage.and_then(|s| s.endpoint.as_ref()));
@@ -41,7 +41,7 @@ mod tests {
     #[test]
     fn the_place_of_the_bucket_is_in_the_command() {
         let storage = json!({"bucket": "b", "region": "eu-west-1", "endpoint": "https://s3.example"});
-        let storage: Storage = serde_json::from_value(storage).unwrap();
+        let storage: S3Bucket = serde_json::from_value(storage).unwrap();
         assert_eq!(
             print("s3://b/1/a.log", Some(&storage)),
             "aws s3 cp s3://b/1/a.log - --region eu-west-1 --endpoint-url https://s3.example"

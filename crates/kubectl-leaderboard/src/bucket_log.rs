@@ -4,7 +4,7 @@
 
 use std::process::Stdio;
 
-use leaderboard_api::Storage;
+use leaderboard_api::S3Bucket;
 use tokio::io::AsyncReadExt as _;
 use tokio::process::Command;
 
@@ -24,7 +24,7 @@ pub enum Unread {
 }
 
 /// What `aws` is called with.
-fn arguments(object: &str, storage: Option<&Storage>) -> Vec<String> {
+fn arguments(object: &str, storage: Option<&S3Bucket>) -> Vec<String> {
     let mut arguments = ["s3", "cp", "--only-show-errors"].map(str::to_owned).to_vec();
     let places = [
         ("--region", storage.and_then(|storage| storage.region.as_ref())),
@@ -38,7 +38,7 @@ fn arguments(object: &str, storage: Option<&Storage>) -> Vec<String> {
 }
 
 /// Hands each line of an object to `show`.
-pub async fn read(object: &str, storage: Option<&Storage>, mut show: impl FnMut(&str)) -> Result<(), Unread> {
+pub async fn read(object: &str, storage: Option<&S3Bucket>, mut show: impl FnMut(&str)) -> Result<(), Unread> {
     // An imported address is a text of a table's row: it must not become a flag, nor name a file of this machine.
     if !object.starts_with("s3://") {
         return Err(Unread::Failed(format!("{} is no address in a bucket", clean(object))));
@@ -103,7 +103,7 @@ mod tests {
     #[test]
     fn the_place_of_the_bucket_is_handed_on_and_no_part_of_an_address_is_a_flag() {
         let storage = json!({"bucket": "b", "region": "eu-west-1", "endpoint": "https://s3.example"});
-        let storage: Storage = serde_json::from_value(storage).unwrap();
+        let storage: S3Bucket = serde_json::from_value(storage).unwrap();
         assert_eq!(
             arguments("s3://b/1/a.log", Some(&storage)),
             [

@@ -203,7 +203,9 @@ async fn from_bucket(submission: &Submission, wanted: &Logs, workers: usize) -> 
     let results = status
         .and_then(|status| status.results_url.as_deref())
         .unwrap_or_default();
-    let storage = status.and_then(|status| status.plan.as_ref()).map(|plan| &plan.storage);
+    let storage = status
+        .and_then(|status| status.plan.as_ref())
+        .map(|plan| &plan.storage.s3);
     let named = storage.and_then(|storage| storage.endpoint.as_ref());
     if let Some(endpoint) = foreign::endpoint(named).filter(|endpoint| wanted.endpoint.as_deref() != Some(*endpoint)) {
         confirm(&submission.name_any(), endpoint, ask)?;
@@ -279,7 +281,9 @@ pub(super) fn in_bucket(
             facts::command("why", submission)
         ));
     };
-    let storage = status.and_then(|status| status.plan.as_ref()).map(|plan| &plan.storage);
+    let storage = status
+        .and_then(|status| status.plan.as_ref())
+        .map(|plan| &plan.storage.s3);
     let text = format!(
         "The Pod of {name} is gone. With the program aws on the PATH, this command shows its logs. Without it:"
     );
@@ -349,9 +353,10 @@ mod tests {
     #[test]
     fn without_a_pod_the_commands_for_the_bucket_are_shown() {
         let storage = json!({"bucket": "b", "region": "eu-west-1"});
-        let plan = json!({"runId": "mine", "leaderboardVersion": "V2", "track": "sensors", "codename": "S",
-                          "slices": [{"first": 0, "last": 0}], "routes": 1, "repetitions": 1, "storage": storage, "image": "a",
-                          "contentsImage": "c", "simulatorImage": "s"});
+        let plan = json!({"runId": "mine",
+            "carla": {"version": "V2", "codename": "S", "slices": [{"first": 0, "last": 0}],
+                "routes": 1, "repetitions": 1, "contentsImage": "c", "simulatorImage": "s"},
+            "track": "sensors", "storage": {"s3": storage}, "image": "a"});
         let stored = submission(&json!({"resultsURL": "s3://b/mine", "plan": plan, "conditions": ended()}));
         assert_eq!(workers(&stored), 1);
         let in_bucket = |submission, of: Whose| in_bucket(submission, of, &of.keys(1, None), frame());

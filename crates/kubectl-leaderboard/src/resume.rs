@@ -135,7 +135,7 @@ fn row(one: &Submission, now: Timestamp) -> Vec<String> {
     let class = failure.map_or("", |failure| failure.class.as_str());
     let plan = status.and_then(|status| status.plan.as_ref());
     // The registry is the same for all, and the tag is what differs.
-    let simulator = plan.and_then(|plan| plan.simulator_image.rsplit('/').next());
+    let simulator = plan.and_then(|plan| plan.carla.simulator_image.rsplit('/').next());
     let since = facts::since(one).map(|at| span(now.duration_since(at).as_secs()));
     vec![
         one.name_any(),

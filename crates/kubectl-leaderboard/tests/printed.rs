@@ -80,9 +80,11 @@ fn failed(class: &str, reason: &str) -> Value {
 }
 
 fn plan() -> Value {
-    json!({"runId": "runs", "leaderboardVersion": "V2", "track": "sensors", "codename": "S",
-           "slices": [{"first": 0, "last": 9}, {"first": 10, "last": 19}], "routes": 20, "repetitions": 1,
-           "storage": {"bucket": "results"}, "image": "a", "contentsImage": "c", "simulatorImage": "s"})
+    json!({"runId": "runs",
+        "carla": {"version": "V2", "codename": "S", "slices": [{"first": 0, "last": 9}, {"first": 10, "last": 19}],
+            "routes": 20, "repetitions": 1, "contentsImage": "c", "simulatorImage": "s"},
+        "track": "sensors",
+           "storage": {"s3": {"bucket": "results"}}, "image": "a"})
 }
 
 fn submissions() -> Vec<Value> {
@@ -106,8 +108,10 @@ fn leaderboard() -> Value {
     json!({
         "apiVersion": "leaderboard.carla.org/v1alpha1", "kind": "Leaderboard",
         "metadata": {"name": "carla-20", "namespace": "carla"},
-        "spec": {"tracks": [{"name": "sensors", "codename": "SENSORS"}], "leaderboardVersion": "V2",
-                 "contents": {"image": "contents:1"}, "simulator": {"image": "simulator:1"}, "storage": {"bucket": "results"}},
+        "spec": {"tracks": [{"name": "sensors"}],
+                 "evaluation": {"carla": {
+                     "version": "V2", "contents": {"image": "contents:1"}, "simulator": {"image": "simulator:1"},
+                 }}, "storage": {"s3": {"bucket": "results"}}},
         "status": {"conditions": [condition("Ready", "True", "Ready")]},
     })
 }

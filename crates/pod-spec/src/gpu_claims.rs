@@ -73,9 +73,10 @@ mod tests {
             "apiVersion": "leaderboard.carla.org/v1alpha1", "kind": "Leaderboard",
             "metadata": {"name": "carla", "namespace": "challenge", "uid": "u-1"},
             "spec": {
-                "leaderboardVersion": "V2", "tracks": [{"name": "sensors", "codename": "SENSORS"}],
-                "contents": {"image": "contents"}, "simulator": {"image": "simulator"},
-                "storage": {"bucket": "bucket"}, "gpu": gpu,
+                "evaluation": {"carla": {
+                    "version": "V2", "contents": {"image": "contents"}, "simulator": {"image": "simulator"},
+                }}, "tracks": [{"name": "sensors"}],
+                "storage": {"s3": {"bucket": "bucket"}}, "gpu": gpu,
             },
         }));
         leaderboard.unwrap()

@@ -121,7 +121,7 @@ pub fn unnamed(tracks: &[TrackPods], hosts: Result<Vec<String>, String>) -> Opti
         Ok(hosts) => hosts,
         Err(why) => {
             return Some(format!(
-                "With network.dns None, {why}; correct storage, logGroup or the region."
+                "With network.dns None, {why}; correct storage, logs or the region."
             ));
         }
     };

@@ -24,7 +24,7 @@ pub fn for_run(base: Aws, setting: &Setting) -> Aws {
     let Some(role_arn) = &setting.role_arn else {
         return base;
     };
-    let storage = &setting.run.plan.storage;
+    let storage = &setting.run.plan.storage.s3;
     let provider = WebIdentity {
         // Never the bucket's endpoint: that one is S3's alone.
         sts: base.sts(storage.region.as_deref()),
@@ -94,8 +94,8 @@ fn session_name(run: &Run) -> String {
 
 /// What is left of the role's rights: this run's objects and log streams.
 fn session_policy(run: &Run, partition: &str) -> String {
-    let bucket = format!("arn:{partition}:s3:::{}", run.plan.storage.bucket);
-    let prefix = key_prefix(&run.plan.storage, &run.plan.run_id);
+    let bucket = format!("arn:{partition}:s3:::{}", run.plan.storage.s3.bucket);
+    let prefix = key_prefix(&run.plan.storage.s3, &run.plan.run_id);
     let mut statements = vec![
         serde_json::json!({
             "Effect": "Allow",
@@ -112,11 +112,11 @@ fn session_policy(run: &Run, partition: &str) -> String {
         serde_json::json!({
             "Effect": "Allow",
             "Action": ["kms:Decrypt", "kms:GenerateDataKey"],
-            "Resource": run.plan.storage.kms_key_arn.as_deref().unwrap_or("*"),
+            "Resource": run.plan.storage.s3.kms_key_arn.as_deref().unwrap_or("*"),
             "Condition": {"StringLike": {"kms:ViaService": "s3.*"}},
         }),
     ];
-    if let Some(group) = &run.log_group {
+    if let Some(group) = run.log_group() {
         statements.push(serde_json::json!({
             "Effect": "Allow",
             "Action": ["logs:CreateLogStream", "logs:PutLogEvents", "logs:GetLogEvents"],
@@ -128,7 +128,6 @@ fn session_policy(run: &Run, partition: &str) -> String {
 
 #[cfg(test)]
 mod tests {
-    use std::collections::BTreeMap;
 
     use super::*;
     use leaderboard_evaluation::fixtures;
@@ -150,7 +149,7 @@ mod tests {
         let key = "arn:aws:kms:us-east-1:123456789012:key/0a1b";
         let mut run = fixtures::run();
         for (named, resource) in [(None, "*"), (Some(key), key)] {
-            run.plan.storage.kms_key_arn = named.map(str::to_owned);
+            run.plan.storage.s3.kms_key_arn = named.map(str::to_owned);
             let policy: serde_json::Value = serde_json::from_str(&session_policy(&run, "aws")).unwrap();
             let statement = &policy["Statement"][2];
             assert_eq!(
@@ -165,13 +164,8 @@ mod tests {
     #[test]
     fn a_log_group_adds_this_runs_streams() {
         let mut run = fixtures::run();
-        run.log_group = Some(leaderboard_api::LogGroup {
-            name: "leaderboard-20".to_owned(),
-            region: None,
-            endpoint: None,
-            retention_days: None,
-            tags: BTreeMap::new(),
-        });
+        let logs = serde_json::json!({"cloudWatch": {"name": "leaderboard-20"}});
+        run.logs = serde_json::from_value(logs).unwrap();
         let policy = session_policy(&run, partition("nonsense"));
         assert!(
             policy.contains("arn:aws:logs:*:*:log-group:leaderboard-20:log-stream:77/*"),

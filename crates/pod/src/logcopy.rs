@@ -71,7 +71,7 @@ impl From<std::io::Error> for LogcopyError {
 pub async fn main(setting: Setting, shutdown: impl Future<Output = ()>) -> Result<(), LogcopyError> {
     let aws = identity::aws(&setting, "logcopy").await;
     let plan = &setting.run.plan;
-    let archive = Archive::of_run(&aws, &plan.storage, &plan.run_id);
+    let archive = Archive::of_run(&aws, &plan.storage.s3, &plan.run_id);
     work(setting, &aws, archive, shutdown).await
 }
 
@@ -85,7 +85,7 @@ pub async fn work(
     let tree = Arc::new(Tree::open(&setting.places.logs)?);
     let results = of_plan(&setting.run.plan).results(&setting.run, Arc::clone(&tree))?;
     let plan = &setting.run.plan;
-    let quota = Quota::new(plan.storage.size_limit.bytes(), plan.workers());
+    let quota = Quota::new(plan.storage.s3.size_limit.bytes(), plan.workers());
     let uploader = Uploader::new(archive.clone(), Arc::clone(&tree), quota);
 
     let (end, ending) = shutdown::Stop::new();
@@ -119,7 +119,7 @@ fn ship(
     (tasks, told): (&Tasks, watch::Sender<Option<Logs>>),
 ) -> (watch::Sender<bool>, Option<JoinHandle<Option<()>>>) {
     let (sender, receiver) = watch::channel(false);
-    let task = setting.run.log_group.as_ref().map(|group| {
+    let task = setting.run.log_group().map(|group| {
         let plan = &setting.run.plan;
         let client = LogClient::of_group(aws, group);
         let pairs = plan.workers();

@@ -9,7 +9,6 @@ use leaderboard_contract::run::{
     ENV_POD_UID, ENV_ROLE_ARN, ENV_RUN, IDENTITY, IDENTITY_TOKEN_FILE, LOGS, PODINFO, RUNNER, RUNNER_IN_IMAGE, Run,
     SCHEMA, STATUS_FOLDER, STOP_FILE, TOOLS,
 };
-use leaderboard_contract::schema::is_read;
 use leaderboard_evaluation::judge::Pace;
 
 /// Files and folders.
@@ -90,7 +89,7 @@ pub enum SettingError {
     Malformed(#[from] serde_json::Error),
     /// Of a version that this program does not know.
     #[error(
-        "{ENV_RUN} has schema {0}, and this program reads {SCHEMA} and the one before. Operator and Pod must be of the \
+        "{ENV_RUN} has schema {0}, and this program reads {SCHEMA}. Operator and Pod must be of the \
          same version"
     )]
     Schema(u32),
@@ -113,7 +112,7 @@ impl Setting {
 
 fn read_run(json: &str) -> Result<Run, SettingError> {
     let run: Run = serde_json::from_str(json)?;
-    if !is_read(run.schema, SCHEMA) {
+    if run.schema != SCHEMA {
         return Err(SettingError::Schema(run.schema));
     }
     Ok(run)

@@ -120,7 +120,7 @@ async fn measure_and_prepare(setting: &Setting) -> Result<Option<Finding>, Works
     of_plan(&setting.run.plan).check(&setting.run)?;
     let finding = measure(setting).await?;
     let aws = identity::aws(setting, "workspace").await;
-    prepare(setting, &Archive::of_run(&aws, &plan.storage, &plan.run_id)).await?;
+    prepare(setting, &Archive::of_run(&aws, &plan.storage.s3, &plan.run_id)).await?;
     Ok(finding)
 }
 
@@ -225,8 +225,11 @@ async fn claim(run: &Run, archive: &Archive) -> Result<Claim, WorkspaceError> {
         return Ok(Claim::Fresh);
     }
     let plan = &run.plan;
-    let prefix = leaderboard_api::effective::key_prefix(&plan.storage, &plan.run_id);
-    Err(WorkspaceError::PrefixInUse(format!("{}/{prefix}", plan.storage.bucket)))
+    let prefix = leaderboard_api::effective::key_prefix(&plan.storage.s3, &plan.run_id);
+    Err(WorkspaceError::PrefixInUse(format!(
+        "{}/{prefix}",
+        plan.storage.s3.bucket
+    )))
 }
 
 /// The report of a run in which nothing has happened, and nothing but it is stored.

@@ -135,15 +135,15 @@ fn named(leaderboard: &Leaderboard) -> impl Iterator<Item = (Kind, Cow<'_, str>)
         .iter()
         .filter_map(|evalai| evalai.token.secrets_manager.as_ref());
     let entries = entry.map(|entry| (Kind::Entry, entry.id.as_str()));
-    let queues = spec.queue.iter().flat_map(|queue| {
+    let queues = spec.sqs().into_iter().flat_map(|queue| {
         let dead = queue.dead_letter_url.as_deref().map(|url| (Kind::DeadLetterQueue, url));
         [(Kind::Queue, queue.url.as_str())].into_iter().chain(dead)
     });
-    let table = spec.table.iter().map(|table| (Kind::Table, table.name.as_str()));
-    let group = spec.log_group.iter().map(|group| (Kind::LogGroup, group.name.as_str()));
+    let table = spec.dynamo_table().map(|table| (Kind::Table, table.name.as_str()));
+    let group = spec.log_group().map(|group| (Kind::LogGroup, group.name.as_str()));
     let by_name = entries.chain(queues).chain(table).chain(group);
-    let prefix = spec.storage.prefix.as_deref().unwrap_or_default();
-    let bucket = format!("{}/{prefix}", spec.storage.bucket);
+    let prefix = spec.storage.s3.prefix.as_deref().unwrap_or_default();
+    let bucket = format!("{}/{prefix}", spec.storage.s3.bucket);
     let by_name = by_name.map(|(kind, name)| (kind, Cow::Borrowed(name)));
     by_name.chain([(Kind::Bucket, Cow::Owned(bucket))])
 }

@@ -4,7 +4,7 @@ use std::fmt::{self, Debug};
 use std::sync::Arc;
 use std::time::Duration;
 
-use leaderboard_api::{LogGroup, Queue, SecretsManagerKey, Storage, Table};
+use leaderboard_api::{DynamoTable, LogGroup, S3Bucket, SecretsManagerKey, SqsQueue};
 
 /// One kind of question. Everything that makes an older answer useless is part of the question: the attempt, a digest, a stage.
 pub trait Ask: Clone + Debug + PartialEq + Send + 'static {
@@ -120,7 +120,7 @@ pub struct Service(String);
 
 impl Service {
     /// The bucket of a run.
-    pub fn bucket(storage: &Storage) -> Self {
+    pub fn bucket(storage: &S3Bucket) -> Self {
         Self::of(
             "bucket",
             storage.endpoint.as_deref(),
@@ -130,12 +130,12 @@ impl Service {
     }
 
     /// A table of rows.
-    pub fn table(table: &Table) -> Self {
+    pub fn table(table: &DynamoTable) -> Self {
         Self::of("table", table.endpoint.as_deref(), table.region.as_deref(), &table.name)
     }
 
     /// A queue, with its dead-letter queue.
-    pub fn queue(queue: &Queue) -> Self {
+    pub fn queue(queue: &SqsQueue) -> Self {
         Self::of("queue", queue.endpoint.as_deref(), queue.region.as_deref(), &queue.url)
     }
 

@@ -3,7 +3,7 @@
 use std::time::Duration;
 
 use crate::ask::{Ask, Failure, Service};
-use leaderboard_api::{Attempt, RunId, Table};
+use leaderboard_api::{Attempt, DynamoTable, RunId};
 
 /// A run of another program, as its row shows it.
 #[derive(Clone, Debug, PartialEq, Eq)]
@@ -18,7 +18,7 @@ pub struct ForeignRun {
 pub struct Row {
     /// An attempt asks anew: another program may have begun since.
     pub attempt: Attempt,
-    pub table: Table,
+    pub table: DynamoTable,
     /// Id of the team, the table's partition key.
     pub team: String,
     pub run_id: RunId,

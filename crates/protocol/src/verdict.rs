@@ -11,15 +11,13 @@ use thiserror::Error;
 
 /// No verdict is longer, in bytes. The containers of a Pod share 12 KiB of termination messages: 16 pairs leave 351 bytes each.
 pub const MAX_BYTES: usize = 340;
-/// Nothing longer is parsed: what the version before wrote at most.
-const MAX_READ_BYTES: usize = 1000;
 /// Exit code of a runner to which its node has refused what it needs, before its command ran (EX_OSERR). It counts without a verdict, too,
 /// which takes an open file. Nothing of the image has run in this life of the container, so nothing of it can have brought that about.
 pub const CODE_NODE_REFUSED: i32 = 71;
 /// The same for want of a process (EX_TEMPFAIL), which the other containers of the Pod can use up.
 pub const CODE_NO_PROCESS: i32 = 75;
-/// Version of the document. Version 1 had no number and no round.
-pub const SCHEMA: u32 = 2;
+/// Version of the document.
+pub const SCHEMA: u32 = 1;
 
 /// How the command of a container came to its end. Whether its results are complete is shown by the container's exit code
 /// (0) and by the status files.
@@ -70,7 +68,6 @@ pub struct Verdict {
     #[serde(default, skip_serializing_if = "Option::is_none")]
     pub round: Option<u32>,
     /// [`SCHEMA`].
-    #[serde(default = "first_schema")]
     pub schema: u32,
     /// The command's exit code, 0–255, if it exited.
     #[serde(default, skip_serializing_if = "Option::is_none")]
@@ -86,10 +83,6 @@ pub struct Verdict {
     pub why: String,
 }
 
-fn first_schema() -> u32 {
-    1
-}
-
 /// A termination message that is no verdict.
 #[derive(Debug, Error)]
 pub enum NotAVerdict {
@@ -97,7 +90,7 @@ pub enum NotAVerdict {
     #[error("the termination message is longer than a verdict can be ({0} bytes)")]
     TooLong(usize),
     /// Of a version that is not known here.
-    #[error("the verdict has schema {0}; this version reads up to {SCHEMA}")]
+    #[error("the verdict has schema {0}; this version reads {SCHEMA}")]
     Schema(u32),
     /// Not the JSON of a verdict.
     #[error("the termination message is no verdict: {0}")]
@@ -139,14 +132,14 @@ impl Verdict {
 
     /// Parses a container's termination message. One whose end is missing is read as far as it goes.
     pub fn parse(message: &str) -> Result<Self, NotAVerdict> {
-        if message.len() > MAX_READ_BYTES {
+        if message.len() > MAX_BYTES {
             return Err(NotAVerdict::TooLong(message.len()));
         }
         let verdict: Self = match serde_json::from_str(message) {
             Ok(verdict) => verdict,
             Err(error) => Self::of_beginning(message).ok_or(error)?,
         };
-        if verdict.schema > SCHEMA {
+        if verdict.schema != SCHEMA {
             return Err(NotAVerdict::Schema(verdict.schema));
         }
         Ok(verdict)
@@ -168,14 +161,7 @@ impl Verdict {
 mod tests {
     use super::*;
 
-    /// What each version wrote. A line stays here as long as a controller may meet it.
-    const GOLDEN: [(u32, &str); 2] = [
-        (1, r#"{"what":"peerCrashed","exitCode":null,"signal":15,"why":"w"}"#),
-        (
-            2,
-            r#"{"what":"peerCrashed","round":12,"schema":2,"signal":15,"why":"w"}"#,
-        ),
-    ];
+    const GOLDEN: &str = r#"{"what":"peerCrashed","round":12,"schema":1,"signal":15,"why":"w"}"#;
 
     fn followed() -> Verdict {
         Verdict {
@@ -185,24 +171,19 @@ mod tests {
     }
 
     #[test]
-    fn the_json_is_the_documented_one_and_the_version_before_is_read() {
-        assert_eq!(followed().to_json(), GOLDEN[1].1);
-        for (schema, json) in GOLDEN {
-            let expected = Verdict {
-                schema,
-                round: (schema > 1).then_some(12),
-                ..followed()
-            };
-            assert_eq!(Verdict::parse(json).unwrap(), expected);
-        }
+    fn the_json_is_the_documented_one() {
+        assert_eq!(followed().to_json(), GOLDEN);
+        assert_eq!(Verdict::parse(GOLDEN).unwrap(), followed());
         let out_of_memory = Verdict {
             out_of_memory: true,
             ..followed()
         };
         assert!(out_of_memory.to_json().contains(r#""outOfMemory":true"#));
         assert_eq!(Verdict::parse(&out_of_memory.to_json()).unwrap(), out_of_memory);
-        let newer = GOLDEN[1].1.replace("\"schema\":2", "\"schema\":3");
-        assert!(matches!(Verdict::parse(&newer), Err(NotAVerdict::Schema(3))));
+        for other in [0, 2] {
+            let json = GOLDEN.replace("\"schema\":1", &format!("\"schema\":{other}"));
+            assert!(matches!(Verdict::parse(&json), Err(NotAVerdict::Schema(found)) if found == other));
+        }
     }
 
     #[test]

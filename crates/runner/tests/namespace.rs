@@ -18,7 +18,7 @@ const CHAINS: usize = 30;
 /// Forks without an end, leaves every group, and writes a verdict of its own each time.
 const CHAIN: &str = r#"
 import os, sys
-forged = b'{"what":"notReady","round":0,"schema":2,"why":"forged"}'
+forged = b'{"what":"notReady","round":0,"schema":1,"why":"forged"}'
 open(sys.argv[2], 'w').close()
 while True:
     if os.fork():

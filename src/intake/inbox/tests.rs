@@ -6,30 +6,29 @@ use leaderboard_evalai::answer::Refusal;
 use leaderboard_evalai::{Hub, Options, Status};
 
 const US: &str = "ns/operator";
+const SERVER: &str = "https://e/";
 
-fn board(name: &str, second: i64, evalai: &Value) -> Arc<Leaderboard> {
+fn board(name: &str, second: i64, server: &str, queue: &Value) -> Arc<Leaderboard> {
     let created = Timestamp::from_second(second).unwrap().to_string();
     let mut board: Leaderboard = serde_json::from_value(json!({
         "apiVersion": "leaderboard.carla.org/v1alpha1", "kind": "Leaderboard",
         "metadata": {"name": name, "namespace": "ns", "uid": name, "creationTimestamp": created},
         "spec": {
-            "evalai": {"apiServer": "https://e/", "challenge": 1, "token": {"secretKeyRef": {"name": "t", "key": "k"}}},
-            "tracks": [{"name": "sensors", "codename": "SENSORS", "phase": 2}],
-            "leaderboardVersion": "V2", "contents": {"image": "c"}, "simulator": {"image": "s"}, "storage": {"bucket": "bbb"},
+            "evalai": {"apiServer": server, "challenge": 1, "token": {"secretKeyRef": {"name": "t", "key": "k"}}},
+            "tracks": [{"name": "sensors", "phase": 2}],
+            "evaluation": {"carla": {
+                "version": "V2", "contents": {"image": "c"}, "simulator": {"image": "s"},
+            }}, "storage": {"s3": {"bucket": "bbb"}},
+            "queue": queue,
         },
     }))
     .unwrap();
-    let mut spec = serde_json::to_value(&board.spec.evalai).unwrap();
-    for (key, value) in evalai.as_object().unwrap() {
-        spec[key] = value.clone();
-    }
-    board.spec.evalai = serde_json::from_value(spec).unwrap();
     board.status.get_or_insert_default().operator = Some(US.into());
     Arc::new(board)
 }
 
 fn reader(name: &str, second: i64) -> Arc<Leaderboard> {
-    board(name, second, &json!({"queue": {"name": "q"}}))
+    board(name, second, SERVER, &json!({"evalai": {"name": "q"}}))
 }
 
 fn inbox() -> Inbox {
@@ -56,13 +55,13 @@ fn the_queue_belongs_to_the_leaderboards_that_name_it_on_its_server() {
     ));
     let mut theirs = Arc::unwrap_or_clone(reader("theirs", 0));
     theirs.status.get_or_insert_default().operator = Some("other/operator".into());
-    let staging = json!({"queue": {"name": "q"}, "apiServer": "https://staging"});
+    let queue = |name: &str| json!({"evalai": {"name": name}});
     let all = [
         Arc::new(going),
         Arc::new(theirs),
-        board("without", 0, &json!({})),
-        board("another", 0, &json!({"queue": {"name": "r"}})),
-        board("staging", 0, &staging),
+        board("without", 0, SERVER, &Value::Null),
+        board("another", 0, SERVER, &queue("r")),
+        board("staging", 0, "https://staging", &queue("q")),
         reader("young", 3),
         reader("old", 2),
     ];
@@ -83,8 +82,8 @@ fn the_queue_belongs_to_the_leaderboards_that_name_it_on_its_server() {
 
 #[test]
 fn a_message_waits_as_long_as_the_most_patient_reader_allows() {
-    let patient = json!({"queue": {"name": "q", "unknownAfterSeconds": 5000}});
-    let rules = inbox().rules(&[reader("a", 1), board("patient", 2, &patient)]);
+    let patient = json!({"evalai": {"name": "q", "unknownAfterSeconds": 5000}});
+    let rules = inbox().rules(&[reader("a", 1), board("patient", 2, SERVER, &patient)]);
     assert_eq!((rules.unknown_after_ms, rules.is_common), (5_000_000, true));
 }
 

@@ -12,8 +12,10 @@ use leaderboard_policy::leaderboards::isolated::condition;
 
 fn leaderboard(network: &Value, generation: i64) -> Leaderboard {
     let spec = json!({
-        "tracks": [{"name": "sensors", "codename": "SENSORS"}], "leaderboardVersion": "V2", "contents": {"image": "c"},
-        "simulator": {"image": "s"}, "storage": {"bucket": "bucket"}, "network": network,
+        "tracks": [{"name": "sensors"}],
+        "evaluation": {"carla": {
+            "version": "V2", "contents": {"image": "c"}, "simulator": {"image": "s"},
+        }}, "storage": {"s3": {"bucket": "bucket"}}, "network": network,
     });
     let mut object = Leaderboard::new("carla", serde_json::from_value(spec).unwrap());
     object.metadata.generation = Some(generation);

@@ -198,10 +198,7 @@ fn an_attempt_that_evalai_has_asked_for_differs_from_one_that_a_person_has_begun
     let by_sweep = || Some(json!({"message": "sweep", "sent": 1, "attempt": 3, "withoutMessage": [2, 3]}));
     assert!(!of(2, by_sweep()) && !of(3, by_sweep()) && of(4, by_sweep()));
     assert!(of(2, None), "nobody but people made it");
-    assert!(
-        of(2, Some(json!({"message": "m", "sent": 1}))),
-        "an older operator noted no attempt"
-    );
+    assert!(of(2, Some(json!({"message": "m", "sent": 1}))), "no message began one");
 }
 
 #[test]

@@ -231,7 +231,7 @@ mod tests {
             let end = seen(container, reason, "disk\u{1b}[2J\r\n full\n");
             assert_eq!(end.why.as_deref(), Some(harmless), "{container}");
         }
-        let verdict = r#"{"what":"exited","exitCode":1,"signal":null,"why":"disk\u001b[2J\nfull"}"#;
+        let verdict = r#"{"what":"exited","schema":1,"exitCode":1,"signal":null,"why":"disk\u001b[2J\nfull"}"#;
         assert_eq!(seen("agent-1", "Error", verdict).verdict.unwrap().why, harmless);
         let long = seen("contents", "Error", &"x".repeat(5000)).why.unwrap();
         assert_eq!(long.chars().count(), LONGEST_MESSAGE);
@@ -239,7 +239,7 @@ mod tests {
 
     #[test]
     fn a_verdict_is_parsed_even_if_its_end_is_cut_off() {
-        let whole = r#"{"what":"exited","round":3,"schema":2,"exitCode":0,"why":"it exited"}"#;
+        let whole = r#"{"what":"exited","round":3,"schema":1,"exitCode":0,"why":"it exited"}"#;
         let verdict = seen("agent-1", "Error", whole).verdict.unwrap();
         assert_eq!(
             (verdict.what, verdict.round, verdict.exit_code),
@@ -309,7 +309,7 @@ mod tests {
     fn a_verdict_of_a_newer_workspace_is_not_guessed_at() {
         let newer = json!({"schema": 2, "reason": "OfTomorrow", "message": "Something."}).to_string();
         let end = seen("workspace", "Error", &newer);
-        let why = "the verdict of `workspace` has schema 2, and 1 and the one before are read";
+        let why = "the verdict of `workspace` has schema 2, and this operator reads 1";
         assert_eq!((end.own_reason, end.why.as_deref()), (None, Some(why)));
     }
 }

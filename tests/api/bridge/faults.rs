@@ -57,7 +57,7 @@ async fn without_a_dead_letter_queue_a_bad_message_stays_and_the_leaderboard_sho
         "{note}"
     );
     assert!(
-        note.ends_with("no Leaderboard of this queue has queue.deadLetterURL"),
+        note.ends_with("no Leaderboard of this queue has queue.sqs.deadLetterURL"),
         "{note}"
     );
     eventually("it is counted", async || bridge.count("blocked") == 1).await;

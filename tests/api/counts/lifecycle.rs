@@ -194,10 +194,9 @@ impl World {
 
     async fn make_board(&self, scenario: Scenario, period: u32) {
         let mut spec = json!({
-            "storage": {"bucket": self.bucket, "endpoint": self.s3.endpoint()},
+            "storage": {"s3": {"bucket": self.bucket, "endpoint": self.s3.endpoint()}},
             "syncPeriodSeconds": period,
-            "pairs": 1,
-            "routes": ROUTES,
+            "evaluation": {"carla": {"pairs": 1, "routes": ROUTES}},
         });
         if scenario.has_limits {
             spec["concurrency"] = json!({"total": 2, "perTeam": 1});
@@ -212,10 +211,10 @@ impl World {
                 "token": {"secretKeyRef": {"name": "evalai", "key": "token"}},
             });
             spec["agent"] = json!({"images": []});
-            spec["tracks"] = json!([{"name": "sensors", "codename": "SENSORS", "phase": 1}]);
+            spec["tracks"] = json!([{"name": "sensors", "phase": 1}]);
             let table = self.aws.name("counts");
             make_table(&self.aws, &table).await;
-            spec["table"] = json!({"name": table, "endpoint": self.table.endpoint()});
+            spec["table"] = json!({"dynamoDB": {"name": table, "endpoint": self.table.endpoint()}});
         }
         let api = Kind::Leaderboard.api(&self.client, &self.namespace);
         let board = Kind::Leaderboard.object(BOARD, &[&json!({ "spec": spec })]);

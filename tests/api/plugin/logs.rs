@@ -14,10 +14,11 @@ async fn stored() -> Terminal {
 
 async fn stored_at(storage: &Value) -> Terminal {
     let terminal = Terminal::new().await;
-    let plan = json!({"runId": "mine", "leaderboardVersion": "V2", "track": "sensors", "codename": "S",
-                      "slices": [{"first": 0, "last": 0}, {"first": 1, "last": 1}], "routes": 2, "repetitions": 1,
-                      "storage": storage, "image": "a", "contentsImage": "c",
-                      "simulatorImage": "s"});
+    let plan = json!({"runId": "mine",
+        "carla": {"version": "V2", "codename": "S", "slices": [{"first": 0, "last": 0}, {"first": 1, "last": 1}],
+            "routes": 2, "repetitions": 1, "contentsImage": "c", "simulatorImage": "s"},
+        "track": "sensors",
+                      "storage": {"s3": storage}, "image": "a"});
     let mut status = finished();
     status["plan"] = plan;
     terminal.submission("mine", &json!({}), &status).await;

@@ -134,7 +134,7 @@ async fn an_s3_without_conditions_stores_all_the_same() {
 /// What S3 has of a stored object: how it is encrypted, with which key, and its class.
 async fn kept_as(pod: &Pod, key: &str) -> (String, String, String) {
     let s3 = pod.aws.s3(None, Some(&server().await.endpoint()));
-    let bucket = &pod.setting.run.plan.storage.bucket;
+    let bucket = &pod.setting.run.plan.storage.s3.bucket;
     let head = s3
         .head_object()
         .bucket(bucket)
@@ -157,7 +157,7 @@ async fn kept_as(pod: &Pod, key: &str) -> (String, String, String) {
 async fn every_object_is_kept_as_the_leaderboard_sets() {
     const KEY: &str = "arn:aws:kms:us-east-1:000000000000:key/0a1b";
     let pod = Pod::new().await;
-    let mut storage = pod.setting.run.plan.storage.clone();
+    let mut storage = pod.setting.run.plan.storage.s3.clone();
     storage.endpoint = Some(server().await.endpoint());
     let run_id = &pod.setting.run.plan.run_id;
     pod.put("file", &vec![7; 6 * MIB]);

@@ -1,7 +1,5 @@
 //! Each line once.
 
-use std::collections::BTreeMap;
-
 use tokio::sync::watch;
 
 use super::*;
@@ -14,13 +12,7 @@ use leaderboard_contract::report::Logs;
 async fn pod_with_logs() -> (Pod, String) {
     let group = format!("group-{}", fastrand::u64(..));
     let mut pod = Pod::new().await;
-    pod.setting.run.log_group = Some(LogGroup {
-        name: group.clone(),
-        region: None,
-        endpoint: None,
-        retention_days: None,
-        tags: BTreeMap::new(),
-    });
+    pod.setting.run.logs = serde_json::from_value(serde_json::json!({"cloudWatch": {"name": group}})).unwrap();
     let logs = pod.aws.logs(None, None);
     logs.create_log_group().log_group_name(&group).send().await.unwrap();
     (pod, group)
@@ -28,7 +20,7 @@ async fn pod_with_logs() -> (Pod, String) {
 
 /// The sender of a logcopy that has just started.
 fn shipper(pod: &Pod, a_day: u64) -> ship::Shipper {
-    let client = LogClient::of_group(&pod.aws, pod.setting.run.log_group.as_ref().unwrap());
+    let client = LogClient::of_group(&pod.aws, pod.setting.run.log_group().unwrap());
     let tree = Arc::new(Tree::open(pod.logs()).unwrap());
     let memory = pod.uploader().memory().clone();
     ship::Shipper::new(client, tree, &"77".parse().unwrap(), 2, &memory, a_day)
@@ -114,7 +106,7 @@ async fn what_cloudwatch_throttles_is_sent_later_and_the_end_waits_for_it() {
     let (mut pod, group) = pod_with_logs().await;
     let logs = pod.aws.logs(None, None);
     let throttle = Throttle::start(&server().await.endpoint(), "ThrottlingException").await;
-    pod.setting.run.log_group.as_mut().unwrap().endpoint = Some(throttle.endpoint().to_owned());
+    pod.setting.run.logs.as_mut().unwrap().cloud_watch.endpoint = Some(throttle.endpoint().to_owned());
     pod.append("agent/agent1/leaderboard.log", b"one\n");
     pod.append("agent/agent2/leaderboard.log", b"of another\n");
     let mut shipper = shipper(&pod, ship::STREAM_A_DAY);
@@ -140,7 +132,7 @@ async fn what_cloudwatch_throttles_is_sent_later_and_the_end_waits_for_it() {
 async fn what_becomes_of_the_lines_is_known() {
     let (mut pod, group) = pod_with_logs().await;
     for (name, sent) in [(group, true), ("no-such-group".to_owned(), false)] {
-        pod.setting.run.log_group.as_mut().unwrap().name = name;
+        pod.setting.run.logs.as_mut().unwrap().cloud_watch.name = name;
         // Without a new line nothing is sent, and nothing is known.
         pod.append("agent/agent1/leaderboard.log", b"one\n");
         let (done, is_over) = watch::channel(false);
@@ -164,7 +156,7 @@ async fn what_is_stored_and_was_refused_until_a_restart_is_sent_after_it() {
     let (mut pod, group) = pod_with_logs().await;
     let log = "agent/agent1/leaderboard.log";
     pod.append(log, b"one\n");
-    pod.setting.run.log_group.as_mut().unwrap().name = "no-such-group".to_owned();
+    pod.setting.run.logs.as_mut().unwrap().cloud_watch.name = "no-such-group".to_owned();
     let (_sender, is_over) = watch::channel(true);
     let (told, _) = watch::channel(None);
     let refused = shipper(&pod, ship::STREAM_A_DAY);
@@ -173,7 +165,14 @@ async fn what_is_stored_and_was_refused_until_a_restart_is_sent_after_it() {
     let wanted = [Wanted::new(log, stamp, Haste::Now)];
     let stored = pod.uploader().sync(&wanted, Window::default()).await.unwrap();
     assert_eq!(stored.objects, 1);
-    pod.setting.run.log_group.as_mut().unwrap().name.clone_from(&group);
+    pod.setting
+        .run
+        .logs
+        .as_mut()
+        .unwrap()
+        .cloud_watch
+        .name
+        .clone_from(&group);
     shipper(&pod, ship::STREAM_A_DAY).pass(true).await.unwrap();
     let logs = pod.aws.logs(None, None);
     assert_eq!(all(&logs, &group, "77/agent-1").await, ["one"]);

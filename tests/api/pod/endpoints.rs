@@ -11,14 +11,9 @@ use super::*;
 async fn objects_and_lines_go_where_the_leaderboard_sends_them() {
     let (mut pod, elsewhere) = (Pod::new().await, Elsewhere::start().await);
     let (endpoint, group) = (server().await.endpoint(), format!("group-{}", fastrand::u64(..)));
-    pod.setting.run.plan.storage.endpoint = Some(endpoint.clone());
-    pod.setting.run.log_group = Some(LogGroup {
-        name: group.clone(),
-        region: None,
-        endpoint: Some(endpoint.clone()),
-        retention_days: None,
-        tags: std::collections::BTreeMap::new(),
-    });
+    pod.setting.run.plan.storage.s3.endpoint = Some(endpoint.clone());
+    let logs = serde_json::json!({"cloudWatch": {"name": group, "endpoint": endpoint}});
+    pod.setting.run.logs = serde_json::from_value(logs).unwrap();
     let logs = pod.aws.logs(None, Some(&endpoint));
     logs.create_log_group().log_group_name(&group).send().await.unwrap();
 

@@ -83,7 +83,7 @@ async fn whatever_is_in_the_place_of_a_checkpoint_the_last_good_one_stays_and_th
 #[tokio::test]
 async fn a_status_file_with_content_is_stored_empty_and_holds_nothing_up() {
     let mut pod = Pod::new().await;
-    pod.setting.run.plan.storage.size_limit = "16Mi".parse().unwrap();
+    pod.setting.run.plan.storage.s3.size_limit = "16Mi".parse().unwrap();
     pod.prepare().await.unwrap();
     pod.append("agent/agent1/leaderboard.log", b"a line\n");
     let content = noise(MIB, 1);

@@ -12,7 +12,7 @@ const AGENT_FILES: usize = 128;
 /// A Pod whose run may store 1 MiB.
 async fn small_pod() -> Pod {
     let mut pod = Pod::new().await;
-    pod.setting.run.plan.storage.size_limit = "1Mi".parse().unwrap();
+    pod.setting.run.plan.storage.s3.size_limit = "1Mi".parse().unwrap();
     pod
 }
 

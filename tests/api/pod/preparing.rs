@@ -196,7 +196,7 @@ async fn a_resume_takes_up_the_checkpoints_of_the_newest_pipelines_workers() {
 #[tokio::test]
 async fn a_failure_is_written_to_the_termination_log() {
     let mut pod = Pod::new().await;
-    pod.setting.run.plan.slices = vec![RouteSlice { first: 0, last: 1 }, RouteSlice { first: 1, last: 2 }];
+    pod.setting.run.plan.carla.slices = vec![RouteSlice { first: 0, last: 1 }, RouteSlice { first: 1, last: 2 }];
     // It never asks S3, so that no credentials are needed.
     workspace::main(pod.setting.clone()).await.unwrap_err();
     let said = fs::read_to_string(&pod.setting.places.termination_log).unwrap();
@@ -265,7 +265,7 @@ async fn connections_that_are_cut_in_mid_transfer_are_made_anew() {
     lost.prepare().await.unwrap();
     let log = "agent/agent1/leaderboard.log";
     lost.archive.put(log, noise(6 * MIB, 3)).await.unwrap();
-    let bucket = lost.setting.run.plan.storage.bucket.clone();
+    let bucket = lost.setting.run.plan.storage.s3.bucket.clone();
     let mut next = Pod::on(&cutting(3).await, &bucket, lost.setting.run.clone()).await;
     "pod-2".clone_into(&mut next.setting.pod_uid);
     next.prepare().await.unwrap();

@@ -10,7 +10,7 @@ async fn a_role_is_assumed_with_the_projected_token() {
     let aws = identity::for_run(pod.aws.clone(), &pod.setting);
     let archive = Archive::new(
         aws.s3(None, Some(&server().await.endpoint())),
-        &pod.setting.run.plan.storage.bucket,
+        &pod.setting.run.plan.storage.s3.bucket,
         "runs/77/",
     );
     archive.put("x", b"y".to_vec()).await.unwrap();

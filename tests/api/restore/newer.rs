@@ -82,11 +82,11 @@ async fn runs_that_are_newer_than_the_backup_go_on_from_their_rows() {
     for table in &tables {
         make_table(&world.aws, table).await;
     }
-    let spec = |table: &str| json!({"routes": ROUTES, "table": {"name": table, "endpoint": world.aws.endpoint}});
+    let spec = |table: &str| json!({"evaluation": {"carla": {"routes": ROUTES}}, "table": {"dynamoDB": {"name": table, "endpoint": world.aws.endpoint}}});
     world.leaderboard_with("lb", 1, "Hosts", &spec(&tables[0])).await;
     let mut local = spec(&tables[1]);
     local["evalai"] = Value::Null;
-    local["tracks"] = json!([{"name": "sensors", "codename": "SENSORS"}]);
+    local["tracks"] = json!([{"name": "sensors"}]);
     world.leaderboard_with("local", 1, "Hosts", &local).await;
     let controller = world.controller();
     let (pk, name) = world.submit("lb", 1).await;

@@ -77,8 +77,13 @@ fn claims() -> Vec<Case> {
 
 fn resources() -> Vec<Case> {
     let given = gpu(&json!({"resourceName": GPU}));
-    let of = |side: &str, list: &str| json!({ side: {"resources": {list: {GPU: "1"}}} });
-    let of_track = |side: &str| one_track(&of(side, "limits"));
+    let requests = |list: &str| json!({"resources": {list: {GPU: "1"}}});
+    let of = |side: &str, list: &str| match side {
+        "simulator" => json!({"evaluation": {"carla": {"simulator": requests(list)}}}),
+        side => json!({ side: requests(list) }),
+    };
+    let of_simulator = one_track(&json!({"carla": {"simulator": requests("limits")}}));
+    let of_agent = one_track(&json!({"agent": requests("limits")}));
     let none = |side: &str| {
         let mut spec = of(side, "limits");
         spec["gpu"] = json!({"mode": "None"});
@@ -87,41 +92,45 @@ fn resources() -> Vec<Case> {
     let missing = json!({"gpu": null});
     vec![
         case(
-            "simulator.resources names gpu.resourceName",
+            "carla.simulator.resources names gpu.resourceName",
             &given,
             &of("simulator", "limits"),
         ),
         case(
-            "simulator.resources names gpu.resourceName",
+            "carla.simulator.resources names gpu.resourceName",
             &given,
             &of("simulator", "requests"),
         ),
         case("agent.resources names gpu.resourceName", &given, &of("agent", "limits")),
-        case("the simulator.resources of a track", &given, &of_track("simulator")),
-        case("the agent.resources of a track", &given, &of_track("agent")),
-        case("simulator.resources names nvidia.com/gpu", &none("simulator"), &missing),
+        case("the carla.simulator.resources of a track", &given, &of_simulator),
+        case("the agent.resources of a track", &given, &of_agent),
+        case(
+            "carla.simulator.resources names nvidia.com/gpu",
+            &none("simulator"),
+            &missing,
+        ),
         case("agent.resources names nvidia.com/gpu", &none("agent"), &missing),
     ]
 }
 
 fn screens() -> Vec<Case> {
-    let simulator = |simulator: Value| json!({ "simulator": simulator });
+    let simulator = |simulator: Value| json!({ "evaluation": {"carla": {"simulator": simulator}} });
     let numbered = simulator(json!({"graphicsAdapter": 1}));
     vec![
         case(
-            "simulator.x11 is for simulator.display X11Socket",
+            "carla.simulator.x11 is for",
             &simulator(json!({"display": "X11Socket", "x11": {"display": ":1"}})),
             &simulator(json!({"display": "Offscreen"})),
         ),
         case(
-            "simulator.graphicsAdapter is a flag of the default command",
+            "carla.simulator.graphicsAdapter is a flag of the default command",
             &numbered,
             &simulator(json!({"command": ["server"]})),
         ),
         case(
-            "simulator.graphicsAdapter is for V2",
+            "carla.simulator.graphicsAdapter is for V2",
             &numbered,
-            &json!({"leaderboardVersion": "V1"}),
+            &json!({"evaluation": {"carla": {"version": "V1"}}}),
         ),
     ]
 }

@@ -19,12 +19,11 @@ pub(super) async fn make_board(
             "apiServer": evalai.url(), "challenge": 1, "requestsPerMinute": size.requests_per_minute,
             "token": {"secretKeyRef": {"name": "evalai", "key": "token"}},
         },
-        "tracks": [{"name": "sensors", "codename": "SENSORS", "phase": 1}],
+        "tracks": [{"name": "sensors", "phase": 1}],
         "agent": {"images": []},
-        "storage": {"bucket": bucket, "endpoint": endpoint},
+        "storage": {"s3": {"bucket": bucket, "endpoint": endpoint}},
         "syncPeriodSeconds": size.period_seconds,
-        "pairs": 1,
-        "routes": ROUTES,
+        "evaluation": {"carla": {"pairs": 1, "routes": ROUTES}},
     }});
     let api = Kind::Leaderboard.api(client, namespace);
     create(&api, Kind::Leaderboard.object(BOARD, &[&spec]), false)

@@ -47,7 +47,7 @@ async fn uses_up(id: &str) {
                 json!({"agent": {"env": [{"name": "ROUTE_MS", "value": ROUTE_MS}]}}),
             )
             .await;
-        let hostile = json!({"pairs": 1, "routes": 2, "agent": {"env": [{"name": VARIABLE, "value": limit.id}]}});
+        let hostile = json!({"evaluation": {"carla": {"pairs": 1, "routes": 2}}, "agent": {"env": [{"name": VARIABLE, "value": limit.id}]}});
         scene.leaderboard("hostile", hostile).await;
         scene.submit("neighbor", "agent:standard").await;
         scene.running("neighbor", LIMIT).await;

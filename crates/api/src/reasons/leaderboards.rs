@@ -35,7 +35,7 @@ reasons! {
             "Remove the phase from one of them.";
         PREFIX_CONFLICT = "PrefixConflict",
             "An older Leaderboard of another namespace or another EvalAI server has the same bucket and prefix.",
-            "Make one of them anew with another `storage.prefix`.";
+            "Make one of them anew with another `storage.s3.prefix`.";
         LABELS_DIFFER = "LabelsDiffer",
             "The challenge's phases, splits or metric labels are not those of the Leaderboard.",
             "Compare `evalai.challenge`, `evalai.split` and the tracks' phases with the challenge; the message names the difference.";
@@ -48,11 +48,11 @@ reasons! {
         QUEUE_UNREACHABLE = "QueueUnreachable",
             "The queue does not answer or does not exist. With `Unknown` also: the controller lacks the right \
              `sqs:GetQueueAttributes`. Of a queue in EvalAI: it refuses to let this token read it, or has not for five minutes.",
-            "As the message asks: create the queue, or correct `queue` or the controller's rights; or correct `evalai.queue`.";
+            "As the message asks: create the queue, or correct `queue` or the controller's rights; or correct `queue.evalai`.";
         DEAD_LETTER_QUEUE_UNREACHABLE = "DeadLetterQueueUnreachable",
             "The dead-letter queue does not answer or does not exist. With `Unknown` also: the controller lacks the right \
              `sqs:GetQueueAttributes`.",
-            "As the message asks: create the queue, or correct `queue.deadLetterURL` or the controller's rights.";
+            "As the message asks: create the queue, or correct `queue.sqs.deadLetterURL` or the controller's rights.";
         INVALID_POD = "InvalidPod",
             "The Pods cannot be made: the API server refuses them, `spec.podOverrides` says what it may not, `resources` and `gpu` \
              contradict each other, or a PriorityClass does not exist or preempts.",
@@ -67,7 +67,7 @@ reasons! {
             "As the message asks. The operator retries every 15 s.";
         QUEUE_BLOCKED = "QueueBlocked",
             "Messages that no Leaderboard serves stay in the queue, because there is no dead-letter queue.",
-            "Set `queue.deadLetterURL`.";
+            "Set `queue.sqs.deadLetterURL`.";
         IN_USE = "InUse",
             "The Leaderboard is being deleted and waits for submissions that are live or unpublished (condition `Terminating`).",
             "Wait, or cancel these submissions.";

@@ -289,7 +289,7 @@ reasons! {
     CloudWatch {
         LOGS_REFUSED = "LogsRefused",
             "CloudWatch refuses the lines of the run. Results do not depend on it, and the logs are in S3.",
-            "Check that `logGroup` of the Leaderboard exists (`logGroup.retentionDays` has the controller make it) and that the Pods' role has \
+            "Check that `logs.cloudWatch` of the Leaderboard exists (`logs.cloudWatch.retentionDays` has the controller make it) and that the Pods' role has \
              logs:CreateLogStream, logs:PutLogEvents and logs:GetLogEvents for it; on a cluster that enforces policies also that \
              `network.egress` names CloudWatch's endpoint.";
         LOGS_SENT = "LogsSent",
@@ -323,7 +323,7 @@ reasons! {
              names the cause.",
             "Look at the message in the dead-letter queue: its attributes `reason` and `detail` name the cause.";
         MESSAGE_DROPPED = "MessageDropped",
-            "Event of a Leaderboard: a message of its queue in EvalAI (`evalai.queue`) cannot be used and was deleted there. The event \
+            "Event of a Leaderboard: a message of its queue in EvalAI (`queue.evalai`) cannot be used and was deleted there. The event \
              and the controller's log have the cause and the message. Its submission stays in EvalAI, and starts later if EvalAI \
              shows it as `submitted` and a Leaderboard serves its phase by then.",
             "As the cause asks. To start a submission after all, re-run it in EvalAI.";

@@ -68,16 +68,18 @@ impl Cause {
                 "Give the identity s3:GetObject, s3:PutObject, s3:DeleteObject, s3:AbortMultipartUpload and \
                  s3:ListBucket for the prefix."
             }
-            Self::NoBucket => "Create the bucket, or correct storage.bucket and storage.region of the leaderboard.",
+            Self::NoBucket => {
+                "Create the bucket, or correct storage.s3.bucket and storage.s3.region of the leaderboard."
+            }
             Self::Changed => "Let nobody else write below this prefix.",
             Self::TooLarge(_) => "Look at the object: nothing of ours is that large.",
-            Self::Away(_) => "It is tried again; check storage.endpoint and the network rules if this stays.",
+            Self::Away(_) => "It is tried again; check storage.s3.endpoint and the network rules if this stays.",
             Self::Unknown(_) => {
                 "If it is for a checksum (CRC32), set AWS_REQUEST_CHECKSUM_CALCULATION=when_required in controller.extraEnv of the chart: \
                  the controller and its Pods then send none."
             }
             Self::Refused(_) => {
-                "Check storage.bucket, storage.region and storage.endpoint of the leaderboard; docs/storage.md has the stores that refuse \
+                "Check storage.s3.bucket, storage.s3.region and storage.s3.endpoint of the leaderboard; docs/storage.md has the stores that refuse \
                  checksums."
             }
             Self::Slow => "It is tried again later.",

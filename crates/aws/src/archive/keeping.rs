@@ -4,7 +4,7 @@ use aws_sdk_s3::operation::create_multipart_upload::builders::CreateMultipartUpl
 use aws_sdk_s3::operation::put_object::builders::PutObjectFluentBuilder;
 use aws_sdk_s3::types::{ServerSideEncryption, StorageClass};
 
-use leaderboard_api::Storage;
+use leaderboard_api::S3Bucket;
 
 /// Nothing is asked for by default: the bucket decides.
 #[derive(Clone, Debug, Default)]
@@ -14,7 +14,7 @@ pub(super) struct Keeping {
 }
 
 impl Keeping {
-    pub(super) fn of(storage: &Storage) -> Self {
+    pub(super) fn of(storage: &S3Bucket) -> Self {
         Self {
             kms_key: storage.kms_key_arn.clone(),
             class: storage.storage_class.map(|class| class.as_str().into()),

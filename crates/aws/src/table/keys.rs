@@ -131,7 +131,7 @@ mod tests {
         let other = read("t", Some(&table), Some(("team-id".into(), "submission-id".into()))).unwrap_err();
         assert_eq!(
             other.to_string(),
-            "table t has the keys team_id and submission_id but table.partitionKey and table.sortKey are team-id and submission-id; leave both out"
+            "table t has the keys team_id and submission_id but table.dynamoDB.partitionKey and table.dynamoDB.sortKey are team-id and submission-id; leave both out"
         );
     }
 }

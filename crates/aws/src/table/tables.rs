@@ -10,7 +10,7 @@ use leaderboard_base::lock::lock;
 /// Reads and writes rows of any table.
 pub struct Tables {
     aws: Aws,
-    known: Mutex<Vec<(api::Table, Table)>>,
+    known: Mutex<Vec<(api::DynamoTable, Table)>>,
 }
 
 impl Tables {
@@ -22,19 +22,24 @@ impl Tables {
     }
 
     /// Writes a row, unless the table holds a later one. Safe twice.
-    pub async fn write(&self, table: &api::Table, row: &Row) -> Result<Written, TableError> {
+    pub async fn write(&self, table: &api::DynamoTable, row: &Row) -> Result<Written, TableError> {
         let written = self.described(table).await?.write(row).await;
         self.noted(table, written)
     }
 
     /// The row of a submission; none if there is none.
-    pub async fn read(&self, table: &api::Table, team: &str, run_id: &str) -> Result<Option<ObservedRow>, TableError> {
+    pub async fn read(
+        &self,
+        table: &api::DynamoTable,
+        team: &str,
+        run_id: &str,
+    ) -> Result<Option<ObservedRow>, TableError> {
         let read = self.described(table).await?.read(team, run_id).await;
         self.noted(table, read)
     }
 
-    async fn described(&self, table: &api::Table) -> Result<Table, TableError> {
-        let is_known = |(known, _): &&(api::Table, Table)| known == table;
+    async fn described(&self, table: &api::DynamoTable) -> Result<Table, TableError> {
+        let is_known = |(known, _): &&(api::DynamoTable, Table)| known == table;
         let found = lock(&self.known).iter().find(is_known).cloned();
         if let Some((_, described)) = found {
             return Ok(described);
@@ -45,7 +50,7 @@ impl Tables {
     }
 
     /// A table that refuses may have been made again with other keys.
-    fn noted<T>(&self, table: &api::Table, answer: Result<T, TableError>) -> Result<T, TableError> {
+    fn noted<T>(&self, table: &api::DynamoTable, answer: Result<T, TableError>) -> Result<T, TableError> {
         if matches!(answer, Err(TableError::Missing { .. } | TableError::Refused { .. })) {
             lock(&self.known).retain(|(known, _)| known != table);
         }

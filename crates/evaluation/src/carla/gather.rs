@@ -32,7 +32,7 @@ impl From<Refusal> for Refused {
 
 /// The plan of the results, from the plan of the run.
 pub fn results_plan(run: &Run) -> Result<Plan, Refusal> {
-    let slices = run.plan.slices.iter();
+    let slices = run.plan.carla.slices.iter();
     let pairs: Vec<Slice> = slices
         .map(|slice| Slice {
             first: slice.first,
@@ -40,11 +40,11 @@ pub fn results_plan(run: &Run) -> Result<Plan, Refusal> {
         })
         .collect();
     let plan = Plan {
-        format: results_format(run.plan.leaderboard_version),
+        format: results_format(run.plan.carla.version),
         strictness: Strictness::Pod,
         routes: pairs.iter().map(|slice| slice.routes()).fold(0, u32::saturating_add),
         pairs,
-        repetitions: u32::try_from(run.plan.repetitions).unwrap_or(0),
+        repetitions: u32::try_from(run.plan.carla.repetitions).unwrap_or(0),
         verify: match run.verify {
             Verify::Disabled => leaderboard_results::Verify::Disabled,
             Verify::Warn => leaderboard_results::Verify::Warn,

@@ -68,10 +68,10 @@ fn port(pair: Pair) -> usize {
 
 /// The container with the private contents.
 pub(super) fn contents(asked: &Asked<'_>) -> Contents {
-    let spec = &asked.spec.contents;
+    let spec = &asked.spec.evaluation.carla.contents;
     let host = commands::of_host(spec.command.as_deref(), spec.args.as_deref());
     Contents {
-        image: asked.plan.contents_image.to_string(),
+        image: asked.plan.carla.contents_image.to_string(),
         command: host.unwrap_or_else(commands::contents),
     }
 }
@@ -85,8 +85,8 @@ pub(super) fn workload(asked: &Asked<'_>, pair: Pair) -> Workload {
 }
 
 fn simulator(asked: &Asked<'_>, pair: Pair) -> Role {
-    let (spec, deadlines) = (&asked.spec.simulator, &asked.deadlines);
-    let version = asked.plan.leaderboard_version;
+    let (spec, deadlines) = (&asked.spec.evaluation.carla.simulator, &asked.deadlines);
+    let version = asked.plan.carla.version;
     let flags = vec![
         format!("--port={}", port(pair)),
         seconds("ready", deadlines.ready_seconds),
@@ -101,7 +101,7 @@ fn simulator(asked: &Asked<'_>, pair: Pair) -> Role {
     };
     let port = ("CARLA_PORT", port(pair).to_string());
     Role {
-        image: asked.plan.simulator_image.to_string(),
+        image: asked.plan.carla.simulator_image.to_string(),
         flags,
         command: commands::of_host(spec.command.as_deref(), spec.args.as_deref())
             .unwrap_or_else(|| commands::simulator(version, adapter(spec, asked.has_gpus))),
@@ -141,7 +141,7 @@ fn agent(asked: &Asked<'_>, pair: Pair) -> Role {
         format!("--route-runs={}", route_runs(asked, pair)),
     ];
     let host = commands::of_host(spec.command.as_deref(), spec.args.as_deref());
-    let words = host.unwrap_or_else(|| commands::agent(asked.plan.leaderboard_version));
+    let words = host.unwrap_or_else(|| commands::agent(asked.plan.carla.version));
     let own = Mount::Own {
         folder: agent_folder(pair),
         path: AGENT,
@@ -160,8 +160,8 @@ fn agent(asked: &Asked<'_>, pair: Pair) -> Role {
 
 /// How many route runs the pair's evaluator is to drive; 0 if there were no slice for it.
 fn route_runs(asked: &Asked<'_>, pair: Pair) -> u32 {
-    let slice = asked.plan.slices.get(pair.index());
-    let repetitions = u32::try_from(asked.plan.repetitions).unwrap_or(0);
+    let slice = asked.plan.carla.slices.get(pair.index());
+    let repetitions = u32::try_from(asked.plan.carla.repetitions).unwrap_or(0);
     slice.map_or(0, |slice| slice.routes().saturating_mul(repetitions))
 }
 
@@ -174,20 +174,20 @@ fn seconds(what: &str, value: i64) -> String {
 fn agent_env(asked: &Asked<'_>, pair: Pair) -> Vec<(&'static str, String)> {
     let (plan, track) = (asked.plan, asked.track);
     let routes = track
-        .and_then(|track| track.routes_file.as_deref())
+        .and_then(|track| track.carla.routes_file.as_deref())
         .unwrap_or(ROUTES_FILE);
     let scenarios = track
-        .and_then(|track| track.scenarios_file.as_deref())
+        .and_then(|track| track.carla.scenarios_file.as_deref())
         .unwrap_or(SCENARIOS_FILE);
-    let slice = plan.slices.get(pair.index());
+    let slice = plan.carla.slices.get(pair.index());
     let resume = if asked.resume { "1" } else { "" };
     vec![
         ("CARLA_PORT", port(pair).to_string()),
         ("CARLA_TM_PORT", (port(pair) + 10).to_string()),
-        ("CHALLENGE_TRACK_CODENAME", plan.codename.to_string()),
+        ("CHALLENGE_TRACK_CODENAME", plan.carla.codename.to_string()),
         ("ROUTES", routes.to_owned()),
         ("ROUTES_SUBSET", slice.map(ToString::to_string).unwrap_or_default()),
-        ("REPETITIONS", plan.repetitions.to_string()),
+        ("REPETITIONS", plan.carla.repetitions.to_string()),
         ("RESUME", resume.to_owned()),
         ("CHECKPOINT_ENDPOINT", CHECKPOINT.to_owned()),
         ("RECORD_PATH", SAVED.to_owned()),
@@ -195,7 +195,7 @@ fn agent_env(asked: &Asked<'_>, pair: Pair) -> Vec<(&'static str, String)> {
         ("CARLA_ROOT", CARLA_ROOT.to_owned()),
         ("SCENARIO_RUNNER_ROOT", SCENARIO_RUNNER_ROOT.to_owned()),
         ("LEADERBOARD_ROOT", LEADERBOARD_ROOT.to_owned()),
-        match plan.leaderboard_version {
+        match plan.carla.version {
             LeaderboardVersion::V1 => ("SCENARIOS", scenarios.to_owned()),
             // The original's file lies in the contents, which are read-only here.
             LeaderboardVersion::V2 => ("DEBUG_CHECKPOINT_ENDPOINT", LIVE_RESULTS.to_owned()),

@@ -52,7 +52,7 @@ fn a_complete_run_stays_complete_when_all_its_evaluators_are_started_once_more()
 #[test]
 fn one_pair_whose_evaluator_died_before_its_global_record_stays_complete() {
     let mut run = run();
-    run.plan.slices = vec![RouteSlice { first: 0, last: 1 }];
+    run.plan.carla.slices = vec![RouteSlice { first: 0, last: 1 }];
     let mut volume = Volume::new();
     let tree = Arc::new(Tree::open(volume.folder.path()).unwrap());
     volume.gatherer = Gatherer::new(&run, tree).unwrap();
@@ -78,7 +78,7 @@ fn one_pair_whose_evaluator_died_before_its_global_record_stays_complete() {
 /// A logcopy that reads the files of one pair, one after the other.
 fn read_in_turn(last_route: u32, files: &[String]) -> Gathered {
     let mut run = run();
-    run.plan.slices = vec![RouteSlice {
+    run.plan.carla.slices = vec![RouteSlice {
         first: 0,
         last: last_route,
     }];

@@ -329,7 +329,7 @@ pub(super) mod seen_on_a_volume {
     fn the_checkpoints_of_all_pairs_share_one_bound() {
         for pairs in [1_u32, 4, 16] {
             let mut run = run();
-            run.plan.slices = (0..pairs)
+            run.plan.carla.slices = (0..pairs)
                 .map(|pair| RouteSlice {
                     first: pair,
                     last: pair,
@@ -440,8 +440,8 @@ pub(super) mod seen_on_a_volume {
         let slice = |first, last| RouteSlice { first, last };
         for slices in [vec![], vec![slice(0, 2), slice(2, 3)], vec![slice(3, 0)]] {
             let mut run = run();
-            run.plan.slices = slices;
-            assert!(results_plan(&run).is_err(), "{:?}", run.plan.slices);
+            run.plan.carla.slices = slices;
+            assert!(results_plan(&run).is_err(), "{:?}", run.plan.carla.slices);
         }
     }
 }

@@ -150,15 +150,15 @@ fn leaderboard(pipeline: &Pipeline, board: &Board, options: &Options) -> String 
 
 fn track(board: &Board, track: &Track) -> String {
     let scenarios = board.original.scenarios_file;
-    let scenarios = scenarios.map(|file| format!("\n    scenariosFile: {file}"));
+    let scenarios = scenarios.map(|file| format!("\n      scenariosFile: {file}"));
     format!(
-        "  - name: {}\n    codename: {}\n    phase: {}\n    nodeSelector:\n      node.kubernetes.io/instance-type: g5.12xlarge\n    \
-         tolerations:\n    - key: nvidia.com/gpu\n      operator: Exists\n      effect: NoSchedule\n    \
-         routesFile: /workspace/leaderboard/data/routes_testing.xml{}",
+        "  - name: {}\n    carla:\n      codename: {}\n      routesFile: /workspace/leaderboard/data/routes_testing.xml{}\n    phase: {}\n    \
+         nodeSelector:\n      node.kubernetes.io/instance-type: g5.12xlarge\n    \
+         tolerations:\n    - key: nvidia.com/gpu\n      operator: Exists\n      effect: NoSchedule",
         quoted(&board.track_name(track)),
         quoted(&track.codename),
-        track.phase,
         scenarios.unwrap_or_default(),
+        track.phase,
     )
 }
 
@@ -167,13 +167,12 @@ fn log_group(board: &Board) -> String {
         Some(name) => format!(
             "  # To decide: does a program on these nodes collect what containers print (FluentD, Fluent Bit, the CloudWatch agent)?\n  \
              # Then each line is stored twice: docs/migrate.md, Logs twice.\n  \
-             logGroup:\n    name: {}\n    region: {}",
+             logs:\n    cloudWatch:\n      name: {}\n      region: {}",
             quoted(name),
             quoted(&board.place.region)
         ),
-        None => {
-            "  # To decide: logGroup, a group of CloudWatch Logs; the entry has no cloudwatch_log_group.".to_owned()
-        }
+        None => "  # To decide: logs.cloudWatch, a group of CloudWatch Logs; the entry has no cloudwatch_log_group."
+            .to_owned(),
     }
 }
 

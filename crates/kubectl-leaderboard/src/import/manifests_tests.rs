@@ -61,22 +61,31 @@ fn both_leaderboards_run_what_the_original_ran() {
         .iter()
         .zip([(LeaderboardVersion::V1, 5), (LeaderboardVersion::V2, 1)])
     {
-        assert_eq!(spec.leaderboard_version, version);
+        assert_eq!(spec.evaluation.carla.version, version);
         assert_eq!(spec.deadlines.run_seconds, None);
         let evalai = spec.evalai.as_ref().unwrap();
         assert_eq!((evalai.challenge, evalai.requests_per_minute), (2098, 54));
         let token = evalai.token.secrets_manager.as_ref().unwrap();
         assert_eq!((token.id.as_str(), token.key.as_str()), ("evalai", "auth_token"));
         assert_eq!(token.region.as_deref(), Some("us-west-2"));
-        let queue = spec.queue.as_ref().unwrap();
+        let queue = spec.sqs().unwrap();
         assert_eq!((queue.url.as_str(), queue.region.as_deref()), (URL, Some("us-west-2")));
-        let scenarios = spec.tracks.iter().all(|track| track.scenarios_file.is_some());
+        let scenarios = spec.tracks.iter().all(|track| track.carla.scenarios_file.is_some());
         assert_eq!(scenarios, version == LeaderboardVersion::V1);
-        assert_eq!(spec.simulator.security_context.as_ref().unwrap().privileged, Some(true));
+        assert_eq!(
+            spec.evaluation
+                .carla
+                .simulator
+                .security_context
+                .as_ref()
+                .unwrap()
+                .privileged,
+            Some(true)
+        );
         let gpu = spec.gpu.as_ref().unwrap();
         assert_eq!(gpu.mode, Some(GpuMode::NodeIndex));
         assert_eq!(gpu.resource_name.as_deref(), Some("nvidia.com/gpu"));
-        let is_on_screen = spec.simulator.display == Display::X11Socket;
+        let is_on_screen = spec.evaluation.carla.simulator.display == Display::X11Socket;
         assert_eq!(is_on_screen, version == LeaderboardVersion::V2);
         for track in &spec.tracks {
             let shape = effective::shape(spec, track);
@@ -97,10 +106,10 @@ fn an_entry_without_a_log_group_leaves_a_comment() {
     twenty.as_object_mut().unwrap().remove("cloudwatch_log_group");
     let text = printed(&all);
     assert!(
-        text.contains("  # To decide: logGroup, a group of CloudWatch Logs;"),
+        text.contains("  # To decide: logs.cloudWatch, a group of CloudWatch Logs;"),
         "{text}"
     );
-    let groups: Vec<_> = specs(&text).iter().map(|spec| spec.log_group.is_some()).collect();
+    let groups: Vec<_> = specs(&text).iter().map(|spec| spec.logs.is_some()).collect();
     assert_eq!(groups, [true, false]);
     assert!(text.contains("#     logGroups: [\"leaderboard-10\"]\n"), "{text}");
 }
@@ -114,7 +123,7 @@ fn two_phases_of_one_track_have_names_of_their_own() {
         let tracks = specs(&printed(&all)).remove(0).tracks;
         tracks
             .into_iter()
-            .map(|track| (track.name, track.codename))
+            .map(|track| (track.name, track.carla.codename.unwrap()))
             .collect::<Vec<_>>()
     };
     let all = |names: &[(&str, &str)]| -> Vec<(String, String)> {
@@ -183,7 +192,10 @@ fn a_text_of_an_entry_is_one_value_and_stays_a_text_for_kubectl_too() {
         let yaml = printed(&all);
         let spec = specs(&yaml).remove(0);
         assert_eq!(
-            (spec.storage.bucket.as_str(), spec.table.unwrap().name.as_str()),
+            (
+                spec.storage.s3.bucket.as_str(),
+                spec.table.unwrap().dynamo_db.name.as_str()
+            ),
             (text, text),
             "{yaml}"
         );

@@ -21,8 +21,10 @@ fn leaderboard(image: &Value, conditions: &[Value]) -> Leaderboard {
         "apiVersion": "leaderboard.carla.org/v1alpha1", "kind": "Leaderboard",
         "metadata": {"name": "carla-20", "namespace": "carla"},
         "spec": {
-            "tracks": [{"name": "sensors", "codename": "SENSORS"}, {"name": "map", "codename": "MAP"}], "leaderboardVersion": "V2",
-            "contents": {"image": "contents:1"}, "simulator": {"image": "simulator:1"}, "check": image, "storage": {"bucket": "results"},
+            "tracks": [{"name": "sensors"}, {"name": "map"}],
+            "evaluation": {"carla": {
+                "version": "V2", "contents": {"image": "contents:1"}, "simulator": {"image": "simulator:1"},
+            }}, "check": image, "storage": {"s3": {"bucket": "results"}},
         },
         "status": {"conditions": conditions},
     });

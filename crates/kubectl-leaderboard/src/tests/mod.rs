@@ -55,9 +55,11 @@ fn leaderboard() -> Leaderboard {
         "apiVersion": "leaderboard.carla.org/v1alpha1", "kind": "Leaderboard",
         "metadata": {"name": "carla-20", "namespace": "carla"},
         "spec": {
-            "tracks": [{"name": "sensors", "codename": "SENSORS", "phase": 7}], "leaderboardVersion": "V2",
-            "contents": {"image": "contents:1"}, "simulator": {"image": "simulator:1"},
-            "storage": {"bucket": "results"}, "concurrency": {"total": 2},
+            "tracks": [{"name": "sensors", "phase": 7}],
+            "evaluation": {"carla": {
+                "version": "V2", "contents": {"image": "contents:1"}, "simulator": {"image": "simulator:1"},
+            }},
+            "storage": {"s3": {"bucket": "results"}}, "concurrency": {"total": 2},
         },
         "status": {
             "counts": {"pending": 4, "running": 2, "finished": 0, "failed": 0, "cancelled": 0},
@@ -175,9 +177,11 @@ fn of_team(status: Value, id: &str, name: &str) -> Value {
 
 /// The plan of a run of two pairs with this simulator.
 fn plan_with(simulator: &str) -> Value {
-    json!({"runId": "mine", "leaderboardVersion": "V2", "track": "sensors", "codename": "S",
-           "slices": [{"first": 0, "last": 9}, {"first": 10, "last": 19}], "routes": 20, "repetitions": 1,
-           "storage": {"bucket": "results"}, "image": "agent:1", "contentsImage": "contents:1", "simulatorImage": simulator})
+    json!({"runId": "mine",
+        "carla": {"version": "V2", "codename": "S", "slices": [{"first": 0, "last": 9}, {"first": 10, "last": 19}],
+            "routes": 20, "repetitions": 1, "contentsImage": "contents:1", "simulatorImage": simulator},
+        "track": "sensors",
+           "storage": {"s3": {"bucket": "results"}}, "image": "agent:1"})
 }
 
 /// The status of a run with this simulator.

@@ -146,7 +146,7 @@ fn what_lasts_or_is_requested_is_shown() {
 fn the_log_is_read_where_the_run_was_stored() {
     let storage =
         json!({"bucket": "results", "prefix": "v2/", "region": "eu-west-1", "endpoint": "http://127.0.0.1:4566"});
-    let plan = with(plan_with("simulator:1"), &json!({"storage": storage}));
+    let plan = with(plan_with("simulator:1"), &json!({"storage": {"s3": storage}}));
     let status = with(crashed(), &json!({"plan": plan}));
     let lines = explain(&submission(&status), Observed::Forbidden, frame());
     let command = "             aws s3 cp s3://results/v2/42/evalai/environment_log.txt - --region eu-west-1 \

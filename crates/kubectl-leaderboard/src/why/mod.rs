@@ -220,7 +220,7 @@ impl Explanation<'_> {
         let log = of_worker(log, failure.worker);
         let text = format!("the last 10,000 characters of {log}. Hosts only: it may reveal private routes.");
         self.page.row("Log", &text);
-        let storage = self.status.plan.as_ref().map(|plan| &plan.storage);
+        let storage = self.status.plan.as_ref().map(|plan| &plan.storage.s3);
         let command = bucket::print(&format!("{results}/{FAILURE_LOG_KEY}"), storage);
         self.page.whole("", &command);
     }

@@ -381,7 +381,7 @@ fn a_hosts_command_stands_behind_the_same_runner() {
     let own = |words: Value| json!({"command": words, "args": ["$(RESUME)", "$$(date) $$ $HOME"], "image": "x"});
     let job = Case::new(
         "V2",
-        json!({"agent": own(json!(["/run", "--port=$(CARLA_PORT)"])), "simulator": own(json!(["/sim", "$(CARLA_PORT)"])), "contents": own(json!(["/fill"]))}),
+        json!({"agent": own(json!(["/run", "--port=$(CARLA_PORT)"])), "evaluation": {"carla": {"simulator": own(json!(["/sim", "$(CARLA_PORT)"])), "contents": own(json!(["/fill"]))}}}),
     )
     .json();
     let (words, mut env) = started(container(&job, "agent-1"), &[]);

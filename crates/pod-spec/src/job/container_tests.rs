@@ -33,7 +33,7 @@ fn the_init_containers_are_those_that_have_names_in_that_order() {
 
 #[test]
 fn the_pairs_share_out_the_routes_of_the_plan() {
-    let job = Case::new("V1", json!({"pairs": 3})).json();
+    let job = Case::new("V1", json!({"evaluation": {"carla": {"pairs": 3}}})).json();
     let expected = [
         ("0-6", "2000", "2010"),
         ("7-13", "2100", "2110"),
@@ -77,10 +77,10 @@ fn resume_is_1_or_empty() {
 #[test]
 fn the_contents_get_what_the_old_pipelines_had_and_the_hosts_variables_win() {
     let of = |contents: Value, attempt: i64| {
-        let mut case = Case::new("V2", json!({ "contents": contents }));
+        let mut case = Case::new("V2", json!({ "evaluation": {"carla": {"contents": contents}} }));
         case.number.attempt = Attempt(attempt);
         let run = case.plan.run_id.as_str().to_owned();
-        let bucket = case.plan.storage.bucket.clone();
+        let bucket = case.plan.storage.s3.bucket.clone();
         let container = container(&case.json(), "contents").clone();
         (container, run, bucket)
     };
@@ -113,7 +113,7 @@ fn the_contents_get_what_the_old_pipelines_had_and_the_hosts_variables_win() {
 
 #[test]
 fn a_track_brings_its_files_and_repetitions() {
-    let track = json!({"name": "sensors", "codename": "MAP", "routesFile": "/r/a.xml", "scenariosFile": "/r/b.json", "repetitions": 2});
+    let track = json!({"name": "sensors", "carla": {"codename": "MAP", "routesFile": "/r/a.xml", "scenariosFile": "/r/b.json", "repetitions": 2}});
     let job = Case::new("V1", json!({"tracks": [track]})).json();
     let agent = container(&job, "agent-1");
     let expected = [
@@ -206,7 +206,11 @@ fn the_controllers_setting_of_checksums_is_that_of_its_pods() {
 #[test]
 fn eks_skips_every_container_of_a_stranger() {
     let pod = json!({"spec": {"initContainers": [{"name": "metrics", "image": "m", "restartPolicy": "Always"}]}});
-    let job = Case::new("V2", json!({"pairs": 2, "podOverrides": pod})).json();
+    let job = Case::new(
+        "V2",
+        json!({"evaluation": {"carla": {"pairs": 2}}, "podOverrides": pod}),
+    )
+    .json();
     assert_eq!(
         job["spec"]["template"]["metadata"]["annotations"]["eks.amazonaws.com/skip-containers"],
         "contents,metrics,simulator-1,simulator-2,agent-1,agent-2"
@@ -251,7 +255,7 @@ fn a_hostile_image_name_cannot_ask_kubernetes_for_a_secret() {
 fn the_run_document_is_the_plan_and_its_times() {
     let mut case = Case::new(
         "V2",
-        json!({"syncPeriodSeconds": 5, "verify": "Refuse", "logGroup": {"name": "g"}}),
+        json!({"syncPeriodSeconds": 5, "evaluation": {"carla": {"verify": "Refuse"}}, "logs": {"cloudWatch": {"name": "g"}}}),
     );
     case.number.attempt = Attempt(2);
     let run = run_document(&case.input());
@@ -265,7 +269,7 @@ fn the_run_document_is_the_plan_and_its_times() {
     );
     assert_eq!(run.plan, case.plan);
     assert_eq!(run.verify, leaderboard_api::Verify::Refuse);
-    assert_eq!(run.log_group.unwrap().name, "g");
+    assert_eq!(run.log_group().unwrap().name, "g");
 }
 
 #[test]
@@ -304,7 +308,7 @@ fn logs_have_room_for_all_that_the_limits_allow() {
     let cases = [
         (json!({}), 20 + 4 * 2 + 1),
         (
-            json!({"pairs": 1, "agent": {"logSizeLimit": "1Gi"}, "storage": {"bucket": "results", "sizeLimit": "5Gi"}}),
+            json!({"evaluation": {"carla": {"pairs": 1}}, "agent": {"logSizeLimit": "1Gi"}, "storage": {"s3": {"bucket": "results", "sizeLimit": "5Gi"}}}),
             5 + 1 + 1,
         ),
     ];
@@ -418,7 +422,11 @@ fn our_own_image_has_the_pull_policy_and_region_of_the_operator() {
 
 #[test]
 fn each_agent_has_shared_memory_of_its_own_and_of_the_size_that_is_asked_for() {
-    let job = Case::new("V2", json!({"pairs": 2, "agent": {"shmSize": "2Gi"}})).json();
+    let job = Case::new(
+        "V2",
+        json!({"evaluation": {"carla": {"pairs": 2}}, "agent": {"shmSize": "2Gi"}}),
+    )
+    .json();
     let volumes = job["spec"]["template"]["spec"]["volumes"].as_array().unwrap();
     for pair in [1, 2] {
         let name = format!("shm-agent-{pair}");
@@ -444,7 +452,7 @@ fn each_agent_has_shared_memory_of_its_own_and_of_the_size_that_is_asked_for() {
 
 #[test]
 fn a_track_has_its_priority_and_a_host_may_let_karpenter_disrupt() {
-    let track = json!({"name": "sensors", "codename": "SENSORS", "priorityClassName": "sensors"});
+    let track = json!({"name": "sensors", "carla": {"codename": "SENSORS"}, "priorityClassName": "sensors"});
     let overlay = json!({"metadata": {"annotations": {"karpenter.sh/do-not-disrupt": null}}});
     let job = Case::new("V2", json!({"tracks": [track], "podOverrides": overlay})).json();
     let template = &job["spec"]["template"];

@@ -57,24 +57,21 @@ mod tests {
     use serde_json::json;
 
     use super::*;
+    use crate::job::tests::lay;
     use leaderboard_api::effective;
 
     /// GPUs of a Leaderboard of four pairs with these fields.
     fn counted(fields: &Value) -> i64 {
         let mut spec = json!({
-            "tracks": [{"name": "sensors", "codename": "SENSORS"}],
-            "leaderboardVersion": "V2",
-            "contents": {"image": "contents:1"},
-            "simulator": {},
+            "tracks": [{"name": "sensors"}],
+            "evaluation": {"carla": {
+                "version": "V2", "contents": {"image": "contents:1"}, "simulator": {}, "pairs": 4, "routes": 20,
+            }},
             "agent": {},
-            "pairs": 4,
-            "routes": 20,
-            "storage": {"bucket": "results"},
+            "storage": {"s3": {"bucket": "results"}},
         });
-        for (name, value) in fields.as_object().unwrap() {
-            spec[name] = value.clone();
-        }
-        spec["simulator"]["image"] = json!("simulator:1");
+        lay(&mut spec, fields);
+        spec["evaluation"]["carla"]["simulator"]["image"] = json!("simulator:1");
         let spec: LeaderboardSpec = serde_json::from_value(spec).unwrap();
         let track = spec.tracks[0].clone();
         let plan = effective::plan(&spec, &track, "77".parse().unwrap(), "a:1".into(), false);
@@ -106,36 +103,41 @@ mod tests {
                 json!({"gpu": {"mode": "Claim", "claim": {"deviceClassName": "gpu.nvidia.com"}}}),
                 4,
             ),
-            ("one a simulator", json!({"simulator": {"resources": one()}}), 4),
+            (
+                "one a simulator",
+                json!({"evaluation": {"carla": {"simulator": {"resources": one()}}}}),
+                4,
+            ),
             (
                 "as a number",
-                json!({"simulator": {"resources": {"requests": {"nvidia.com/gpu": 1}}}}),
+                json!({"evaluation": {"carla": {"simulator": {"resources": {"requests": {"nvidia.com/gpu": 1}}}}}}),
                 4,
             ),
             (
                 "limits and requests are one",
-                json!({"simulator": {"resources":
-                {"limits": {"nvidia.com/gpu": "1"}, "requests": {"nvidia.com/gpu": "1"}}}}),
+                json!({"evaluation": {"carla": {"simulator": {
+                    "resources": {"limits": {"nvidia.com/gpu": "1"}, "requests": {"nvidia.com/gpu": "1"}},
+                }}}}),
                 4,
             ),
             (
                 "both sides",
-                json!({"simulator": {"resources": one()}, "agent": {"resources": one()}}),
+                json!({"evaluation": {"carla": {"simulator": {"resources": one()}}}, "agent": {"resources": one()}}),
                 8,
             ),
             (
                 "a track of its own",
-                json!({"tracks": [{"name": "sensors", "codename": "S", "simulator": {"resources": one()}}]}),
+                json!({"tracks": [{"name": "sensors", "carla": {"simulator": {"resources": one()}}}]}),
                 4,
             ),
             (
                 "slices",
-                json!({"simulator": {"resources": {"limits": {"nvidia.com/mig-1g.5gb": "2"}}}}),
+                json!({"evaluation": {"carla": {"simulator": {"resources": {"limits": {"nvidia.com/mig-1g.5gb": "2"}}}}}}),
                 8,
             ),
             (
                 "other resources",
-                json!({"simulator": {"resources": {"limits": {"cpu": "2"}}}}),
+                json!({"evaluation": {"carla": {"simulator": {"resources": {"limits": {"cpu": "2"}}}}}}),
                 0,
             ),
         ];
@@ -171,7 +173,7 @@ mod tests {
             ),
         ];
         for (what, simulator, container, expected) in cases {
-            let fields = json!({"simulator": simulator, "podOverrides": overlay(container)});
+            let fields = json!({"evaluation": {"carla": {"simulator": simulator}}, "podOverrides": overlay(container)});
             assert_eq!(counted(&fields), expected, "{what}");
         }
     }

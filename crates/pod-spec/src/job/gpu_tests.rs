@@ -127,7 +127,11 @@ fn each_pair_has_a_claim_of_its_own_from_one_template() {
         (json!({"resourceClaimTemplateName": "mine"}), "mine"),
         (json!({"deviceClassName": "gpu.nvidia.com"}), "carla-gpu-"),
     ] {
-        let job = Case::new("V2", json!({"pairs": 3, "gpu": {"mode": "Claim", "claim": claim}})).json();
+        let job = Case::new(
+            "V2",
+            json!({"evaluation": {"carla": {"pairs": 3}}, "gpu": {"mode": "Claim", "claim": claim}}),
+        )
+        .json();
         let claims = job["spec"]["template"]["spec"]["resourceClaims"]
             .as_array()
             .unwrap()
@@ -145,7 +149,7 @@ fn each_pair_has_a_claim_of_its_own_from_one_template() {
 
 #[test]
 fn the_resources_of_a_track_get_the_gpu_too() {
-    let track = json!({"name": "sensors", "codename": "S", "agent": {"resources": {"limits": {"memory": "1Gi"}}}});
+    let track = json!({"name": "sensors", "agent": {"resources": {"limits": {"memory": "1Gi"}}}});
     let job = Case::new("V2", json!({"tracks": [track]})).json();
     let limits = json!({"memory": "1Gi", GPU: "1", "ephemeral-storage": "20Gi"});
     assert_eq!(container(&job, "agent-1")["resources"]["limits"], limits);
@@ -227,9 +231,24 @@ fn the_runner_checks_what_the_server_draws_with_and_finds_its_adapter() {
         ("V2", json!({}), Some("vulkan"), Some(found)),
         ("V1", json!({"gpu": none}), None, None),
         ("V2", json!({"gpu": none}), None, None),
-        ("V2", json!({"simulator": own}), Some("any"), None),
-        ("V2", json!({"simulator": numbered}), Some("vulkan"), Some("3")),
-        ("V2", json!({"simulator": numbered, "gpu": none}), None, Some("3")),
+        (
+            "V2",
+            json!({"evaluation": {"carla": {"simulator": own}}}),
+            Some("any"),
+            None,
+        ),
+        (
+            "V2",
+            json!({"evaluation": {"carla": {"simulator": numbered}}}),
+            Some("vulkan"),
+            Some("3"),
+        ),
+        (
+            "V2",
+            json!({"evaluation": {"carla": {"simulator": numbered}}, "gpu": none}),
+            None,
+            Some("3"),
+        ),
     ] {
         let expected = (check.map(str::to_owned), adapter.map(str::to_owned));
         assert_eq!(drawn_with(version, more.clone()), expected, "{version} {more}");
@@ -268,7 +287,7 @@ fn only_pods_that_share_by_index_keep_away_from_each_other() {
 fn pods_are_for_amd64_unless_the_host_sets_it_otherwise() {
     let selector = |more| Case::new("V2", more).json()["spec"]["template"]["spec"]["nodeSelector"].clone();
     let amd64 = json!({"kubernetes.io/arch": "amd64"});
-    let track = |nodes: &Value| json!({"tracks": [{"name": "sensors", "codename": "S", "nodeSelector": nodes}]});
+    let track = |nodes: &Value| json!({"tracks": [{"name": "sensors", "nodeSelector": nodes}]});
     assert_eq!(selector(json!({})), amd64);
     let pool = json!({"pool": "gpu"});
     assert_eq!(
@@ -285,7 +304,11 @@ fn pods_are_for_amd64_unless_the_host_sets_it_otherwise() {
 fn screen(version: &str, simulator: &Value, overlay: &Value) -> (Option<String>, Option<String>, Option<String>) {
     let mut simulator = simulator.clone();
     simulator["image"] = "s".into();
-    let job = Case::new(version, json!({"simulator": simulator, "podOverrides": overlay})).json();
+    let job = Case::new(
+        version,
+        json!({"evaluation": {"carla": {"simulator": simulator}}, "podOverrides": overlay}),
+    )
+    .json();
     let container = container(&job, "simulator-1");
     let words = words(container);
     let own: Vec<&&str> = words.iter().take_while(|word| **word != "--").collect();
@@ -336,7 +359,11 @@ fn only_simulators_on_x11_see_the_nodes_sockets() {
         let mounts = container(job, name)["volumeMounts"].as_array().unwrap().clone();
         mounts.into_iter().find(|mount| mount["mountPath"] == "/tmp/.X11-unix")
     };
-    let job = Case::new("V2", json!({"simulator": {"image": "s", "display": "X11Socket"}})).json();
+    let job = Case::new(
+        "V2",
+        json!({"evaluation": {"carla": {"simulator": {"image": "s", "display": "X11Socket"}}}}),
+    )
+    .json();
     let volumes = job["spec"]["template"]["spec"]["volumes"].as_array().unwrap();
     let volume = json!({"name": "x11-sockets", "hostPath": {"path": "/tmp/.X11-unix", "type": "Directory"}});
     assert!(volumes.contains(&volume), "{volumes:?}");
@@ -358,11 +385,11 @@ fn resources_that_leave_open_who_has_a_gpu_are_refused() {
     let claim = json!({"mode": "Claim", "claim": {"deviceClassName": "gpu.nvidia.com"}});
     for (more, expected) in [
         (
-            json!({"gpu": null, "simulator": limits(GPU)}),
+            json!({"gpu": null, "evaluation": {"carla": {"simulator": limits(GPU)}}}),
             Some("simulator-1 requests nvidia.com/gpu and the Leaderboard has no field gpu"),
         ),
         (
-            json!({"gpu": null, "simulator": limits("nvidia.com/mig-1g.5gb")}),
+            json!({"gpu": null, "evaluation": {"carla": {"simulator": limits("nvidia.com/mig-1g.5gb")}}}),
             Some("simulator-1 requests nvidia.com/mig-1g.5gb"),
         ),
         (
@@ -370,12 +397,18 @@ fn resources_that_leave_open_who_has_a_gpu_are_refused() {
             Some("agent-1 requests nvidia.com/gpu"),
         ),
         (
-            json!({"gpu": claim, "simulator": limits(GPU)}),
+            json!({"gpu": claim, "evaluation": {"carla": {"simulator": limits(GPU)}}}),
             Some("simulator-1 requests nvidia.com/gpu of a device plugin"),
         ),
         (json!({"gpu": null}), None),
-        (json!({"gpu": null, "simulator": limits("vendor.example/fpga")}), None),
-        (json!({"gpu": {"mode": "None"}, "simulator": limits(GPU)}), None),
+        (
+            json!({"gpu": null, "evaluation": {"carla": {"simulator": limits("vendor.example/fpga")}}}),
+            None,
+        ),
+        (
+            json!({"gpu": {"mode": "None"}, "evaluation": {"carla": {"simulator": limits(GPU)}}}),
+            None,
+        ),
         (json!({"gpu": claim}), None),
         (json!({}), None),
         (json!({"gpu": {"mode": "NodeIndex", "resourceName": GPU}}), None),

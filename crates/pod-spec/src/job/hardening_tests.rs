@@ -118,8 +118,11 @@ fn a_hosts_security_context_is_laid_over_the_default_field_by_field() {
         ),
     ] {
         for side in ["contents", "simulator", "agent"] {
-            let mut more = json!({"contents": {"image": "c"}, "simulator": {"image": "s"}, "agent": {}});
-            more[side]["securityContext"] = hosts.clone();
+            let run = json!({"image": "own:1", "securityContext": hosts});
+            let more = match side {
+                "agent" => json!({"agent": {"securityContext": hosts}}),
+                side => json!({"evaluation": {"carla": {side: run}}}),
+            };
             let job = Case::new("V2", more).json();
             for container in containers(&job) {
                 let is_addressed = container["name"].as_str().unwrap().starts_with(side);
@@ -169,7 +172,8 @@ fn a_pod_requests_and_may_fill_so_much_of_its_nodes_disk() {
     let volumes = ((20 + 2 * 2 + 1 + 10) * gib).to_string();
     let of = |simulator: Value, agent: Value| {
         let simulator = json!({"image": "s", "resources": simulator});
-        let more = json!({"pairs": 2, "simulator": simulator, "agent": {"resources": agent}});
+        let more =
+            json!({"evaluation": {"carla": {"pairs": 2, "simulator": simulator}}, "agent": {"resources": agent}});
         let job = Case::new("V2", more).json();
         assert_eq!(disk(&job, "contents"), (None, None));
         assert_eq!(disk(&job, "workspace"), (None, None));
@@ -210,7 +214,7 @@ fn a_pod_requests_and_may_fill_so_much_of_its_nodes_disk() {
 #[test]
 fn a_tracks_own_resources_and_the_overlay_count_for_the_disk_as_well() {
     let disk_of = |amount: &str| json!({"limits": {"ephemeral-storage": amount}});
-    let track = json!({"name": "sensors", "codename": "S", "agent": {"resources": {"limits": {"memory": "1Gi"}}}});
+    let track = json!({"name": "sensors", "agent": {"resources": {"limits": {"memory": "1Gi"}}}});
     let overlay = json!({"spec": {
         "containers": [{"name": "simulator", "resources": disk_of("1Gi")}],
         "initContainers": [{"name": "logcopy", "resources": disk_of("90Gi")}],

@@ -55,7 +55,7 @@ fn contents_env(input: &JobInput<'_>, hosts: &[EnvVar]) -> Vec<EnvVar> {
         variable("SUBMISSION_ID", plan.run_id.as_str()),
         // The evaluator takes any text for a yes.
         variable("RESUME", if is_resumed(input) { "1" } else { "" }),
-        variable("S3_BUCKET", &plan.storage.bucket),
+        variable("S3_BUCKET", &plan.storage.s3.bucket),
     ];
     let is_free = |ours: &EnvVar| hosts.iter().all(|hosts| hosts.name != ours.name);
     ours.into_iter().filter(is_free).chain(hosts.iter().cloned()).collect()
@@ -117,7 +117,7 @@ fn own_env(input: &JobInput<'_>) -> Vec<EnvVar> {
         // The node's own role is no identity of ours: what answers us at the metadata address answers the agents too.
         variable("AWS_EC2_METADATA_DISABLED", "true"),
     ];
-    let region = input.own.region.as_ref().or(input.plan.storage.region.as_ref());
+    let region = input.own.region.as_ref().or(input.plan.storage.s3.region.as_ref());
     env.extend(region.map(|region| variable("AWS_REGION", region)));
     let checksums = input.own.checksums.as_deref();
     env.extend(checksums.map(|when| variable(ENV_CHECKSUMS, when)));

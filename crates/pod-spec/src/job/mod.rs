@@ -164,11 +164,11 @@ fn run_document(input: &JobInput<'_>) -> Run {
             .unwrap_or_default(),
         attempt: input.number.attempt,
         plan: input.plan.clone(),
-        verify: spec.verify,
+        verify: spec.evaluation.carla.verify,
         period_seconds: unsigned(spec.sync_period_seconds),
         flush_seconds: unsigned(spec.deadlines.flush_seconds),
         cancel_seconds: unsigned(spec.deadlines.cancel_seconds),
-        log_group: spec.log_group.clone(),
+        logs: spec.logs.clone(),
         isolation: isolation(input.leaderboard, input.now),
     }
 }

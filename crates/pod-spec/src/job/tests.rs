@@ -20,22 +20,30 @@ pub(super) struct Case {
     pub(super) failed_nodes: Vec<FailedNode>,
 }
 
+/// Lays fields over a spec, those of `evaluation.carla` one by one.
+pub(super) fn lay(spec: &mut Value, more: &Value) {
+    for (key, value) in more.as_object().unwrap() {
+        match key.as_str() {
+            "evaluation" => lay(&mut spec["evaluation"]["carla"], &value["carla"]),
+            key => spec[key] = value.clone(),
+        }
+    }
+}
+
 impl Case {
     /// A Leaderboard with one track, `more` laid over its spec.
     pub(super) fn new(format: &str, more: Value) -> Self {
         let mut spec = json!({
-            "leaderboardVersion": format,
-            "tracks": [{"name": "sensors", "codename": "SENSORS"}],
-            "contents": {"image": "registry.example/contents:1"},
-            "simulator": {"image": "registry.example/carla:1"},
+            "evaluation": {"carla": {
+                "version": format, "contents": {"image": "registry.example/contents:1"},
+                "simulator": {"image": "registry.example/carla:1"},
+            }},
+            "tracks": [{"name": "sensors", "carla": {"codename": "SENSORS"}}],
             "gpu": {"resourceName": "nvidia.com/gpu"},
             "agent": {},
-            "storage": {"bucket": "results", "prefix": "runs/", "region": "eu-west-1"},
+            "storage": {"s3": {"bucket": "results", "prefix": "runs/", "region": "eu-west-1"}},
         });
-        let Value::Object(more) = more else { panic!("an object") };
-        for (key, value) in more {
-            spec[key] = value;
-        }
+        lay(&mut spec, &more);
         let leaderboard: Leaderboard = serde_json::from_value(json!({
             "apiVersion": "leaderboard.carla.org/v1alpha1", "kind": "Leaderboard",
             "metadata": {"name": "carla", "namespace": "challenge", "uid": "leaderboard-uid"}, "spec": spec,
@@ -134,9 +142,9 @@ fn the_job_of_leaderboard_2_is_as_committed() {
         json!({
             "podIdentity": role(),
             "runtimeClassName": "gvisor",
-            "logGroup": {"name": "leaderboard"},
+            "logs": {"cloudWatch": {"name": "leaderboard"}},
             "tracks": [{
-                "name": "sensors", "codename": "SENSORS", "phase": 2,
+                "name": "sensors", "carla": {"codename": "SENSORS"}, "phase": 2,
                 "nodeSelector": {"node.kubernetes.io/instance-type": "g5.12xlarge"},
                 "tolerations": [{"key": "nvidia.com/gpu", "operator": "Exists", "effect": "NoSchedule"}],
             }],
@@ -179,7 +187,7 @@ fn an_overlay_that_is_refused_is_not_applied() {
 
 #[test]
 fn names_fit_wherever_kubernetes_puts_them() {
-    let mut case = Case::new("V2", json!({"pairs": 16, "routes": 100}));
+    let mut case = Case::new("V2", json!({"evaluation": {"carla": {"pairs": 16, "routes": 100}}}));
     case.submission.metadata.name = Some("s".repeat(52));
     case.number.attempt = Attempt(99_999);
     case.number.retry = 100;
@@ -225,12 +233,12 @@ fn the_nets_are_wider_than_the_rules_above_them() {
     let cases = [
         (json!({}), 52, None),
         (
-            json!({"pairs": 1, "retries": {"perWorker": 0}, "deadlines": {"runSeconds": 7200}}),
+            json!({"evaluation": {"carla": {"pairs": 1}}, "retries": {"perWorker": 0}, "deadlines": {"runSeconds": 7200}}),
             22,
             Some(5400 + 1800 + 7200 + 120 + 1800 + 1800),
         ),
         (
-            json!({"pairs": 16, "retries": {"perWorker": 100}, "deadlines": {"runSeconds": i64::MAX}}),
+            json!({"evaluation": {"carla": {"pairs": 16}}, "retries": {"perWorker": 100}, "deadlines": {"runSeconds": i64::MAX}}),
             3252,
             Some(i32::MAX.into()),
         ),

@@ -85,6 +85,7 @@ pub(super) fn logs_limit(input: &JobInput<'_>) -> u64 {
     input
         .plan
         .storage
+        .s3
         .size_limit
         .bytes()
         .saturating_add(agent_logs)

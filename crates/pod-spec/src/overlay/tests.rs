@@ -416,19 +416,24 @@ fn what_may_not_be_mounted_is_refused() {
 fn a_leaderboards_own_variables_are_checked_too() {
     let spec = |side: &str, name: &str| {
         let mut spec = json!({
-            "leaderboardVersion": "V2", "tracks": [{"name": "t", "codename": "T"}], "storage": {"bucket": "bucket"},
-            "contents": {"image": "c"}, "simulator": {"image": "s"}, "agent": {},
+            "evaluation": {"carla": {
+                "version": "V2", "contents": {"image": "c"}, "simulator": {"image": "s"},
+            }}, "tracks": [{"name": "t"}], "storage": {"s3": {"bucket": "bucket"}}, "agent": {},
         });
-        spec[side]["env"] = json!([{"name": "FINE", "value": "1"}, {"name": name, "value": "2"}]);
+        let own = match side {
+            "agent" => &mut spec["agent"],
+            side => &mut spec["evaluation"]["carla"][side],
+        };
+        own["env"] = json!([{"name": "FINE", "value": "1"}, {"name": name, "value": "2"}]);
         serde_json::from_value(spec).unwrap()
     };
     assert_eq!(validate(&spec("agent", "RECORD_PATH")), Ok(()));
     assert_eq!(validate(&spec("contents", "LEADERBOARD_ROOT")), Ok(()));
-    for side in ["agent", "simulator"] {
+    for (side, path) in [("agent", "agent"), ("simulator", "evaluation.carla.simulator")] {
         let error = validate(&spec(side, "CARLA_PORT")).unwrap_err().to_string();
         assert!(
             error.starts_with(&format!(
-                "{side}.env[CARLA_PORT] cannot be overridden: it follows from the plan"
+                "{path}.env[CARLA_PORT] cannot be overridden: it follows from the plan"
             )),
             "{error}"
         );

@@ -38,7 +38,7 @@ impl fmt::Display for Why {
             Self::Limit(limit) => write!(f, "{limit}. Further files are left out without a word"),
             Self::Shortened(size) => write!(
                 f,
-                "beyond {size} bytes: storage.sizeLimit is reached, and that is what the log keeps of it. Raise it, or have \
+                "beyond {size} bytes: storage.s3.sizeLimit is reached, and that is what the log keeps of it. Raise it, or have \
                  less printed"
             ),
             Self::Day => f.write_str(
@@ -115,7 +115,7 @@ mod tests {
         let limit = Why::Limit(Limit::AgentBytes(9));
         assert!(complaints.is_new("a", &limit) && !complaints.is_new("b", &limit));
         assert!(
-            limit.to_string().contains("storage.sizeLimit, 9 bytes. Raise it"),
+            limit.to_string().contains("storage.s3.sizeLimit, 9 bytes. Raise it"),
             "{limit}"
         );
         assert!(complaints.is_new("a", &Why::Limit(Limit::Bytes(9))));

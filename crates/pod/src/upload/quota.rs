@@ -52,12 +52,12 @@ impl fmt::Display for Limit {
         match self {
             Self::Bytes(limit) => write!(
                 f,
-                "storage.sizeLimit is reached: of it, {limit} bytes are for all but the known logs. Raise it, or have the \
+                "storage.s3.sizeLimit is reached: of it, {limit} bytes are for all but the known logs. Raise it, or have the \
                  simulators and the agent write less"
             ),
             Self::AgentBytes(limit) => write!(
                 f,
-                "the agents' own files have reached their half of storage.sizeLimit, {limit} bytes. Raise it, or have the \
+                "the agents' own files have reached their half of storage.s3.sizeLimit, {limit} bytes. Raise it, or have the \
                  agent write less"
             ),
             Self::Objects(limit) => write!(
@@ -76,7 +76,7 @@ impl fmt::Display for Limit {
 /// The limits of one run.
 #[derive(Clone, Debug, PartialEq, Eq)]
 pub struct Quota {
-    /// Bytes: `storage.sizeLimit`.
+    /// Bytes: `storage.s3.sizeLimit`.
     pub bytes: u64,
     /// Objects.
     pub objects: u64,

@@ -56,7 +56,7 @@ pub async fn restore(
     if !listing.complete {
         tracing::warn!("the prefix holds more than {MAX_OBJECTS} objects; the rest is not restored");
     }
-    let limit = run.plan.storage.size_limit.bytes();
+    let limit = run.plan.storage.s3.size_limit.bytes();
     let chosen = choose(
         listing.objects,
         &Quota::new(limit, run.plan.workers()),
@@ -93,7 +93,7 @@ pub async fn restore(
     if restored.left_out > 0 {
         tracing::warn!(
             objects = restored.left_out,
-            "not restored: impossible keys, or beyond storage.sizeLimit"
+            "not restored: impossible keys, or beyond storage.s3.sizeLimit"
         );
     }
     Ok(restored)

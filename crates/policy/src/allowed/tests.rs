@@ -10,13 +10,13 @@ fn leaderboard(namespace: &str, entry: Option<&str>, queue: Option<&str>, dead: 
         None => json!({"secretKeyRef": {"name": "evalai", "key": "token"}}),
     };
     let mut spec = json!({
-        "leaderboardVersion": "V2", "tracks": [{"name": "sensors", "codename": "SENSORS", "phase": 1}],
-        "contents": {"image": "contents"}, "simulator": {"image": "simulator"}, "storage": {"bucket": "bucket"},
+        "evaluation": {"carla": {
+            "version": "V2", "contents": {"image": "contents"}, "simulator": {"image": "simulator"},
+        }}, "tracks": [{"name": "sensors", "phase": 1}], "storage": {"s3": {"bucket": "bucket"}},
         "evalai": {"apiServer": "https://eval.ai", "challenge": 1, "token": token},
     });
     if let Some(url) = queue {
-        spec["queue"] = json!({"url": url});
-        spec["queue"]["deadLetterURL"] = dead.map_or(Value::Null, Value::from);
+        spec["queue"] = json!({"sqs": {"url": url, "deadLetterURL": dead}});
     }
     let object = json!({
         "apiVersion": "leaderboard.carla.org/v1alpha1", "kind": "Leaderboard",
@@ -82,10 +82,10 @@ fn a_namespace_may_not_name_the_results_rows_and_logs_of_another_one() {
         "ours": {"buckets": ["ours-*", "shared/ours/*"], "tables": ["ours-*"], "logGroups": ["/leaderboards/ours"]},
         "theirs": {"buckets": ["theirs", "shared/theirs/*"], "tables": ["theirs"], "logGroups": ["*"]}
     }"#;
-    let stored = |bucket: &str, prefix: Option<&str>| json!({"storage": {"bucket": bucket, "prefix": prefix}});
-    let with = |key: &str, name: &str| {
+    let stored = |bucket: &str, prefix: Option<&str>| json!({"storage": {"s3": {"bucket": bucket, "prefix": prefix}}});
+    let with = |key: &str, member: &str, name: &str| {
         let mut spec = stored("ours-1", None);
-        spec[key] = json!({ "name": name });
+        spec[key] = json!({member: {"name": name}});
         spec
     };
     let cases = [
@@ -98,11 +98,11 @@ fn a_namespace_may_not_name_the_results_rows_and_logs_of_another_one() {
         (stored("shared", Some("ours2/")), Some("Bucket shared/ours2/")),
         // All of a bucket that is shared holds the others' too.
         (stored("shared", None), Some("Bucket shared/")),
-        (with("table", "ours-rows"), None),
-        (with("table", "theirs"), Some("Table theirs")),
-        (with("logGroup", "/leaderboards/ours"), None),
+        (with("table", "dynamoDB", "ours-rows"), None),
+        (with("table", "dynamoDB", "theirs"), Some("Table theirs")),
+        (with("logs", "cloudWatch", "/leaderboards/ours"), None),
         (
-            with("logGroup", "/leaderboards/ours/2"),
+            with("logs", "cloudWatch", "/leaderboards/ours/2"),
             Some("LogGroup /leaderboards/ours/2"),
         ),
     ];

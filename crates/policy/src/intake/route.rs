@@ -5,7 +5,7 @@
 use std::sync::Arc;
 
 use super::message::{Malformed, Message};
-use leaderboard_api::{Attempt, Foreign, Leaderboard, Queue, ResourceExt};
+use leaderboard_api::{Attempt, Foreign, Leaderboard, ResourceExt, SqsQueue};
 
 /// First wait of a message that can't be used yet, in seconds; it doubles with each receive.
 const FIRST_WAIT: i32 = 30;
@@ -171,8 +171,8 @@ pub fn readers(url: &str, leaderboards: &[Arc<Leaderboard>]) -> Vec<Arc<Leaderbo
 }
 
 /// The queue of a Leaderboard that takes messages.
-pub fn queue_of(leaderboard: &Leaderboard) -> Option<&Queue> {
-    leaderboard.spec.queue.as_ref()
+pub fn queue_of(leaderboard: &Leaderboard) -> Option<&SqsQueue> {
+    leaderboard.spec.sqs()
 }
 
 /// The rules of a queue, from all its readers, the oldest first.

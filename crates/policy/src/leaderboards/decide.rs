@@ -11,8 +11,8 @@ use crate::submissions::previous_controller;
 use leaderboard_api::conditions::{self, Truth};
 use leaderboard_api::leaderboard::Counts;
 use leaderboard_api::{
-    Evalai, EvalaiUse, Leaderboard, LeaderboardStatus, ResourceExt, TableUse, TeamUse, Track, TrackStatus, effective,
-    names, reasons,
+    CarlaShape, Evalai, EvalaiUse, Leaderboard, LeaderboardStatus, ResourceExt, TableUse, TeamUse, Track, TrackStatus,
+    effective, names, reasons,
 };
 use leaderboard_contract::verdict::WorkspaceVerdict;
 
@@ -196,7 +196,7 @@ fn of_spec(view: &LeaderboardView) -> Option<(Truth, &'static str, String)> {
             reasons::PREFIX_CONFLICT,
             format!(
                 "Leaderboard {older} is older, of another namespace or another EvalAI server, and stores below the same bucket and prefix: \
-                 the runs of one could replace those of the other. Make this one anew with a storage.prefix of its own."
+                 the runs of one could replace those of the other. Make this one anew with a storage.s3.prefix of its own."
             ),
         );
     }
@@ -259,9 +259,9 @@ fn prefix_conflict(view: &LeaderboardView) -> Option<String> {
     let mine = &view.leaderboard;
     let place = |l: &Leaderboard| {
         (
-            l.spec.storage.bucket.clone(),
-            l.spec.storage.prefix.clone(),
-            l.spec.storage.endpoint.clone(),
+            l.spec.storage.s3.bucket.clone(),
+            l.spec.storage.s3.prefix.clone(),
+            l.spec.storage.s3.endpoint.clone(),
         )
     };
     let others = others(view).filter(|l| place(l) == place(mine) && is_older(l, mine));
@@ -300,9 +300,11 @@ fn tracks(leaderboard: &Leaderboard) -> Vec<TrackStatus> {
         let shape = effective::shape(&leaderboard.spec, track);
         TrackStatus {
             name: track.name.clone(),
-            pairs: number(shape.pairs),
-            routes: number(shape.routes),
-            repetitions: number(shape.repetitions),
+            carla: CarlaShape {
+                pairs: number(shape.pairs),
+                routes: number(shape.routes),
+                repetitions: number(shape.repetitions),
+            },
         }
     };
     leaderboard.spec.tracks.iter().map(status).collect()

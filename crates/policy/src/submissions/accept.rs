@@ -284,7 +284,7 @@ fn pin(draft: &mut PlanBuilder<'_>, leaderboard: &LeaderboardSpec, track: &Track
             ..plan
         }
     };
-    draft.status.results_url = Some(effective::results_url(&plan.storage, &plan.run_id));
+    draft.status.results_url = Some(effective::results_url(&plan.storage.s3, &plan.run_id));
     draft.status.plan = Some(plan);
     if draft.status.times.accepted.is_none() {
         draft.status.times.accepted = Some(draft.time());

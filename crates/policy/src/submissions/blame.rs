@@ -176,7 +176,7 @@ fn by_times_and_rounds(end: &EndView, agent: &EndView) -> Order {
     match round(end).zip(round(agent)) {
         Some((host, agent)) if agent > host => Order::AgentIsLater,
         Some((host, agent)) if agent < host => Order::HostIsLater,
-        // An agent without a round is of an older version, or has replaced its verdict.
+        // An agent without a round has replaced its verdict.
         _ => Order::SameRound,
     }
 }

@@ -215,7 +215,7 @@ fn waits_for_other_program(draft: &mut PlanBuilder<'_>) -> bool {
 /// Where another program's row would be. None: there is no table, no other program gets the submission, or a run of ours has begun.
 fn question(draft: &PlanBuilder<'_>) -> Option<Row> {
     let team = &draft.evalai_info()?.team_id;
-    let table = draft.leaderboard()?.table.as_ref()?;
+    let table = draft.leaderboard()?.dynamo_table()?;
     // One that observes runs what another program runs, on purpose, and writes nothing.
     let is_asked = draft.status.plan.is_none() && !draft.observes() && !team.is_empty();
     is_asked.then(|| Row {

@@ -84,7 +84,7 @@ const fn ending(id: &'static str, attack: &'static str, image: Image, expected: 
 const TWICE: &str = r#"{"retries": {"perWorker": 2}}"#;
 
 /// Both pairs run, and each may come back once.
-const TWO_PAIRS: &str = r#"{"pairs": 2, "retries": {"perWorker": 1}}"#;
+const TWO_PAIRS: &str = r#"{"evaluation": {"carla": {"pairs": 2}}, "retries": {"perWorker": 1}}"#;
 const NOT_ROOT: &str = r#"{"agent": {"securityContext": {"runAsNonRoot": true}}}"#;
 
 /// All of them. Those that take longest come first.
@@ -130,7 +130,7 @@ pub const ENDINGS: &[Ending] = &[
         )
     },
     Ending {
-        change: r#"{"storage": {"sizeLimit": "16Mi"}}"#,
+        change: r#"{"storage": {"s3": {"sizeLimit": "16Mi"}}}"#,
         ..ending(
             "growing-file",
             "a file that grows while it is stored",

@@ -16,18 +16,18 @@ fn board(name: &str, second: i64) -> Leaderboard {
         "metadata": {"name": name, "namespace": "ns", "creationTimestamp": created},
         "spec": {
             "evalai": {"apiServer": "https://e", "challenge": 1, "token": {"secretKeyRef": {"name": "t", "key": "k"}}},
-            "tracks": [{"name": "sensors", "codename": "SENSORS", "phase": 2}, {"name": "map", "codename": "MAP", "phase": 3}],
-            "leaderboardVersion": "V2",
-            "contents": {"image": "c"},
-            "simulator": {"image": "s"},
-            "storage": {"bucket": "bbb"}
+            "tracks": [{"name": "sensors", "phase": 2}, {"name": "map", "phase": 3}],
+            "evaluation": {"carla": {
+                "version": "V2", "contents": {"image": "c"}, "simulator": {"image": "s"},
+            }},
+            "storage": {"s3": {"bucket": "bbb"}}
         }
     }))
     .unwrap()
 }
 
 fn with_queue(mut board: Leaderboard, url: &str) -> Arc<Leaderboard> {
-    board.spec.queue = Some(serde_json::from_value(json!({"url": url})).unwrap());
+    board.spec.queue = Some(serde_json::from_value(json!({"sqs": {"url": url}})).unwrap());
     Arc::new(board)
 }
 
@@ -78,8 +78,8 @@ fn leaving() -> Vec<Arc<Leaderboard>> {
     vec![with(one().remove(0), |lb| queue_mut(lb).foreign = Foreign::Leave)]
 }
 
-fn queue_mut(leaderboard: &mut Leaderboard) -> &mut Queue {
-    leaderboard.spec.queue.as_mut().unwrap()
+fn queue_mut(leaderboard: &mut Leaderboard) -> &mut SqsQueue {
+    leaderboard.spec.queue.as_mut().unwrap().sqs.as_mut().unwrap()
 }
 
 fn check(what: &str, envelope: &Envelope, readers: &[Arc<Leaderboard>], synced: bool, want: &MessageOutcome) {

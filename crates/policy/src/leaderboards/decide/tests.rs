@@ -7,9 +7,11 @@ use super::*;
 fn leaderboard(name: &str, second: i64, phase: i64, server: &str, prefix: &str) -> Arc<Leaderboard> {
     let spec = json!({
         "evalai": {"apiServer": server, "challenge": 1, "token": {"secretKeyRef": {"name": "t", "key": "k"}}},
-        "tracks": [{"name": "sensors", "codename": "SENSORS", "phase": phase}],
-        "leaderboardVersion": "V2", "contents": {"image": "c"}, "simulator": {"image": "s"},
-        "storage": {"bucket": "bucket", "prefix": prefix}, "deadlines": {"runSeconds": 86400},
+        "tracks": [{"name": "sensors", "phase": phase}],
+        "evaluation": {"carla": {
+            "version": "V2", "contents": {"image": "c"}, "simulator": {"image": "s"},
+        }},
+        "storage": {"s3": {"bucket": "bucket", "prefix": prefix}}, "deadlines": {"runSeconds": 86400},
     });
     let mut object = Leaderboard::new(name, serde_json::from_value(spec).unwrap());
     object.metadata.namespace = Some("ns".into());

@@ -36,16 +36,15 @@ pub fn at(second: i64) -> Timestamp {
 /// A Leaderboard with the defaults, two routes on two pairs; EvalAI's if `evalai`.
 pub fn leaderboard(evalai: bool) -> Leaderboard {
     let mut spec = json!({
-        "tracks": [{"name": "sensors", "codename": "SENSORS"}],
-        "leaderboardVersion": "V2",
-        "contents": {"image": "contents:1"},
-        "simulator": {"image": "simulator:1"},
+        "tracks": [{"name": "sensors"}],
+        "evaluation": {"carla": {
+            "version": "V2", "contents": {"image": "contents:1"}, "simulator": {"image": "simulator:1"},
+            "pairs": 2, "routes": 4,
+        }},
         // Any image; the tests of images set it otherwise.
         "agent": {"images": []},
-        "pairs": 2,
-        "routes": 4,
-        "storage": {"bucket": "results"}, "deadlines": {"runSeconds": 86400},
-        "table": {"name": "submissions"},
+        "storage": {"s3": {"bucket": "results"}}, "deadlines": {"runSeconds": 86400},
+        "table": {"dynamoDB": {"name": "submissions"}},
     });
     if evalai {
         spec["tracks"][0]["phase"] = json!(7);

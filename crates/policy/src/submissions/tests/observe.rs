@@ -13,7 +13,7 @@ fn observed() -> World {
     let mut world = World::evalai();
     let spec = world.leaderboard();
     spec.evalai.as_mut().unwrap().mode = EvalaiMode::Observe;
-    spec.storage.prefix = Some("observe/".into());
+    spec.storage.s3.prefix = Some("observe/".into());
     spec.table = None;
     world.view.record = None;
     world

@@ -39,9 +39,9 @@ fn the_plan_is_kept_and_the_images_renewed() {
     for mut world in [failed(), cancelled()] {
         let before = world.status().plan.unwrap();
         let spec = world.leaderboard();
-        spec.pairs = 4;
-        spec.routes = 8;
-        spec.simulator.image = "simulator:2".into();
+        spec.evaluation.carla.pairs = 4;
+        spec.evaluation.carla.routes = 8;
+        spec.evaluation.carla.simulator.image = "simulator:2".into();
         world.submission().spec.attempt = Attempt(2);
         world.submission().spec.cancel = false;
         let plan = world.pass_to(Pending, reasons::PREPARING);
@@ -62,8 +62,11 @@ fn the_plan_is_kept_and_the_images_renewed() {
         assert_eq!(evalai_updates(&plan), [EvalaiUpdate::Queued]);
         let pinned = plan.status.plan.unwrap();
         assert!(pinned.resume);
-        assert_eq!(pinned.simulator_image, "simulator:2");
-        assert_eq!((pinned.slices, pinned.routes), (before.slices, before.routes));
+        assert_eq!(pinned.carla.simulator_image, "simulator:2");
+        assert_eq!(
+            (pinned.carla.slices, pinned.carla.routes),
+            (before.carla.slices, before.carla.routes)
+        );
 
         world.see_job();
         world.view.pod = Some(pod(500));

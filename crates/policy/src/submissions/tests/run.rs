@@ -107,10 +107,10 @@ fn an_edited_leaderboard_leaves_the_plan_of_a_run_alone() {
     let mut world = World::local().running();
     let before = world.status();
     let spec = world.leaderboard();
-    spec.pairs = 4;
-    spec.routes = 8;
-    spec.simulator.image = "simulator:2".into();
-    spec.contents.image = "contents:2".into();
+    spec.evaluation.carla.pairs = 4;
+    spec.evaluation.carla.routes = 8;
+    spec.evaluation.carla.simulator.image = "simulator:2".into();
+    spec.evaluation.carla.contents.image = "contents:2".into();
     assert_eq!(world.pass().status, before);
 }
 

@@ -11,7 +11,7 @@ use leaderboard_api::{Attempt, Use, reasons};
 fn with_gpus() -> World {
     let mut world = World::local();
     let resources = json!({"limits": {"nvidia.com/gpu": "1"}});
-    world.leaderboard().simulator.resources = Some(serde_json::from_value(resources).unwrap());
+    world.leaderboard().evaluation.carla.simulator.resources = Some(serde_json::from_value(resources).unwrap());
     world
 }
 
