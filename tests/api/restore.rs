@@ -373,7 +373,7 @@ impl Season {
 
 #[tokio::test(flavor = "multi_thread", worker_threads = 2)]
 async fn what_a_backup_brings_back_with_its_status_goes_on_as_it_was() {
-    let season = Season::play().await;
+    let season = Box::pin(Season::play()).await;
     let world = &season.world;
     let boards = Backup::of(world, "leaderboards").await;
     let locals = Backup::of(world, &format!("submissions {LOCAL_FINISHED} {LOCAL_RUNNING}")).await;
@@ -411,7 +411,7 @@ async fn what_a_backup_brings_back_with_its_status_goes_on_as_it_was() {
 
 #[tokio::test(flavor = "multi_thread", worker_threads = 2)]
 async fn what_a_backup_brings_back_without_a_status_is_neither_run_nor_published_again() {
-    let season = Season::play().await;
+    let season = Box::pin(Season::play()).await;
     let world = &season.world;
     let all = Backup::of(world, "leaderboards,submissions").await;
     lose_all(world).await;
