@@ -1,7 +1,7 @@
 //! The tail of the log that explains a failure: read while it can be had, remembered until every system has the end, and
 //! stored in S3 for people.
 //!
-//! `decide` asks for it; `external` hands the text on to EvalAI's hosts. A log may hold private routes, so it never gets into status,
+//! `decide` asks for it; `external` hands the text on to EvalAI's hosts. A log may hold private parts of the challenge, so it never gets into status,
 //! events or our own log.
 
 use std::pin::pin;

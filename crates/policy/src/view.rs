@@ -349,7 +349,7 @@ pub struct EvalaiView {
     pub end: Option<EvalaiEnd>,
     /// Why what the bucket holds of that result cannot be read.
     pub unread: Option<String>,
-    /// Routes of the last partial result of this attempt that EvalAI has answered.
+    /// Units of work in the last partial result of this attempt that EvalAI has answered.
     pub partial_done: Option<u32>,
     /// Whether the leaderboards of its phase show partial results; no as long as that is not known.
     pub shows_partial: bool,

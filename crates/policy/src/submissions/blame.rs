@@ -386,7 +386,6 @@ pub(super) fn too_many(draft: &mut PlanBuilder<'_>) -> Option<Failure> {
     let is_too_many = |worker: &&WorkerStatus| {
         worker.crashes >= limit || (worker.crashes > 0 && failure::cause_of(worker).is_some_and(is_hopeless))
     };
-    let node = draft.status.node_name.as_deref();
     let mut awaited = None;
     for worker in draft.status.workers.iter().filter(is_too_many) {
         let Some(cause) = failure::cause_of(worker) else {
@@ -396,7 +395,7 @@ pub(super) fn too_many(draft: &mut PlanBuilder<'_>) -> Option<Failure> {
         let crash = pod.and_then(|pod| last_crash_of(pod, worker.id, draft.now()));
         // Who goes on to fail while the other side's word is waited for puts its end off no further.
         match crash.filter(|crash| !crash.is_settled && worker.crashes <= limit) {
-            None => return Some(failure::of_worker(worker, cause, node)),
+            None => return Some(failure::of_worker(worker, cause, &draft.status)),
             Some(crash) => awaited = awaited.or(crash.at),
         }
     }

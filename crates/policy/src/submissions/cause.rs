@@ -3,7 +3,7 @@
 //!
 //! An image is the cause only where the words prove it. A node without disk, driver or memory must charge nobody, and its words are endless; so
 //! what the table does not know is the node's, or the registry's. Of disks only what was measured of agents alone is evidence against them.
-//! Agents and simulators that started and crashed are judged by `blame`.
+//! Workers that started and crashed are judged by `blame`.
 
 use serde_json::Value;
 

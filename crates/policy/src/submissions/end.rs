@@ -142,7 +142,7 @@ fn cause(draft: &PlanBuilder<'_>, report: Option<&ReportDigest>, job_end: Option
         return failure::invalid_results(why);
     }
     if let Some(report) = verdict {
-        return failure::not_eligible(report, &draft.status.workers);
+        return failure::not_eligible(report, &draft.status);
     }
     match job_end {
         Some(end) => of_job(draft, end),
@@ -159,10 +159,9 @@ fn of_job(draft: &PlanBuilder<'_>, end: &JobEnd) -> Failure {
         JobEnd::Complete { .. } => failure::results_not_stored(),
         // Without a limit on the run the deadline is not ours.
         JobEnd::Failed { reason, .. } if reason == "DeadlineExceeded" && draft.deadlines().run_seconds.is_some() => {
-            failure::charged(
-                reasons::TIME_LIMIT,
-                "The Pod reached its time limit; finished routes are kept.",
-            )
+            let units = draft.words().units;
+            let what = format!("The Pod reached its time limit; finished {units} are kept.");
+            failure::charged(reasons::TIME_LIMIT, &what)
         }
         JobEnd::Failed { reason, message, .. } => failure::worst(&draft.status).unwrap_or_else(|| {
             let what = format!("The Job failed with {reason}: {}", sentence(message));

@@ -8,6 +8,7 @@ use leaderboard_api::text::sentence;
 use leaderboard_api::{EndReason, Failure, FailureClass, SubmissionStatus, WorkerStatus, names, reasons};
 use leaderboard_contract::keys::agent_log;
 use leaderboard_contract::run::{Stop, console};
+use leaderboard_evaluation::{Words, words};
 use leaderboard_protocol::files::Pair;
 
 /// A failure that is the participant's: `what` happened, in one sentence, and what each reader does about it.
@@ -72,18 +73,22 @@ pub(super) fn job_expired() -> Failure {
     )
 }
 
-pub(super) fn node_lost(node: Option<&str>, node_state: ObservedNode) -> Failure {
+pub(super) fn node_lost(node: Option<&str>, node_state: ObservedNode, words: &Words) -> Failure {
     let node = node.map_or_else(|| "The node of the Pod".to_owned(), |node| format!("Node {node}"));
     let what = if node_state == ObservedNode::Reports {
         "did not end its Pod within its grace"
     } else {
         "was lost and its Pod with it"
     };
-    infrastructure(reasons::NODE_LOST, &format!("{node} {what}; finished routes are kept."))
+    let what = format!("{node} {what}; finished {} are kept.", words.units);
+    infrastructure(reasons::NODE_LOST, &what)
 }
 
-pub(super) fn time_limit(seconds: i64) -> Failure {
-    let what = format!("The run took longer than {seconds} s and was stopped; finished routes are kept.");
+pub(super) fn time_limit(seconds: i64, words: &Words) -> Failure {
+    let what = format!(
+        "The run took longer than {seconds} s and was stopped; finished {} are kept.",
+        words.units
+    );
     charged(reasons::TIME_LIMIT, &what)
 }
 
@@ -109,9 +114,9 @@ fn pair_named(why: &str) -> Option<i32> {
 }
 
 /// Results that are complete but do not count.
-pub(super) fn not_eligible(report: &ReportDigest, workers: &[WorkerStatus]) -> Failure {
+pub(super) fn not_eligible(report: &ReportDigest, status: &SubmissionStatus) -> Failure {
     if report.entry_status == "Crashed" {
-        return named_crash(report, workers);
+        return named_crash(report, status);
     }
     let what = format!("The run ended as {}, so its results do not count.", report.entry_status);
     charged(reasons::NOT_ELIGIBLE, &what)
@@ -119,17 +124,20 @@ pub(super) fn not_eligible(report: &ReportDigest, workers: &[WorkerStatus]) -> F
 
 /// Results that name a crash of the simulation. The agent writes them, and knows its score by then, so a crash that no host's container had is
 /// its own. Evaluators repeat the route of a crash; one that does not keeps its record over the Jobs of an attempt.
-fn named_crash(report: &ReportDigest, workers: &[WorkerStatus]) -> Failure {
+fn named_crash(report: &ReportDigest, status: &SubmissionStatus) -> Failure {
+    let words = words(status.plan.as_ref());
     let named = report.workers.iter().filter(|worker| worker.names_crash);
     let mut named = named.map(|worker| clamp(worker.id));
     let first = named.clone().next();
     let has_failed = |id: i32| {
-        workers
-            .iter()
-            .any(|worker| worker.id == id && worker.environment_failed)
+        let mut workers = status.workers.iter();
+        workers.any(|worker| worker.id == id && worker.environment_failed)
     };
     if let Some(id) = named.find(|id| !has_failed(*id)) {
-        let what = format!("The results of pair {id} name a crash of the simulation that its simulator did not have.");
+        let what = format!(
+            "The results of pair {id} name a crash of the simulation that its {} did not have.",
+            words.host
+        );
         return Failure {
             worker: Some(id),
             ..charged(reasons::INVALID_RESULTS, &what)
@@ -140,7 +148,10 @@ fn named_crash(report: &ReportDigest, workers: &[WorkerStatus]) -> Failure {
         worker: first,
         ..infrastructure(
             reasons::SIMULATION_CRASHED,
-            "The simulation crashed during a route, so the results do not count.",
+            &format!(
+                "The simulation crashed during a {}, so the results do not count.",
+                words.unit
+            ),
         )
     }
 }
@@ -159,7 +170,7 @@ pub(super) fn stop_of(failure: Option<&Failure>) -> Stop {
 pub(super) fn worst(status: &SubmissionStatus) -> Option<Failure> {
     let crashed = status.workers.iter().filter(|p| p.crashes > 0 && p.last.is_some());
     let worker = crashed.max_by_key(|p| p.crashes)?;
-    Some(of_worker(worker, cause_of(worker)?, status.node_name.as_deref()))
+    Some(of_worker(worker, cause_of(worker)?, status))
 }
 
 /// True if what looked like crashes were runs to the end whose checkpoint is refused: an agent that ends by itself without
@@ -174,19 +185,19 @@ pub(super) fn cause_of(worker: &WorkerStatus) -> Option<EndReason> {
     worker.last.as_ref().map(|last| last.reason)
 }
 
-pub(super) fn of_worker(worker: &WorkerStatus, cause: EndReason, node: Option<&str>) -> Failure {
-    let id = worker.id;
+pub(super) fn of_worker(worker: &WorkerStatus, cause: EndReason, status: &SubmissionStatus) -> Failure {
+    let (id, node, words) = (worker.id, status.node_name.as_deref(), words(status.plan.as_ref()));
     let times = match worker.crashes {
         1 => "once".to_owned(),
         crashes => format!("{crashes} times"),
     };
-    let failure = if let Some((reason, what)) = of_node(id, &times, cause, node) {
+    let failure = if let Some((reason, what)) = of_node(id, &times, (cause, node), words) {
         infrastructure(reason, &what)
     } else if let Some(what) = of_host(cause) {
-        let what = format!("The simulator of pair {id} failed {times}: {what}.");
+        let what = format!("The {} of pair {id} failed {times}: {what}.", words.host);
         infrastructure(reasons::SIMULATION_CRASHED, &what)
     } else {
-        let (reason, what, next) = of_agent(id, &times, cause);
+        let (reason, what, next) = of_agent(id, &times, cause, words);
         participant(reason, &what, &next)
     };
     Failure {
@@ -196,20 +207,26 @@ pub(super) fn of_worker(worker: &WorkerStatus, cause: EndReason, node: Option<&s
 }
 
 /// The node's fault: it cannot draw, or start an agent.
-fn of_node(id: i32, times: &str, cause: EndReason, node: Option<&str>) -> Option<(&'static str, String)> {
+fn of_node(
+    id: i32,
+    times: &str,
+    (cause, node): (EndReason, Option<&str>),
+    words: &Words,
+) -> Option<(&'static str, String)> {
+    let host = words.host;
     let node = node.map_or_else(|| "the node".to_owned(), |node| format!("node {node}"));
     match cause {
         EndReason::NoGPU => Some((
             reasons::NO_GPU,
             format!(
-                "Pair {id} lacks a GPU on {node}, although the Leaderboard gives it one: its simulator or its agent saw none. The \
-                 simulator's log says which."
+                "Pair {id} lacks a GPU on {node}, although the Leaderboard gives it one: its {host} or its agent saw none. The \
+                 {host}'s log says which."
             ),
         )),
         EndReason::GraphicsDriverMissing => Some((
             reasons::GRAPHICS_DRIVER_MISSING,
             format!(
-                "Simulator {id} had a GPU and could not draw: the NVIDIA driver of {node} has no Vulkan/OpenGL part \
+                "The {host} of pair {id} had a GPU and could not draw: the NVIDIA driver of {node} has no Vulkan/OpenGL part \
                  (nvidia_icd.json)."
             ),
         )),
@@ -238,7 +255,8 @@ fn of_host(cause: EndReason) -> Option<&'static str> {
     }
 }
 
-fn of_agent(id: i32, times: &str, cause: EndReason) -> (&'static str, String, Steps) {
+fn of_agent(id: i32, times: &str, cause: EndReason, words: &Words) -> (&'static str, String, Steps) {
+    let host = words.host;
     match cause {
         EndReason::OutOfMemory => (
             reasons::OUT_OF_MEMORY,
@@ -248,7 +266,7 @@ fn of_agent(id: i32, times: &str, cause: EndReason) -> (&'static str, String, St
         EndReason::Idle => (
             reasons::IDLE,
             format!("Agent {id} ended too early {times}, the last time because it printed nothing for too long."),
-            in_the_log_of(id),
+            in_the_log_of(id, words),
         ),
         EndReason::Incomplete => (
             reasons::INVALID_RESULTS,
@@ -256,7 +274,7 @@ fn of_agent(id: i32, times: &str, cause: EndReason) -> (&'static str, String, St
                 "Agent {id} ended by itself {times} without complete results: its checkpoint is missing, malformed or has \
                  no global record."
             ),
-            in_the_log_of(id),
+            in_the_log_of(id, words),
         ),
         EndReason::CannotStart | EndReason::StartError => (
             reasons::CANNOT_START,
@@ -270,18 +288,20 @@ fn of_agent(id: i32, times: &str, cause: EndReason) -> (&'static str, String, St
         ),
         EndReason::BlamesSimulator => (
             reasons::AGENT_CRASHED,
-            format!("Agent {id} ended {times} and blamed its simulator, which had not failed."),
+            format!("Agent {id} ended {times} and blamed its {host}, which had not failed."),
             for_both("Leave the files of the evaluator's runner alone, and submit again."),
         ),
         EndReason::PortTaken => (
             reasons::AGENT_CRASHED,
-            format!("Another container of the Pod listened on the port of simulator {id}, which failed {times}."),
-            for_both("Let the agents listen on no port of a simulator, and submit again."),
+            format!("Another container of the Pod listened on the port of {host} {id}, which failed {times}."),
+            for_both(&format!(
+                "Let the agents listen on no port of a {host}, and submit again."
+            )),
         ),
         _ => (
             reasons::AGENT_CRASHED,
             format!("Agent {id} crashed {times}."),
-            in_the_log_of(id),
+            in_the_log_of(id, words),
         ),
     }
 }
@@ -302,12 +322,13 @@ pub(super) fn for_both(step: &str) -> Steps {
 }
 
 /// The log of an agent explains what happened. Only hosts can read it.
-fn in_the_log_of(agent: i32) -> Steps {
+fn in_the_log_of(agent: i32, words: &Words) -> Steps {
     Steps {
         hosts: of_participant(reasons::AGENT_CRASHED).replace("<n>", &agent.to_string()),
-        participant:
-            "Reproduce it on routes of your own, fix the agent and submit again; the challenge's hosts have its log."
-                .to_owned(),
+        participant: format!(
+            "Reproduce it on {} of your own, fix the agent and submit again; the challenge's hosts have its log.",
+            words.units
+        ),
     }
 }
 
@@ -340,11 +361,11 @@ fn infrastructure_for_participants(reason: &str) -> String {
         reasons::NODE_LOST => "The machine that ran the submission was lost.",
         reasons::NODE_INTERRUPTED => "The machine that ran the submission was taken away.",
         reasons::RESULTS_NOT_STORED => "The results could not be stored.",
-        reasons::SIMULATION_CRASHED => "The simulator crashed.",
+        reasons::SIMULATION_CRASHED => "The simulation crashed.",
         reasons::NO_GPU => "The machine that ran the submission had no GPU for it.",
         reasons::NODE_CANNOT_START => "The machine that was to run the submission could not start it.",
         reasons::DISK_FULL => "The run's disk was full.",
-        reasons::GRAPHICS_DRIVER_MISSING => "The machine that ran the submission could not run the simulator.",
+        reasons::GRAPHICS_DRIVER_MISSING => "The machine that ran the submission had no driver for its simulation.",
         reasons::START_DEADLINE => "The run could not be started in time.",
         reasons::SCHEDULE_DEADLINE => "No machine was free for the submission in time.",
         reasons::JOB_DELETED | reasons::JOB_EXPIRED | reasons::JOB_FAILED => "The cluster ended the run.",

@@ -113,7 +113,7 @@ pub enum Question {
 pub enum EvalaiUpdate {
     Queued,
     Running,
-    /// A partial result; `is_shown`: with the metrics over the routes so far, else with the original's zeros.
+    /// A partial result; `is_shown`: with the metrics over what is done so far, else with the original's zeros.
     Partial {
         is_shown: bool,
     },

@@ -54,7 +54,7 @@ pub(super) fn watch(draft: &mut PlanBuilder<'_>) {
         return;
     };
     if ran >= limit {
-        draft.fail(failure::time_limit(limit));
+        draft.fail(failure::time_limit(limit, draft.words()));
     } else if goes_on(draft) {
         draft.requeue_at(after(draft.now(), limit - ran));
     }

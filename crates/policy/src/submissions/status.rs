@@ -14,6 +14,7 @@ use leaderboard_api::{
     Attempt, BlockedSince, Deadlines, Failure, Ingested, LeaderboardSpec, Retries, RunPlan, Score, State, Submission,
     SubmissionSpec, SubmissionStatus, effective, names, reasons,
 };
+use leaderboard_evaluation::{Words, words};
 
 /// Reasons that Kubernetes' own events and the status show anyway: a write for each would cost every submission the same again.
 const WITHOUT_EVENT: [&str; 4] = [
@@ -95,6 +96,11 @@ impl<'a> PlanBuilder<'a> {
             per_worker: 0,
             infrastructure: 0,
         }
+    }
+
+    /// The words of the kind of evaluation that is run.
+    pub(super) fn words(&self) -> &'static Words {
+        words(self.status.plan.as_ref())
     }
 
     pub(super) fn now(&self) -> Timestamp {

@@ -92,10 +92,11 @@ fn show(draft: &mut PlanBuilder<'_>) {
             return draft.replacing(&what);
         }
         Some(failure) => format!(
-            "{} The run is being stopped; completed routes are kept.",
-            failure.message
+            "{} The run is being stopped; completed {} are kept.",
+            failure.message,
+            draft.words().units
         ),
-        None if draft.is_cancelled() => "Stopping as requested; completed routes are kept.".to_owned(),
+        None if draft.is_cancelled() => format!("Stopping as requested; completed {} are kept.", draft.words().units),
         None => {
             let wanted = draft.spec().attempt;
             let what =
@@ -195,7 +196,7 @@ pub(super) fn leaves_lost_pod(draft: &mut PlanBuilder<'_>, job: &JobView) -> boo
         draft.requeue_at(at);
         return false;
     }
-    let found = failure::node_lost(pod.node.as_deref(), draft.view.node.state);
+    let found = failure::node_lost(pod.node.as_deref(), draft.view.node.state, draft.words());
     draft.replacing(&found.message);
     draft.fail(found);
     if force(draft, pod) {

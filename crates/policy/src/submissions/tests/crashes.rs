@@ -347,7 +347,7 @@ fn a_node_whose_driver_cannot_draw_is_no_reason_for_another_job() {
         .failure
         .unwrap();
     assert_eq!(failure.class, Infrastructure);
-    let begin = "Simulator 1 had a GPU and could not draw: the NVIDIA driver of node node-a has no Vulkan/OpenGL part (nvidia_icd.json). \
+    let begin = "The simulator of pair 1 had a GPU and could not draw: the NVIDIA driver of node node-a has no Vulkan/OpenGL part (nvidia_icd.json). \
                  Use a node image";
     assert!(failure.message.starts_with(begin), "{}", failure.message);
 }
