@@ -1,4 +1,4 @@
-"""Owns what the documents promise about the repository: a runbook for each alert, links that lead somewhere, tests that exist.
+"""Owns what the documents promise of the repository: runbooks for alerts, links that lead somewhere, tests, files and names that exist.
 
 Pure but for reading files. Called by the chart's test and by local/tests.
 """
@@ -27,6 +27,11 @@ PYTHON_TEST = re.compile(r"^    def (test_\w+)", re.MULTILINE)
 # The chart's test is no unittest: it checks by functions, each of which it names once.
 CHART_CHECK = re.compile(r"^ +check\(\".+\", lambda: (?:\w+\.)?(\w+)\(", re.MULTILINE)
 PAGE_CHECK = re.compile(r'^    "[^"]+": (\w+),$', re.MULTILINE)
+# A file of the source as a page writes it, whole or by its end: `crates/policy/src/plan.rs`, `queue/choose.rs`.
+PLACE = re.compile(
+    r"`((?:[\w.-]+/)*[\w.-]+\.(?:rs|py)|(?:src|crates|tests|local|benches|charts|examples)/[\w./-]*\w/?)`"
+)
+NAME_IN_PLACE = re.compile(r"`([\w:]+)` in\s+`((?:[\w.-]+/)*[\w.-]+\.(?:rs|py))`")
 KINDS = ("held", "by policy", "inherent", "open", "struck")
 # How the sums are written in the text, so that it cannot contradict its table.
 SUMS = re.compile(
@@ -74,6 +79,32 @@ def pages(repository: Path) -> list[Path]:
     argv = ["git", "-C", str(repository), "ls-files", "--cached", "--others", "--exclude-standard", "*.md"]
     listed = subprocess.run(argv, capture_output=True, text=True, check=True).stdout.splitlines()
     return [repository / name for name in sorted(set(listed)) if (repository / name).exists()]
+
+
+def tracked(repository: Path) -> list[str]:
+    """Every file that git knows."""
+    argv = ["git", "-C", str(repository), "ls-files"]
+    return subprocess.run(argv, capture_output=True, text=True, check=True).stdout.splitlines()
+
+
+def place_faults(repository: Path, page: Path, files: Sequence[str]) -> Iterator[str]:
+    """Files that a page of the house names and that do not exist, and names that are not in the file where the page places them."""
+    text = FENCE.sub("", page.read_text())
+    for place in sorted(set(PLACE.findall(text))):
+        if not _named(place, files):
+            yield f"{page.name}: there is no {place}"
+    for name, place in NAME_IN_PLACE.findall(text):
+        texts = [(repository / file).read_text() for file in _named(place, files)]
+        word = re.compile(rf"\b{name.split('::')[-1]}\b")
+        if texts and not any(word.search(text) for text in texts):
+            yield f"{page.name}: {name} is not in {place}"
+
+
+def _named(place: str, files: Sequence[str]) -> list[str]:
+    """The files of that name, or below the folder of that name."""
+    place = place.rstrip("/")
+    ends = [file for file in files if f"/{file}".endswith(f"/{place}")]
+    return ends or [file for file in files if f"/{place}/" in f"/{file}"]
 
 
 def anchors(text: str) -> set[str]:

@@ -1,6 +1,7 @@
 """What the documents promise: runbooks, links, and the tests that the table of attacks names."""
 
 import re
+import tempfile
 import unittest
 from pathlib import Path
 
@@ -37,6 +38,36 @@ class Links(unittest.TestCase):
         pages = doccheck.pages(REPOSITORY)
         self.assertGreater(len(pages), 20)
         self.assertEqual([fault for page in pages for fault in doccheck.link_faults(page)], [])
+
+
+class Places(unittest.TestCase):
+    """Pages that lead a contributor to a file: those of hosts name the objects of a cluster and the keys of a bucket as well."""
+
+    def test_every_file_and_name_in_a_page_for_contributors_exists(self) -> None:
+        files = doccheck.tracked(REPOSITORY)
+        pages = [
+            REPOSITORY / name
+            for name in ("CONTRIBUTING.md", "docs/architecture.md", "local/changes.md", "tests/README.md")
+        ]
+        # The ledger names what is gone.
+        pages += sorted(page for page in (REPOSITORY / "docs" / "decisions").glob("*.md") if page.name != "ledger.md")
+        self.assertEqual([fault for page in pages for fault in doccheck.place_faults(REPOSITORY, page, files)], [])
+
+    def test_what_a_page_misplaces_is_named(self) -> None:
+        files = ("local/labkit/doccheck.py", "src/cli/mod.rs")
+        with tempfile.TemporaryDirectory() as folder:
+            page = Path(folder) / "page.md"
+            page.write_text(
+                "`place_faults` in `labkit/doccheck.py`, `src/cli`, `cli/mod.rs`, `<run>/agent.rs`, and `s3/key/of.txt`"
+            )
+            self.assertEqual(list(doccheck.place_faults(REPOSITORY, page, files)), [])
+            page.write_text("`absent` in\n`doccheck.py`, `src/page`, `check.py`")
+            faults = [
+                "page.md: there is no check.py",
+                "page.md: there is no src/page",
+                "page.md: absent is not in doccheck.py",
+            ]
+            self.assertEqual(list(doccheck.place_faults(REPOSITORY, page, files)), faults)
 
 
 class Logs(unittest.TestCase):
