@@ -1,6 +1,12 @@
 //! What the controller and the programs in a Pod agree on: what a Pod is given (`run`), what it reports (`report`), what `workspace`
 //! ends with (`verdict`), and the names of what is stored (`keys`).
 //!
+//! ```text
+//! controller ── run (variable LEADERBOARD_RUN) ──▶ workspace, logcopy
+//! controller ◀── report (logcopy/report.json in S3) ── logcopy
+//! controller ◀── verdict (termination message) ── workspace
+//! ```
+//!
 //! Pods and controller may be of different versions, so that each document has a number. Golden files hold each version that was.
 #![cfg_attr(not(test), deny(clippy::indexing_slicing, clippy::arithmetic_side_effects))]
 
