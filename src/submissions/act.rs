@@ -1,4 +1,5 @@
-//! Carries a plan out: finalizer, status, children, requests, events, in this order. Decides nothing.
+//! Carries a plan out, in this order: finalizer, status, events, then the actions. A Job is created last, because a quota may refuse it for
+//! hours. Decides nothing.
 //!
 //! Every step is safe to repeat. A failed status write ends the reconcile, because what follows would not be remembered.
 

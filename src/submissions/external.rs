@@ -206,7 +206,7 @@ fn wants_image(submission: &Submission) -> bool {
     submission.spec.image.is_none() && !has_ended
 }
 
-/// Where a Leaderboard only observes, the other program's end is no end of its own run; a cancel is one of both.
+/// In Observe mode only a cancel in EvalAI ends our run; `finished` and `failed` are the other program's.
 fn as_observed(seen: SubmissionState, observes: bool) -> SubmissionState {
     let is_others = |status: &Status| observes && matches!(status, Status::Finished | Status::Failed);
     SubmissionState {

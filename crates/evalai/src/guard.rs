@@ -2,10 +2,14 @@
 //!
 //! Called by `queue` with each read. Pure: a status in, a verdict out.
 //!
-//! An [`Attempt`] has `begun` when the end of an earlier one no longer stands: its Job is in the row's `job_name`, or the read
-//! was requested after EvalAI had answered its `queued`, or after another read had shown the submission as live. Only then does
-//! `failed` are about this attempt. So does `cancelled`, but EvalAI resumes only what has failed: before an attempt that it has
-//! asked for has begun, `cancelled` is a new cancel. Only an attempt that a person has begun here follows a cancelled one.
+//! An [`Attempt`] has `begun` when the end of an earlier one no longer stands:
+//!
+//! - its Job is in the row's `job_name`;
+//! - or the read was sent after EvalAI had answered our `queued`;
+//! - or an earlier read showed the submission as live.
+//!
+//! Until then `failed` belongs to the attempt before. `cancelled` does so only for an attempt that a person has begun here: EvalAI resumes
+//! only what has failed, so before an attempt that it has asked for has begun, `cancelled` is a new cancel.
 
 use leaderboard_api as api;
 use leaderboard_api::evalai_status::{Outcome, Progress, Status};

@@ -174,8 +174,8 @@ impl State {
         Some(Begun { key, class, waited })
     }
 
-    /// A reconcile that runs knows whether it creates a Job. False: it has no permit, and ends with `After::WithPermit`. One that
-    /// creates none gives its permit back.
+    /// Exchanges the permit of a reconcile once its plan is known. A plan that creates a Job takes one: false if none is free, and the
+    /// reconcile ends with `After::WithPermit`. Any other plan returns it.
     pub fn may_continue(&mut self, key: &Key, creates_job: bool) -> bool {
         let Some(Stage::Runs(run)) = self.objects.get_mut(key).map(|object| &mut object.stage) else {
             return !creates_job;

@@ -8,7 +8,7 @@ use crate::view::{LogPlace, ReportDemand};
 use leaderboard_api::{JobNumber, SubmissionStatus, names};
 use leaderboard_contract::run::Stop;
 
-/// The result of a reconcile: the status to show, then the actions in order, then the events.
+/// The result of a reconcile: the status to show, the actions in order, and the events.
 #[derive(Clone, Debug, PartialEq)]
 pub struct Plan {
     pub status: SubmissionStatus,
