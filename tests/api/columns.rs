@@ -124,17 +124,17 @@ async fn submissions_fill_their_columns() {
     assert_eq!(
         table(&client, Kind::Submission, &namespace, false).await,
         "\
-NAME            LEADERBOARD   TRACK     STATE     REASON    PROGRESS   SCORE    QUEUE            AGE
-new             local         <none>    <none>    <none>    <none>     <none>   <none>           <age>
-submission-42   local         sensors   Running   Resumed   12/20      ~41.20   1st, 20-40 min   <age>
+NAME            TEAM         TRACK     STATE     REASON    PROGRESS   SCORE    QUEUE            AGE
+new             <none>       <none>    <none>    <none>    <none>     <none>   <none>           <age>
+submission-42   Team Seven   sensors   Running   Resumed   12/20      ~41.20   1st, 20-40 min   <age>
 "
     );
     assert_eq!(
         table(&client, Kind::Submission, &namespace, true).await,
         "\
-NAME            LEADERBOARD   TRACK     STATE     REASON    PROGRESS   SCORE    QUEUE            AGE     TEAM         ATTEMPT   FAILURE          PUBLISHED   DURATION   NODE     RESULTS
-new             local         <none>    <none>    <none>    <none>     <none>   <none>           <age>   <none>       <none>    <none>           <none>      <none>     <none>   <none>
-submission-42   local         sensors   Running   Resumed   12/20      ~41.20   1st, 20-40 min   <age>   Team Seven   2         Infrastructure   Published   1h25m      node-1   s3://results/a/42
+NAME            TEAM         TRACK     STATE     REASON    PROGRESS   SCORE    QUEUE            AGE     LEADERBOARD   ATTEMPT   FAILURE          PUBLISHED   DURATION   NODE     RESULTS
+new             <none>       <none>    <none>    <none>    <none>     <none>   <none>           <age>   local         <none>    <none>           <none>      <none>     <none>   <none>
+submission-42   Team Seven   sensors   Running   Resumed   12/20      ~41.20   1st, 20-40 min   <age>   local         2         Infrastructure   Published   1h25m      node-1   s3://results/a/42
 "
     );
 }
