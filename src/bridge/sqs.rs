@@ -13,7 +13,7 @@ use super::queue::{Reader, batch_size};
 use crate::intake::source::{Received, SetAside, Source, named};
 use crate::kubernetes::{Namespaces, call_within};
 use crate::observability::liveness::Liveness;
-use leaderboard_api::{Leaderboard, reasons};
+use leaderboard_api::{Leaderboard, Reason};
 use leaderboard_base::lock::lock;
 use leaderboard_base::meter::Meter;
 use leaderboard_policy::intake::route::{self, DeadReason, Rules};
@@ -158,7 +158,7 @@ impl Source for SqsQueue {
         let sent = self.reader()?.send_dead(to, message, reason).await;
         sent.map_err(|error| error.to_string())?;
         Ok(SetAside {
-            reason: reasons::DEAD_LETTER,
+            reason: Reason::DeadLetter,
             note: format!("Moved to the dead-letter queue: {}", named(message, reason)),
         })
     }

@@ -16,7 +16,7 @@ use crate::intake::source::{Received, SetAside, Source, named};
 use crate::leaderboards::operator;
 use crate::runtime::objects::key_of;
 use leaderboard_api::text::one_line;
-use leaderboard_api::{EvalaiQueue, Leaderboard, reasons};
+use leaderboard_api::{EvalaiQueue, Leaderboard, Reason};
 use leaderboard_base::backoff::Backoff;
 use leaderboard_base::object_key::ObjectKey;
 use leaderboard_evalai::answer::{About, Answer};
@@ -234,7 +234,7 @@ impl Source for Inbox {
         let text = one_line(&message.body, QUOTED);
         let (queue, what) = (&self.way.name, named(message, reason));
         Ok(SetAside {
-            reason: reasons::MESSAGE_DROPPED,
+            reason: Reason::MessageDropped,
             note: format!("Deleted from EvalAI's queue {queue}: {what}. It was {text}"),
         })
     }

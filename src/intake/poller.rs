@@ -20,7 +20,7 @@ use super::source::{Received, Source, named};
 use crate::bridge::leaderboards::Leaderboards;
 use crate::kubernetes::call_within;
 use leaderboard_api::text::one_line;
-use leaderboard_api::{Leaderboard, reasons};
+use leaderboard_api::{Leaderboard, Reason};
 use leaderboard_base::backoff::Backoff;
 use leaderboard_policy::intake::message;
 use leaderboard_policy::intake::route::{self, DeadReason, Envelope, Later, MessageOutcome, Outcome, Rules};
@@ -49,7 +49,7 @@ pub struct Poller<S> {
     /// Mean time that a message takes.
     each: Duration,
     ages: Ages,
-    events: HashMap<&'static str, Instant>,
+    events: HashMap<Reason, Instant>,
 }
 
 /// The Leaderboards that read the queue, while one batch is processed.
@@ -296,7 +296,7 @@ impl<S: Source> Poller<S> {
             Err(problem) => {
                 let what = named(message, reason);
                 let note = format!("A message can't be used and stays in the queue: {what}. {problem}");
-                (reasons::QUEUE_BLOCKED, note)
+                (Reason::QueueBlocked, note)
             }
         };
         let (queue, reason_name) = (&self.queue, reason.as_str());
@@ -309,15 +309,15 @@ impl<S: Source> Poller<S> {
     }
 
     /// An event on the oldest Leaderboard of the queue.
-    async fn publish(&mut self, readers: &Readers, reason: &'static str, note: &str) {
-        let is_recent = self.events.get(reason).is_some_and(|at| at.elapsed() < EVENT_PAUSE);
+    async fn publish(&mut self, readers: &Readers, reason: Reason, note: &str) {
+        let is_recent = self.events.get(&reason).is_some_and(|at| at.elapsed() < EVENT_PAUSE);
         let Some(leaderboard) = readers.all.first().filter(|_| !is_recent) else {
             return;
         };
         self.events.insert(reason, Instant::now());
         let event = Event {
             type_: EventType::Warning,
-            reason: reason.to_owned(),
+            reason: reason.as_str().to_owned(),
             note: Some(one_line(note, 1000)),
             action: "ReadQueue".to_owned(),
             secondary: None,
@@ -326,7 +326,7 @@ impl<S: Source> Poller<S> {
         let published = self.shared.recorder.publish(&event, &reference);
         let name = reference.name.as_deref().unwrap_or_default();
         if let Err(error) = call_within(CALL_LIMIT, "an event", name, published).await {
-            tracing::warn!(reason, "{error}");
+            tracing::warn!(%reason, "{error}");
         }
     }
 

@@ -3,7 +3,7 @@
 use std::sync::Arc;
 use std::time::Duration;
 
-use leaderboard_api::Leaderboard;
+use leaderboard_api::{Leaderboard, Reason};
 use leaderboard_policy::intake::route::{DeadReason, Hindrance, Rules};
 
 /// A message that was received and is ours until its visibility lapses.
@@ -29,7 +29,7 @@ pub struct Received {
 
 /// What was done with a message that cannot be used, for an event.
 pub struct SetAside {
-    pub reason: &'static str,
+    pub reason: Reason,
     pub note: String,
 }
 

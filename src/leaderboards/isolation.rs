@@ -20,7 +20,7 @@ use crate::runtime::objects::{Wake, key_of, uid_of};
 use crate::runtime::stores::Stores;
 use crate::slots::Slots;
 use leaderboard_api::text::sentence;
-use leaderboard_api::{Enforcement, Leaderboard, PolicySource, conditions, names, reasons};
+use leaderboard_api::{Enforcement, Leaderboard, PolicySource, Reason, conditions, names};
 use leaderboard_contract::verdict::{NotAVerdict, WorkspaceReason, WorkspaceVerdict};
 use leaderboard_pod_spec::network_policy::{is_in_place, network_policy};
 use leaderboard_policy::leaderboards::view::Policy;
@@ -283,9 +283,9 @@ fn known(leaderboard: &Leaderboard) -> Option<WorkspaceVerdict> {
     if known.observed_generation != leaderboard.metadata.generation {
         return None;
     }
-    let reason = match known.reason.as_str() {
-        reasons::ENFORCED => WorkspaceReason::Enforced,
-        reasons::NOT_ENFORCED => WorkspaceReason::NotEnforced,
+    let reason = match known.reason.known()? {
+        Reason::Enforced => WorkspaceReason::Enforced,
+        Reason::NotEnforced => WorkspaceReason::NotEnforced,
         _ => return None,
     };
     Some(WorkspaceVerdict::new(reason, known.message.to_string()))

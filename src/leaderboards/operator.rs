@@ -16,7 +16,7 @@ use super::state::{LeaderboardState, SOONEST};
 use crate::kubernetes::{CallError, call};
 use crate::runtime::objects::{key_of, uid_of};
 use crate::runtime::writes::patch_by;
-use leaderboard_api::{Leaderboard, names, reasons};
+use leaderboard_api::{Leaderboard, Reason, names};
 
 /// When a Leaderboard of another installation is looked at again, in the cache alone: a changed status is no event.
 const LOOK_AGAIN: Duration = Duration::from_secs(10);
@@ -92,10 +92,10 @@ async fn report(recorder: &Recorder, leaderboard: &Leaderboard, other: &str, us:
         leaderboard.namespace().unwrap_or_default(),
         leaderboard.name_any(),
     );
-    tracing::warn!(leaderboard = %key, other, reason = reasons::OTHER_OPERATOR, "{note}");
+    tracing::warn!(leaderboard = %key, other, reason = %Reason::OtherOperator, "{note}");
     let event = Event {
         type_: EventType::Warning,
-        reason: reasons::OTHER_OPERATOR.to_owned(),
+        reason: Reason::OtherOperator.as_str().to_owned(),
         note: Some(note),
         action: "LeaveAlone".to_owned(),
         secondary: None,

@@ -9,7 +9,7 @@ use std::time::Duration;
 
 use leaderboard_api::conditions::Truth;
 use leaderboard_api::text::sentence;
-use leaderboard_api::{Leaderboard, reasons};
+use leaderboard_api::{Leaderboard, Reason};
 use leaderboard_base::backoff::Backoff;
 use leaderboard_policy::ask::{Ask, Failure, Lookup, Service};
 use leaderboard_policy::leaderboards::view::Unreachable;
@@ -44,12 +44,12 @@ impl AwsResource {
     ];
 
     /// The reason of a Leaderboard that cannot do without it.
-    fn reason(self) -> Option<&'static str> {
+    fn reason(self) -> Option<Reason> {
         match self {
-            Self::Bucket => Some(reasons::BUCKET_UNREACHABLE),
-            Self::Table => Some(reasons::TABLE_UNREACHABLE),
-            Self::Queue => Some(reasons::QUEUE_UNREACHABLE),
-            Self::DeadLetterQueue => Some(reasons::DEAD_LETTER_QUEUE_UNREACHABLE),
+            Self::Bucket => Some(Reason::BucketUnreachable),
+            Self::Table => Some(Reason::TableUnreachable),
+            Self::Queue => Some(Reason::QueueUnreachable),
+            Self::DeadLetterQueue => Some(Reason::DeadLetterQueueUnreachable),
             // No result depends on lines in CloudWatch, and rows wait for their table.
             Self::Rows | Self::LogGroup => None,
         }
@@ -126,7 +126,7 @@ impl Reach {
         let (reason, (truth, _)) = said.first()?;
         Some(Unreachable {
             truth: *truth,
-            reason,
+            reason: *reason,
             message: said
                 .iter()
                 .map(|(_, (_, why))| capitalized(why))
@@ -226,7 +226,7 @@ mod tests {
             assert_eq!(reach.unreachable(), None);
             assert_eq!(reach.notes(), ["It does not exist; create it."]);
             reach.0.push(found(AwsResource::Table, Some(bad()), None));
-            assert_eq!(reach.unreachable().unwrap().reason, reasons::TABLE_UNREACHABLE);
+            assert_eq!(reach.unreachable().unwrap().reason, Reason::TableUnreachable);
             reach.0[0] = found(resource, Some(Ok(Seen::default())), None);
             assert_eq!(reach.notes(), Vec::<String>::new());
         }
@@ -297,7 +297,7 @@ mod tests {
             found(AwsResource::Queue, Some(bad()), None),
         ]);
         let found = reach.unreachable().unwrap();
-        assert_eq!((found.truth, found.reason), (Truth::False, reasons::QUEUE_UNREACHABLE));
+        assert_eq!((found.truth, found.reason), (Truth::False, Reason::QueueUnreachable));
         assert_eq!(
             found.message,
             "It does not exist; create it. It does not answer; check the network."

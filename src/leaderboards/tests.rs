@@ -7,7 +7,7 @@ use tokio::time::Instant;
 
 use super::*;
 use crate::fixtures::{self, Cluster, Surroundings, surroundings};
-use leaderboard_api::reasons;
+use leaderboard_api::Reason;
 use leaderboard_pod_spec::network_policy::network_policy;
 
 /// Where nobody listens: each request is refused.
@@ -95,14 +95,14 @@ async fn a_bucket_that_never_answers_holds_up_no_reconcile_and_its_silence_wakes
     tokio::time::advance(FIRST_LOOK).await;
     let (wait, written, status) = reconciled(&mut around, &board).await;
     assert_eq!((wait, written), (RESYNC, vec!["status".to_owned()]));
-    assert_eq!(ready(&status), ("Unknown", reasons::CHECKING, Some(1)));
+    assert_eq!(ready(&status), ("Unknown", Reason::Checking.as_str(), Some(1)));
     assert_eq!(status["observedGeneration"], Value::Null);
     assert_eq!(began.elapsed(), FIRST_LOOK);
 
     answered(&mut around, &board).await;
     let (_, written, status) = reconciled(&mut around, &board).await;
     assert_eq!(written, ["status"]);
-    assert_eq!(ready(&status), ("Unknown", reasons::BUCKET_UNREACHABLE, Some(1)));
+    assert_eq!(ready(&status), ("Unknown", Reason::BucketUnreachable.as_str(), Some(1)));
     assert_eq!(status["observedGeneration"], 1);
 }
 
@@ -136,7 +136,7 @@ async fn an_edit_changes_nothing_that_is_shown_before_it_was_looked_at() {
     reconciled(&mut around, &board).await;
     answered(&mut around, &board).await;
     let (_, _, first) = reconciled(&mut around, &board).await;
-    assert_eq!(ready(&first), ("Unknown", reasons::BUCKET_UNREACHABLE, Some(1)));
+    assert_eq!(ready(&first), ("Unknown", Reason::BucketUnreachable.as_str(), Some(1)));
     board.status = serde_json::from_value(first).unwrap();
     board.status.as_mut().unwrap().operator = fixtures::leaderboard("any", NOBODY).status.unwrap().operator;
 
@@ -151,7 +151,7 @@ async fn an_edit_changes_nothing_that_is_shown_before_it_was_looked_at() {
     let (_, _, status) = reconciled(&mut around, &board).await;
     assert_eq!(
         ready(&status),
-        ("Unknown", reasons::BUCKET_UNREACHABLE, Some(1)),
+        ("Unknown", Reason::BucketUnreachable.as_str(), Some(1)),
         "as it was"
     );
     assert_eq!(status["observedGeneration"], 1);
@@ -188,7 +188,7 @@ async fn nothing_is_asked_of_a_leaderboard_that_names_what_it_may_not() {
     let mut around = around(&board, NOBODY).await;
     let (_, written, status) = reconciled(&mut around, &board).await;
     assert_eq!(written.len(), 2, "the policy, and at once the status: {written:?}");
-    assert_eq!(ready(&status), ("False", reasons::INSECURE_SERVER, Some(1)));
+    assert_eq!(ready(&status), ("False", Reason::InsecureServer.as_str(), Some(1)));
     let looked = around.context.asks.known(&Arc::new(board));
     assert!(looked.reach.0.iter().all(|(_, lookup)| lookup.asked.is_none()));
 }

@@ -6,7 +6,8 @@ use jiff::Timestamp;
 use kube::ResourceExt;
 use leaderboard_api::text::{one_line, sentence};
 use leaderboard_api::{
-    Attempt, EndReason, Failure, State, Submission, SubmissionStatus, WorkerState, WorkerStatus, conditions, reasons,
+    Attempt, EndReason, Failure, ReasonName, State, Submission, SubmissionStatus, WorkerState, WorkerStatus,
+    conditions, reasons,
 };
 use serde::Serialize;
 
@@ -142,6 +143,10 @@ fn with_status<T>(submission: &Submission, read: impl FnOnce(&SubmissionStatus) 
     }
 }
 
+fn reason(status: &SubmissionStatus) -> Option<String> {
+    status.reason.as_ref().map(|reason| name(reason.as_str()))
+}
+
 impl Waits {
     pub(super) fn of(submission: &Submission) -> Self {
         let created = submission.metadata.creation_timestamp.as_ref().map(|time| time.0);
@@ -150,8 +155,8 @@ impl Waits {
             let began = status.condition(conditions::FINISHED);
             let since = began.map(|c| c.last_transition_time.0).or(created);
             let waiting = status.waiting.as_deref();
-            let meaning = status.reason.as_deref().and_then(reasons::of);
-            let meaning = meaning.map(|reason| reasons::plain(reason.meaning));
+            let meaning = status.reason.as_ref().and_then(ReasonName::known);
+            let meaning = meaning.map(|reason| reasons::plain(reason.meaning()));
             let own = status.message.as_deref().unwrap_or_default();
             Self {
                 who: Who::of(submission),
@@ -159,7 +164,7 @@ impl Waits {
                 eta: waiting
                     .and_then(leaderboard_api::Waiting::eta)
                     .map(|eta| eta.to_string()),
-                reason: status.reason.as_deref().map(name),
+                reason: reason(status),
                 message: match meaning {
                     Some(meaning) if own.is_empty() => message(&meaning),
                     _ => message(own),
@@ -176,7 +181,7 @@ impl Runs {
             let (done, total, unit) = progress(status);
             Self {
                 who: Who::of(submission),
-                reason: status.reason.as_deref().map(name),
+                reason: reason(status),
                 attempt: status.attempt,
                 node: status.node_name.as_deref().map(name),
                 done,
@@ -223,7 +228,7 @@ impl Ended {
             Self {
                 who: Who::of(submission),
                 state: state.as_str(),
-                reason: status.reason.as_deref().map(name),
+                reason: reason(status),
                 score: score.map(|score| name(&score.text)),
                 is_final: score.is_some_and(|score| score.is_final),
                 done,
@@ -248,7 +253,7 @@ impl Failed {
         Self {
             who: Who::of(submission),
             class: failure.class.as_str(),
-            reason: name(&failure.reason),
+            reason: name(failure.reason.as_str()),
             message: message(&failure.message),
             time: end(submission).map(seconds),
         }

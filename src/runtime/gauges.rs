@@ -16,7 +16,7 @@ use crate::metrics::OTHERS;
 use crate::metrics::leader::{self, Samples};
 use crate::observability::Observability;
 use crate::runtime::objects::{board_of, key_of};
-use leaderboard_api::{FailureClass, Leaderboard, State, Submission, SubmissionStatus, conditions, reasons};
+use leaderboard_api::{FailureClass, Leaderboard, ReasonName, State, Submission, SubmissionStatus, conditions};
 use leaderboard_policy::census::Census;
 use leaderboard_policy::submissions::awaits_publication;
 
@@ -102,10 +102,8 @@ fn standing(submission: &Submission) -> [&'static str; 3] {
     let state = status.map_or(State::Pending, SubmissionStatus::state_of_conditions);
     let failure = status.and_then(|status| status.failure.as_ref());
     let class = failure.filter(|_| state == State::Failed).map(|failure| failure.class);
-    let reason = match status.and_then(|status| status.reason.as_deref()).unwrap_or_default() {
-        "" => "None",
-        name => reasons::of(name).map_or("Other", |reason| reason.name),
-    };
+    let reason = status.and_then(|status| status.reason.as_ref());
+    let reason = reason.map_or("None", ReasonName::label);
     [state.as_str(), reason, class.map_or("", FailureClass::as_str)]
 }
 

@@ -22,8 +22,7 @@ use crate::runtime::objects::{span_of, uid_of};
 use crate::slots::Slots;
 use crate::submissions::act::{ActError, act};
 use crate::submissions::observe::observe;
-use leaderboard_api::reasons::OTHER_OPERATOR;
-use leaderboard_api::{Leaderboard, Submission};
+use leaderboard_api::{Leaderboard, Reason, Submission};
 use leaderboard_base::backoff::jittered;
 use leaderboard_base::tasks::panic_message;
 use leaderboard_policy::submissions::{SlotUse, decide};
@@ -140,7 +139,7 @@ async fn reconcile_known(turn: Turn, submission: Arc<Submission>, shared: Arc<Sh
     let board = context.stores.leaderboard_for(&submission);
     if let Some(wait) = operator::left_alone(board.as_deref(), &context.settings.operator) {
         let metrics = &shared.telemetry.metrics;
-        metrics.reconciled(SUBMISSION, OTHER_OPERATOR, started.elapsed());
+        metrics.reconciled(SUBMISSION, Reason::OtherOperator.as_str(), started.elapsed());
         return After::In(jittered(wait, 0.2), Class::Refresh);
     }
     let work = async {
@@ -203,7 +202,7 @@ async fn reconcile_leaderboard(turn: Turn, shared: Arc<Shared>) -> After {
     let result = match limited(work.map(|result| result.map_err(ReconcileError::from))).await {
         Ok(Reconciled::LeftAlone(wait)) => {
             let metrics = &shared.telemetry.metrics;
-            metrics.reconciled(LEADERBOARD, OTHER_OPERATOR, started.elapsed());
+            metrics.reconciled(LEADERBOARD, Reason::OtherOperator.as_str(), started.elapsed());
             return After::In(wait, Class::Refresh);
         }
         Ok(Reconciled::Done(wait)) => Ok((Some(wait), Class::Refresh)),

@@ -26,7 +26,7 @@ use crate::runtime::stores::Stores;
 use crate::runtime::writes::{apply_status, patch_by, set_finalizer};
 use crate::slots::Slots;
 use leaderboard_api::text::one_line;
-use leaderboard_api::{JobNumber, RunPlan, State, Submission, SubmissionStatus, names, reasons};
+use leaderboard_api::{JobNumber, ReasonName, RunPlan, State, Submission, SubmissionStatus, names};
 use leaderboard_contract::run::Stop;
 use leaderboard_pod_spec::job as job_spec;
 use leaderboard_pod_spec::job::JobInput;
@@ -224,7 +224,7 @@ impl Actor<'_> {
             attempt = new.attempt.map(|attempt| attempt.0),
             from = old.map_or("none", |status| status.state_of_conditions().as_str()),
             to = new.state_of_conditions().as_str(),
-            reason = new.reason.as_deref(),
+            reason = new.reason.as_ref().map(ReasonName::as_str),
             "{}",
             new.message.as_deref().unwrap_or("the submission's state has changed")
         );
@@ -261,8 +261,7 @@ impl Actor<'_> {
         let failed = |status: &SubmissionStatus| status.state_of_conditions() == State::Failed;
         let is_known = failed(old) && old.attempt == new.attempt;
         if let Some(failure) = new.failure.as_ref().filter(|_| failed(new) && !is_known) {
-            let reason = reasons::of(&failure.reason).map_or("Other", |reason| reason.name);
-            let labels = [&self.leaderboard(), failure.class.as_str(), reason];
+            let labels = [&self.leaderboard(), failure.class.as_str(), failure.reason.label()];
             let failures = &self.uses.metrics.submissions.failures;
             failures.of(labels.map(str::to_owned)).inc();
         }
@@ -390,9 +389,9 @@ impl Actor<'_> {
             } else {
                 EventType::Normal
             },
-            reason: event.reason.clone(),
+            reason: event.reason.as_str().to_owned(),
             note: Some(one_line(&event.message, LONGEST_NOTE)),
-            action: event.reason.clone(),
+            action: event.reason.as_str().to_owned(),
             secondary: None,
         };
         let published = self.uses.recorder.publish(&note, &reference);

@@ -7,7 +7,7 @@ use sha2::{Digest, Sha256};
 
 use crate::observability::traces::{Kind, Span, Value};
 use crate::runtime::objects::uid_of;
-use leaderboard_api::{Submission, SubmissionStatus, names, reasons};
+use leaderboard_api::{Submission, SubmissionStatus, names};
 use leaderboard_base::trace_id::TraceId;
 use leaderboard_policy::phases::{Ended, Phase, restarted};
 
@@ -117,7 +117,7 @@ fn of_attempt(new: &SubmissionStatus) -> Vec<(&'static str, Value)> {
 /// The reason of an attempt that has failed, of the closed set.
 fn failed(new: &SubmissionStatus, phase: Phase) -> Option<&'static str> {
     let failure = new.failure.as_ref().filter(|_| phase == Phase::Attempt)?;
-    Some(reasons::of(&failure.reason).map_or("Other", |reason| reason.name))
+    Some(failure.reason.label())
 }
 
 #[cfg(test)]
@@ -126,7 +126,7 @@ mod tests {
     use serde_json::{Value as Json, json};
 
     use super::*;
-    use leaderboard_api::Attempt;
+    use leaderboard_api::{Attempt, Reason};
 
     fn submission(attempt: i64, status: &Json) -> Submission {
         serde_json::from_value(json!({
@@ -157,7 +157,7 @@ mod tests {
     fn what_a_restart_ends_is_of_the_attempt_before() {
         let old = json!({"attempt": 1, "jobName": "sub-1"});
         let new = status(json!({"attempt": 2, "conditions": [{
-            "type": "Finished", "status": "False", "reason": reasons::REPLACING, "message": "m",
+            "type": "Finished", "status": "False", "reason": Reason::Replacing, "message": "m",
             "lastTransitionTime": "2026-01-01T00:00:00Z",
         }]}));
         let spans = of(&submission(2, &old), &new, &[ended(Phase::Run), ended(Phase::Attempt)]);
@@ -169,9 +169,9 @@ mod tests {
     fn the_spans_of_a_failed_attempt_are_one_tree_that_names_the_reason() {
         let failed = json!({
             "attempt": 1, "state": "Failed",
-            "failure": {"class": "Participant", "reason": reasons::AGENT_CRASHED, "message": "m"},
+            "failure": {"class": "Participant", "reason": Reason::AgentCrashed, "message": "m"},
             "conditions": [{
-                "type": "Finished", "status": "True", "reason": reasons::AGENT_CRASHED, "message": "m",
+                "type": "Finished", "status": "True", "reason": Reason::AgentCrashed, "message": "m",
                 "lastTransitionTime": "2026-01-01T00:00:00Z",
             }],
         });
@@ -185,7 +185,7 @@ mod tests {
             panic!("{spans:?}")
         };
         assert_eq!((run.name, run.parent), ("run", Some(attempt.id)));
-        assert_eq!((run.error, attempt.error), (None, Some(reasons::AGENT_CRASHED)));
+        assert_eq!((run.error, attempt.error), (None, Some(Reason::AgentCrashed.as_str())));
         assert_eq!(run.trace, TraceId::of("uid-1"));
         for expected in [
             ("leaderboard.state", Value::Word("Failed")),

@@ -4,7 +4,7 @@
 use kube::Api;
 use kube::api::{Patch, PatchParams};
 use kube::runtime::wait::await_condition;
-use leaderboard_api::{Leaderboard, conditions, reasons};
+use leaderboard_api::{Leaderboard, Reason, conditions};
 use leaderboard_operator::runtime::settings::Settings;
 use serde_json::{Value, json};
 use tokio::time::timeout;
@@ -24,7 +24,7 @@ async fn change(world: &World, spec: &Value) {
 
 /// Waits until `Ready` has this reason; hands back its message.
 /// The message of `Ready` once it has this reason and this part.
-async fn until_says(world: &World, reason: &str, part: &str) -> String {
+async fn until_says(world: &World, reason: Reason, part: &str) -> String {
     let condition = |board: Option<&Leaderboard>| {
         let status = board.and_then(|board| board.status.as_ref())?;
         conditions::get(&status.conditions, conditions::READY).cloned()
@@ -56,7 +56,7 @@ async fn a_leaderboard_that_names_what_it_may_not_is_not_ready_until_it_does_not
     world
         .leaderboard_with("lb", 1, "Hosts", &json!({"queue": {"sqs": {"url": QUEUE}}}))
         .await;
-    let said = until_says(&world, reasons::NOT_ALLOWED, "").await;
+    let said = until_says(&world, Reason::NotAllowed, "").await;
     for part in ["the queue", QUEUE, "leaderboards[]", "in queues"] {
         assert!(said.contains(part), "{said}");
     }
@@ -64,7 +64,7 @@ async fn a_leaderboard_that_names_what_it_may_not_is_not_ready_until_it_does_not
 
     let entry = json!({"secretsManager": {"id": "payroll"}, "secretKeyRef": null});
     change(&world, &json!({"queue": null, "evalai": {"token": entry}})).await;
-    until_says(&world, reasons::NOT_ALLOWED, "Secrets Manager payroll").await;
+    until_says(&world, Reason::NotAllowed, "Secrets Manager payroll").await;
 
     let secret = json!({"secretsManager": null, "secretKeyRef": {"name": "evalai", "key": "token"}});
     change(
@@ -72,16 +72,16 @@ async fn a_leaderboard_that_names_what_it_may_not_is_not_ready_until_it_does_not
         &json!({"evalai": {"token": secret}, "table": {"dynamoDB": {"name": "theirs"}}}),
     )
     .await;
-    until_says(&world, reasons::NOT_ALLOWED, "the table theirs").await;
+    until_says(&world, Reason::NotAllowed, "the table theirs").await;
     change(
         &world,
         &json!({"table": null, "logs": {"cloudWatch": {"name": "theirs"}}}),
     )
     .await;
-    until_says(&world, reasons::NOT_ALLOWED, "the log group theirs").await;
+    until_says(&world, Reason::NotAllowed, "the log group theirs").await;
 
     change(&world, &json!({"logs": null})).await;
-    until_says(&world, reasons::READY, "").await;
+    until_says(&world, Reason::Ready, "").await;
     world.job(&name, 0).await;
     operator.end().await;
 }
@@ -92,7 +92,7 @@ async fn a_token_is_not_sent_in_clear_over_the_internet() {
     let _controller = world.controller();
     let server = json!({"evalai": {"apiServer": "http://evalai.example.org"}});
     world.leaderboard_with("lb", 1, "Hosts", &server).await;
-    let said = until_says(&world, reasons::INSECURE_SERVER, "").await;
+    let said = until_says(&world, Reason::InsecureServer, "").await;
     assert!(
         said.contains("http://evalai.example.org") && said.contains("use https"),
         "{said}"

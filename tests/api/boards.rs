@@ -12,7 +12,7 @@ use k8s_openapi::api::batch::v1::Job;
 use k8s_openapi::api::scheduling::v1::PriorityClass;
 use kube::api::{Api, Patch, PatchParams, PostParams};
 use kube::runtime::wait::await_condition;
-use leaderboard_api::{Condition, Leaderboard, conditions, reasons};
+use leaderboard_api::{Condition, Leaderboard, Reason, conditions};
 use serde_json::{Value, json};
 use tokio::net::TcpListener;
 use tokio::time::timeout;
@@ -110,7 +110,7 @@ impl World {
     }
 
     /// Waits until the Leaderboard shows this.
-    async fn says(&self, status: &str, reason: &str) -> Condition {
+    async fn says(&self, status: &str, reason: Reason) -> Condition {
         let api = self.boards().await;
         let found =
             |board: Option<&Leaderboard>| ready(board).is_some_and(|c| c.status == status && c.reason == reason);
@@ -176,7 +176,7 @@ async fn what_is_missing_is_named_until_it_is_there() {
     let world = World::new().await;
     let token = world.store_token().await;
     world.apply(&world.spec(&token)).await;
-    let said = world.says("False", reasons::BUCKET_UNREACHABLE).await;
+    let said = world.says("False", Reason::BucketUnreachable).await;
     let all = [
         world.bucket(),
         world.table(),
@@ -189,11 +189,11 @@ async fn what_is_missing_is_named_until_it_is_there() {
     assert!(said.message.contains("Create the bucket"), "{}", said.message);
     world.make_bucket().await;
     // Nobody edits anything here: it is asked again by itself.
-    let said = world.says("False", reasons::TABLE_UNREACHABLE).await;
+    let said = world.says("False", Reason::TableUnreachable).await;
     assert!(said.message.contains("check table.dynamoDB.name"), "{}", said.message);
     world.make_table().await;
     world.edit(1).await;
-    let said = world.says("False", reasons::QUEUE_UNREACHABLE).await;
+    let said = world.says("False", Reason::QueueUnreachable).await;
     assert!(
         said.message.contains("create it, or correct queue.sqs.url"),
         "{}",
@@ -201,11 +201,11 @@ async fn what_is_missing_is_named_until_it_is_there() {
     );
     world.aws.queue("queue").await;
     world.edit(2).await;
-    let said = world.says("False", reasons::DEAD_LETTER_QUEUE_UNREACHABLE).await;
+    let said = world.says("False", Reason::DeadLetterQueueUnreachable).await;
     assert!(!said.message.contains(&world.bucket()), "{}", said.message);
     world.aws.queue("dead").await;
     world.edit(3).await;
-    let said = world.says("True", reasons::READY).await;
+    let said = world.says("True", Reason::Ready).await;
     let ends = Timestamp::now() + SignedDuration::from_hours(20 * 24);
     let ends = ends.strftime("%Y-%m-%d").to_string();
     assert!(
@@ -246,7 +246,7 @@ async fn a_bucket_that_is_away_for_a_moment_changes_nothing() {
     world
         .apply(&json!({"spec": {"storage": {"s3": {"bucket": world.bucket(), "endpoint": proxy.endpoint()}}}}))
         .await;
-    let before = world.says("True", reasons::READY).await;
+    let before = world.says("True", Reason::Ready).await;
     proxy.set_away(true);
     world.edit(1).await;
     let silent = "leaderboard_cloud_calls_total{service=\"s3\",op=\"ListObjectsV2\",outcome=\"unavailable\"}";
@@ -275,7 +275,7 @@ async fn a_bucket_that_has_never_answered_is_not_known() {
     world
         .apply(&json!({"spec": {"storage": {"s3": {"bucket": world.bucket(), "endpoint": endpoint}}}}))
         .await;
-    let said = world.says("Unknown", reasons::BUCKET_UNREACHABLE).await;
+    let said = world.says("Unknown", Reason::BucketUnreachable).await;
     assert!(said.message.contains("did not answer within 10 s"), "{}", said.message);
     world
         .counted("leaderboard_cloud_calls_total{service=\"s3\",op=\"ListObjectsV2\",outcome=\"abandoned\"}")
@@ -293,7 +293,7 @@ async fn a_missing_table_stops_no_submission() {
         "table": {"dynamoDB": {"name": world.table(), "endpoint": endpoint}},
     }});
     world.apply(&spec).await;
-    world.says("False", reasons::TABLE_UNREACHABLE).await;
+    world.says("False", Reason::TableUnreachable).await;
     let client = server().await.client();
     let api = Kind::Submission.api(&client, &world.namespace);
     let patch = json!({"spec": {"leaderboardName": NAME}});
@@ -303,7 +303,7 @@ async fn a_missing_table_stops_no_submission() {
     let jobs: Api<Job> = Api::namespaced(client, &world.namespace);
     let made = await_condition(jobs, "one-1", |job: Option<&Job>| job.is_some());
     timeout(LIMIT, made).await.expect("its Job is made").unwrap();
-    world.says("False", reasons::TABLE_UNREACHABLE).await;
+    world.says("False", Reason::TableUnreachable).await;
     world.operator.end().await;
 }
 
@@ -316,7 +316,7 @@ async fn the_priority_class_of_a_track_has_to_be_there_and_must_not_preempt() {
     let storage = json!({"bucket": world.bucket(), "endpoint": world.aws.endpoint});
     let spec = json!({"spec": {"tracks": tracks(class("waits")), "storage": {"s3": storage}}});
     world.apply(&spec).await;
-    let said = world.says("False", reasons::INVALID_POD).await;
+    let said = world.says("False", Reason::InvalidPod).await;
     let expected = format!("PriorityClass {} of the track sensors does not exist.", class("waits"));
     assert!(said.message.starts_with(&expected), "{}", said.message);
 
@@ -327,11 +327,11 @@ async fn the_priority_class_of_a_track_has_to_be_there_and_must_not_preempt() {
         classes.create(&PostParams::default(), &class).await.unwrap();
     }
     // Nobody edits anything: it is asked again by itself.
-    world.says("True", reasons::READY).await;
+    world.says("True", Reason::Ready).await;
     let patch = Patch::Merge(json!({"spec": {"tracks": tracks(class("preempts"))}}));
     let boards = world.boards().await;
     boards.patch(NAME, &PatchParams::default(), &patch).await.unwrap();
-    let said = world.says("False", reasons::INVALID_POD).await;
+    let said = world.says("False", Reason::InvalidPod).await;
     assert!(said.message.contains("preemptionPolicy: Never"), "{}", said.message);
     world.operator.end().await;
 }

@@ -12,7 +12,7 @@ use super::bridge::{LIMIT, StandIn};
 use super::objects::{Kind, create};
 use super::operator::Operator;
 use crate::support::apiserver::server;
-use leaderboard_api::{Leaderboard, Submission, conditions, reasons};
+use leaderboard_api::{Leaderboard, Reason, Submission, conditions};
 use leaderboard_operator::leaderboards::claims::{keep, remove_others};
 use leaderboard_pod_spec::gpu_claims::{resource, template};
 use leaderboard_policy::leaderboards::view::Claims;
@@ -85,7 +85,7 @@ impl World {
     }
 
     /// The message of `Ready`, once it is False with this reason.
-    async fn not_ready(&self, reason: &str) -> String {
+    async fn not_ready(&self, reason: Reason) -> String {
         let ready = |found: &Leaderboard| {
             let conditions = found.status.as_ref()?.conditions.as_slice();
             let ready = conditions::get(conditions, conditions::READY)?.clone();
@@ -159,12 +159,12 @@ async fn a_template_is_applied_named_by_jobs_and_kept_as_long_as_one_needs_it() 
 async fn a_template_of_the_hosts_that_is_missing_is_named_and_no_job_is_made() {
     let world = World::new(&json!({"resourceClaimTemplateName": "mine"})).await;
     let operator = Operator::start(&world.namespace, world.aws.aws.clone()).await;
-    let message = world.not_ready(reasons::CLAIM_TEMPLATE_MISSING).await;
+    let message = world.not_ready(Reason::ClaimTemplateMissing).await;
     let submissions: Api<Submission> = Api::namespaced(world.client.clone(), &world.namespace);
     world.submit().await;
     let is_held = await_condition(submissions, "sub", |found: Option<&Submission>| {
-        let reason = found.and_then(|found| found.status.as_ref()?.reason.as_deref());
-        reason == Some(reasons::LEADERBOARD_NOT_READY)
+        let status = found.and_then(|found| found.status.as_ref());
+        status.is_some_and(|status| status.shows(Reason::LeaderboardNotReady))
     });
     timeout(LIMIT, Box::pin(is_held)).await.expect("it waits").unwrap();
     assert!(

@@ -16,7 +16,7 @@ use kube::api::{DeleteParams, PostParams};
 use kube::runtime::wait::await_condition;
 use leaderboard_api::names::FAILURE_LOG_KEY;
 use leaderboard_api::{
-    Attempt, JobNumber, Leaderboard, State, Submission, SubmissionStatus, conditions, names, reasons,
+    Attempt, JobNumber, Leaderboard, Reason, State, Submission, SubmissionStatus, conditions, names,
 };
 use leaderboard_aws::archive::Archive;
 use leaderboard_contract::report::{OWNER_KEY, Owner};
@@ -87,7 +87,7 @@ async fn a_result_that_a_hosts_rerun_cancels_in_evalai_is_shown_so() {
     let statuses = [pk, new].map(|pk| world.evalai.with_state(|state| state.submissions[&pk].status));
     assert_eq!(statuses, [Status::Cancelled, Status::Submitted]);
     let published = |s: &SubmissionStatus| conditions::get(&s.conditions, conditions::PUBLISHED).cloned();
-    let is_shown = |s: &SubmissionStatus| published(s).is_some_and(|c| c.reason == reasons::CANCELLED_IN_EVALAI);
+    let is_shown = |s: &SubmissionStatus| published(s).is_some_and(|c| c.reason == Reason::CancelledInEvalAI);
     world.until(&name, "its result counts no more", is_shown).await;
     let status = world.api::<Submission>().get(&name).await.unwrap().status.unwrap();
     assert_eq!(status.state, Some(State::Finished), "its result stays");
@@ -132,7 +132,7 @@ async fn after_a_controller_that_did_not_confirm_its_requests_everybody_reads_un
     let waits = |s: &SubmissionStatus| {
         let published = conditions::get(&s.conditions, conditions::PUBLISHED);
         published.is_some_and(|c| {
-            c.status == "False" && c.reason == "WaitingForPreviousController" && c.message.starts_with(text)
+            c.status == "False" && c.reason == Reason::WaitingForPreviousController && c.message.starts_with(text)
         })
     };
     world.until(&name, "Published says until when", waits).await;

@@ -7,7 +7,7 @@ use k8s_openapi::api::core::v1::Container;
 use kube::ResourceExt;
 use kube::api::{DeleteParams, ListParams};
 use kube::runtime::wait::await_condition;
-use leaderboard_api::{FailureClass, Submission, SubmissionStatus, reasons};
+use leaderboard_api::{FailureClass, Reason, Submission, SubmissionStatus};
 use serde_json::json;
 use tokio::time::timeout;
 
@@ -38,8 +38,8 @@ async fn an_image_of_another_team_fails_before_a_job_is_made_and_evalai_gets_the
     let submission = world.api::<Submission>().get(&name).await.unwrap();
     let failure = submission.status.unwrap().failure.unwrap();
     assert_eq!(
-        (failure.reason.as_str(), failure.class),
-        (reasons::IMAGE_NOT_ALLOWED, FailureClass::Participant)
+        (failure.reason, failure.class),
+        (Reason::ImageNotAllowed.into(), FailureClass::Participant)
     );
     let (_, fetched) = world.fetched(pk, PARTICIPANT).await;
     assert!(fetched.contains("ImageNotAllowed (participant)"), "{fetched}");

@@ -12,7 +12,7 @@ use k8s_openapi::api::events::v1::Event;
 use kube::Api;
 use kube::runtime::wait::await_condition;
 use kube::runtime::{WatchStreamExt, watcher};
-use leaderboard_api::{Attempt, Ingested, Leaderboard, Submission, SubmissionStatus, conditions, names};
+use leaderboard_api::{Attempt, Ingested, Leaderboard, Reason, Submission, SubmissionStatus, conditions, names};
 use serde_json::{Value, json};
 use tokio::time::timeout;
 
@@ -98,7 +98,7 @@ impl World {
     }
 
     /// Waits until the Leaderboard's `Ready` is this, and hands back its message.
-    async fn ready(&self, status: &str, reason: &str) -> String {
+    async fn ready(&self, status: &str, reason: Reason) -> String {
         let of = |found: Option<&Leaderboard>| {
             let conditions = &found?.status.as_ref()?.conditions;
             conditions::get(conditions, conditions::READY).cloned()
@@ -210,7 +210,7 @@ async fn a_queue_that_evalai_does_not_know_is_named() {
     let world = World::new().await;
     let _controller = world.controller();
     world.leaderboard_with_inbox("another-queue").await;
-    let message = world.ready("False", "QueueUnreachable").await;
+    let message = world.ready("False", Reason::QueueUnreachable).await;
     assert!(
         message.contains("Challenge with queue name another-queue does not exist"),
         "{message}"

@@ -9,7 +9,7 @@ use k8s_openapi::api::rbac::v1::{Role, RoleBinding};
 use kube::api::{DeleteParams, Patch, PatchParams, PostParams};
 use kube::runtime::wait::await_condition;
 use kube::{Api, Client, ResourceExt};
-use leaderboard_api::{Condition, Leaderboard, Submission, conditions, names, reasons};
+use leaderboard_api::{Condition, Leaderboard, Reason, Submission, conditions, names};
 use serde_json::{Value, json};
 use tokio::net::TcpListener;
 use tokio::time::timeout;
@@ -114,9 +114,9 @@ impl World {
     }
 
     /// Waits until the Leaderboard's condition `Isolated` shows it.
-    async fn says(&self, status: &str, reason: &str) -> Condition {
+    async fn says(&self, status: &str, reason: Reason) -> Condition {
         let holds = |board: &Leaderboard| isolated(board).is_some_and(|c| c.status == status && c.reason == reason);
-        let board = self.until(NAME, reason, holds).await;
+        let board = self.until(NAME, reason.as_str(), holds).await;
         isolated(&board).unwrap()
     }
 
@@ -124,7 +124,7 @@ impl World {
     async fn held_back(&self, name: &str) -> String {
         let holds = |submission: &Submission| {
             let status = submission.status.as_ref();
-            status.and_then(|s| s.reason.as_deref()) == Some(reasons::NOT_ISOLATED)
+            status.is_some_and(|s| s.shows(Reason::NotIsolated))
         };
         let found = self.until(name, "it waits for the policy", holds).await;
         found.status.unwrap().message.unwrap().into()
@@ -311,7 +311,7 @@ async fn without_a_right_to_policies_no_job_is_made_and_both_objects_show_what_t
     let operator = operator_with_few_rights(&world, &["get", "list", "watch"]).await;
     world.leaderboard(&json!({})).await;
     world.submit("one").await;
-    let said = world.says("False", reasons::FORBIDDEN).await;
+    let said = world.says("False", Reason::Forbidden).await;
     for part in [
         POLICY,
         "create and patch of networkpolicies",
@@ -343,7 +343,7 @@ async fn without_a_right_to_observe_policies_no_job_is_made_and_it_is_shown() {
     let operator = operator_with_few_rights(&world, &["get", "create", "patch"]).await;
     world.leaderboard(&json!({})).await;
     world.submit("one").await;
-    let said = world.says("False", reasons::NOT_APPLIED).await;
+    let said = world.says("False", Reason::NotApplied).await;
     assert!(
         said.message.contains("list and watch of networkpolicies"),
         "{}",
@@ -353,7 +353,7 @@ async fn without_a_right_to_observe_policies_no_job_is_made_and_it_is_shown() {
     assert!(world.api::<Job>().get_opt("one-1").await.unwrap().is_none());
     world.set_rights(&["get", "list", "watch", "create", "patch"]).await;
     world.job("one").await;
-    world.says("Unknown", reasons::NOT_MEASURED).await;
+    world.says("Unknown", Reason::NotMeasured).await;
     operator.end().await;
 }
 
@@ -372,7 +372,7 @@ async fn a_job_that_was_deleted_with_the_policy_comes_back_with_it() {
         loop {
             let _ = policies.delete(POLICY, &DeleteParams::default()).await;
             let board = world.api::<Leaderboard>().get(NAME).await.unwrap();
-            if isolated(&board).is_some_and(|c| c.reason == reasons::FORBIDDEN) {
+            if isolated(&board).is_some_and(|c| c.reason == Reason::Forbidden) {
                 return;
             }
             tokio::time::sleep(POLL * 10).await;
@@ -396,7 +396,7 @@ async fn with_policies_of_the_clusters_own_none_is_applied_and_no_right_is_neede
     world.submit("one").await;
     let job = world.job("one").await;
     assert_eq!(told(&job), Value::Null);
-    world.says("Unknown", reasons::EXTERNAL).await;
+    world.says("Unknown", Reason::External).await;
     assert!(world.api::<NetworkPolicy>().get_opt(POLICY).await.unwrap().is_none());
     operator.end().await;
 }
@@ -406,7 +406,7 @@ async fn what_a_pod_has_measured_is_the_leaderboards_condition_and_known_to_the_
     let world = World::new().await;
     let operator = world.operator().await;
     world.leaderboard(&json!({"egress": [{"cidr": "192.0.2.1/32"}]})).await;
-    world.says("Unknown", reasons::NOT_MEASURED).await;
+    world.says("Unknown", Reason::NotMeasured).await;
     world.submit("first").await;
     let job = world.job("first").await;
     let first = json!({"enforcement": "Warn", "egress": ["192.0.2.1/32"], "isKnownOpen": false});
@@ -415,20 +415,20 @@ async fn what_a_pod_has_measured_is_the_leaderboards_condition_and_known_to_the_
     world
         .pod(&job, &json!({"reason": "NotEnforced", "message": message}))
         .await;
-    let said = world.says("False", reasons::NOT_ENFORCED).await;
+    let said = world.says("False", Reason::NotEnforced).await;
     assert_eq!(said.message, message);
     world.submit("second").await;
     assert_eq!(told(&world.job("second").await)["isKnownOpen"], true);
 
     // Another spec has not been measured.
     world.change(&json!({"egress": [{"cidr": "192.0.2.2/32"}]})).await;
-    world.says("Unknown", reasons::NOT_MEASURED).await;
+    world.says("Unknown", Reason::NotMeasured).await;
     world.submit("third").await;
     let job = world.job("third").await;
     assert_eq!(told(&job)["isKnownOpen"], false);
     world
         .pod(&job, &json!({"reason": "Enforced", "message": "It could not."}))
         .await;
-    world.says("True", reasons::ENFORCED).await;
+    world.says("True", Reason::Enforced).await;
     operator.end().await;
 }

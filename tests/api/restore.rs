@@ -13,7 +13,7 @@ use k8s_openapi::api::networking::v1::NetworkPolicy;
 use kube::api::{DeleteParams, ListParams, Patch, PatchParams, PostParams};
 use kube::core::NamespaceResourceScope;
 use kube::{Resource, ResourceExt};
-use leaderboard_api::{Attempt, JobNumber, Leaderboard, State, Submission, SubmissionStatus, names, reasons};
+use leaderboard_api::{Attempt, JobNumber, Leaderboard, Reason, State, Submission, SubmissionStatus, names};
 use leaderboard_aws::archive::Archive;
 use leaderboard_contract::report::REPORT_KEY;
 use serde::de::DeserializeOwned;
@@ -86,7 +86,7 @@ impl Season {
             begin(&world, &run, name).await;
         }
         let pending = world.submit("held", 2).await;
-        let is_held = |status: &SubmissionStatus| status.reason.as_deref() == Some(reasons::PAUSED);
+        let is_held = |status: &SubmissionStatus| status.shows(Reason::Paused);
         world.until(&pending.1, "it is held", is_held).await;
         drop(controller);
         until_released(&world).await;
@@ -404,7 +404,7 @@ async fn what_a_backup_brings_back_with_its_status_goes_on_as_it_was() {
     }
     let is_read = |status: &SubmissionStatus| status.state == Some(State::Finished) && is_settled(status);
     world.until(&season.unread.1, "its end is read", is_read).await;
-    let is_held = |status: &SubmissionStatus| status.reason.as_deref() == Some(reasons::PAUSED);
+    let is_held = |status: &SubmissionStatus| status.shows(Reason::Paused);
     world.until(&season.pending.1, "it is held again", is_held).await;
     season.assert_rest_is_as(before).await;
 }

@@ -12,7 +12,7 @@ use k8s_openapi::api::core::v1::Pod;
 use kube::ResourceExt;
 use kube::api::DeleteParams;
 use kube::runtime::wait::{await_condition, conditions};
-use leaderboard_api::{Attempt, JobNumber, State, Submission, SubmissionStatus, names, reasons};
+use leaderboard_api::{Attempt, JobNumber, Reason, State, Submission, SubmissionStatus, names};
 use serde_json::{Value, json};
 use tokio::time::timeout;
 
@@ -83,9 +83,7 @@ async fn what_has_ended_is_deleted_after_its_time_and_only_a_resume_runs_again()
     let image = json!("r/team-a:1");
     world.object("short", 1, pk, &image).await;
     let uid = uid_of(&world, &name).await;
-    let ended = |s: &SubmissionStatus| {
-        s.state == Some(State::Cancelled) && s.reason.as_deref() == Some(reasons::ENDED_IN_EVALAI)
-    };
+    let ended = |s: &SubmissionStatus| s.state == Some(State::Cancelled) && s.shows(Reason::EndedInEvalAI);
     world.until(&name, "it shows that it has ended", ended).await;
     until_deleted(&world, &name, &uid).await;
     let job = names::job(&name, JobNumber::first(Attempt(1)));

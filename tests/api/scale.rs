@@ -18,7 +18,7 @@ use jiff::{SignedDuration, Timestamp};
 use kube::api::Api;
 use kube::runtime::{WatchStreamExt, watcher};
 use kube::{Client, ResourceExt};
-use leaderboard_api::{Leaderboard, State, Submission, conditions, reasons};
+use leaderboard_api::{Leaderboard, Reason, State, Submission, conditions};
 use serde_json::{Map, Value, json};
 use tokio::net::TcpListener;
 use tokio::time::{Instant, timeout_at};
@@ -198,7 +198,7 @@ impl Seen {
         if published.status == "True" {
             self.published.insert(name.clone());
         }
-        if published.status == "True" || published.reason == reasons::NOT_REQUIRED {
+        if published.status == "True" || published.reason == Reason::NotRequired {
             self.settled.insert(name);
         }
     }

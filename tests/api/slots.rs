@@ -5,7 +5,7 @@ use k8s_openapi::api::batch::v1::Job;
 use kube::ResourceExt;
 use kube::api::{Api, DeleteParams, Patch, PatchParams};
 use kube::runtime::wait::await_condition;
-use leaderboard_api::{Leaderboard, State, Submission, reasons};
+use leaderboard_api::{Leaderboard, Reason, State, Submission};
 use serde_json::json;
 use tokio::time::timeout;
 
@@ -71,13 +71,13 @@ impl World {
     }
 
     /// Waits until a submission shows this reason and place.
-    async fn shows(&self, name: &str, reason: &str, position: i32) {
+    async fn shows(&self, name: &str, reason: Reason, position: i32) {
         let api: Api<Submission> = Api::namespaced(server().await.client(), &self.namespace);
         let found = |object: Option<&Submission>| {
             let status = object.and_then(|object| object.status.as_ref());
             status.is_some_and(|status| {
                 let place = status.waiting.as_ref().map(|waiting| waiting.position);
-                status.reason.as_deref() == Some(reason) && place == Some(position) && status.job_name.is_none()
+                status.shows(reason) && place == Some(position) && status.job_name.is_none()
             })
         };
         if timeout(LIMIT, await_condition(api.clone(), name, found)).await.is_err() {
@@ -95,18 +95,18 @@ async fn one_slot_is_one_job_also_after_a_takeover() {
     world.submit("first").await;
     world.has_job("first").await;
     world.submit("second").await;
-    world.shows("second", reasons::WAITING_FOR_SLOT, 1).await;
+    world.shows("second", Reason::WaitingForSlot, 1).await;
     operator.end().await;
 
     let operator = world.operator().await;
     world.submit("third").await;
-    world.shows("third", reasons::WAITING_FOR_SLOT, 2).await;
+    world.shows("third", Reason::WaitingForSlot, 2).await;
     world.edit(json!({"paused": true})).await;
-    world.shows("second", reasons::PAUSED, 1).await;
-    world.shows("third", reasons::PAUSED, 2).await;
+    world.shows("second", Reason::Paused, 1).await;
+    world.shows("third", Reason::Paused, 2).await;
     world.edit(json!({"paused": false, "concurrency": {"total": 2}})).await;
     world.has_job("second").await;
-    world.shows("third", reasons::WAITING_FOR_SLOT, 1).await;
+    world.shows("third", Reason::WaitingForSlot, 1).await;
     world.edit(json!({"concurrency": null})).await;
     world.has_job("third").await;
     operator.end().await;
@@ -119,12 +119,12 @@ async fn a_check_starts_while_the_leaderboard_is_paused_and_others_wait() {
     world.edit(json!({"paused": true})).await;
     let operator = world.operator().await;
     world.submit("first").await;
-    world.shows("first", reasons::PAUSED, 1).await;
+    world.shows("first", Reason::Paused, 1).await;
     world.check("check-one").await;
     world.has_job("check-one").await;
     world.check("check-two").await;
     // The only slot is taken, also for a check.
-    world.shows("check-two", reasons::WAITING_FOR_SLOT, 1).await;
+    world.shows("check-two", Reason::WaitingForSlot, 1).await;
     let api: Api<Submission> = Api::namespaced(server().await.client(), &world.namespace);
     let status = api.get("check-one").await.unwrap().status.unwrap();
     let plan = status.plan.unwrap();
@@ -163,7 +163,7 @@ async fn one_that_no_other_system_has_is_deleted_at_once() {
     world.submit("first").await;
     world.has_job("first").await;
     world.submit("second").await;
-    world.shows("second", reasons::WAITING_FOR_SLOT, 1).await;
+    world.shows("second", Reason::WaitingForSlot, 1).await;
     let client = server().await.client();
     let submissions: Api<Submission> = Api::namespaced(client.clone(), &world.namespace);
     let jobs: Api<Job> = Api::namespaced(client, &world.namespace);

@@ -6,7 +6,7 @@ use aws_sdk_dynamodb::types::AttributeValue;
 use evalai_stand_in::model::Status;
 use k8s_openapi::api::batch::v1::Job;
 use kube::api::{ListParams, Patch, PatchParams};
-use leaderboard_api::{State, Submission, SubmissionStatus, conditions, names, reasons};
+use leaderboard_api::{Reason, State, Submission, SubmissionStatus, conditions, names};
 use serde_json::{Value, json};
 
 use super::boards::make_table;
@@ -66,7 +66,7 @@ async fn jobs(world: &World) -> usize {
 }
 
 fn is_foreign(status: &SubmissionStatus) -> bool {
-    status.reason.as_deref() == Some(reasons::FOREIGN)
+    status.shows(Reason::Foreign)
 }
 
 /// What the agent of a Job gets as RESUME.
@@ -106,9 +106,8 @@ async fn what_the_old_pipeline_runs_is_left_alone_until_it_has_ended_there() {
     set(&world, finishes.0, Status::Finished);
     write_row(&world, &table, fails.0, "FAILED").await;
     set(&world, fails.0, Status::Resuming);
-    let ended = |status: &SubmissionStatus| {
-        status.state == Some(State::Cancelled) && status.reason.as_deref() == Some(reasons::ENDED_IN_EVALAI)
-    };
+    let ended =
+        |status: &SubmissionStatus| status.state == Some(State::Cancelled) && status.shows(Reason::EndedInEvalAI);
     world.until(&finishes.1, "EvalAI has its end already", ended).await;
     assert_eq!(resume(&world.job(&fails.1, 0).await), "1", "it takes up what is stored");
     assert_eq!(jobs(&world).await, 1);
@@ -177,7 +176,7 @@ async fn what_is_only_observed_is_run_and_never_written_to_evalai() {
     world.run_that_crashes(pk, &name).await;
     let has_failed = |status: &SubmissionStatus| {
         let published = conditions::get(&status.conditions, conditions::PUBLISHED);
-        status.state == Some(State::Failed) && published.is_some_and(|c| c.reason == reasons::NOT_REQUIRED)
+        status.state == Some(State::Failed) && published.is_some_and(|c| c.reason == Reason::NotRequired)
     };
     world
         .until(&name, "it has failed, and nothing is published", has_failed)

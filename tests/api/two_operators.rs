@@ -7,7 +7,7 @@ use k8s_openapi::api::events::v1::Event;
 use kube::ResourceExt;
 use kube::api::{ListParams, Patch, PatchParams};
 use kube::runtime::wait::await_condition;
-use leaderboard_api::{Leaderboard, Submission, reasons};
+use leaderboard_api::{Leaderboard, Reason, Submission};
 use serde_json::json;
 use tokio::time::timeout;
 
@@ -107,7 +107,7 @@ async fn what_another_installation_drives_is_left_alone_and_an_event_has_the_com
 
     let is_reported = |event: &Event| {
         let note = event.note.as_deref().unwrap_or_default();
-        event.reason.as_deref() == Some(reasons::OTHER_OPERATOR)
+        event.reason.as_deref() == Some(Reason::OtherOperator.as_str())
             && note.contains(
                 "patch leaderboard theirs --subresource=status --type=merge -p '{\"status\":{\"operator\":null}}'",
             )

@@ -16,7 +16,7 @@ use kube::api::{ApiResource, DynamicObject, ListParams, Patch, PatchParams, Post
 use kube::runtime::wait::await_condition;
 use kube::{Api, Client, ResourceExt};
 use leaderboard_api::{
-    Attempt, JobNumber, Leaderboard, S3Bucket, Submission, SubmissionStatus, conditions, names, reasons,
+    Attempt, JobNumber, Leaderboard, Reason, S3Bucket, Submission, SubmissionStatus, conditions, names,
 };
 use leaderboard_aws::archive::Archive;
 use leaderboard_base::shutdown::Stop;
@@ -299,7 +299,7 @@ impl World {
         let cluster = self.cluster();
         let pod = cluster.pod(&job).await;
         cluster.set_pod(&pod.name_any(), &prefix_in_use()).await;
-        let is_held = |status: &SubmissionStatus| status.reason.as_deref() == Some(reasons::FOREIGN);
+        let is_held = |status: &SubmissionStatus| status.shows(Reason::Foreign);
         self.until(name, "it is held back", is_held).await;
         let (jobs, name) = (self.api::<Job>(), job.name_any());
         let goes = |job: Option<&Job>| job.is_some_and(|job| job.metadata.deletion_timestamp.is_some());
@@ -352,7 +352,7 @@ impl World {
 pub(super) fn is_settled(status: &SubmissionStatus) -> bool {
     let is_known = |type_: &str| {
         let found = conditions::get(&status.conditions, type_);
-        found.is_some_and(|c| c.status == "True" || c.reason == reasons::NOT_REQUIRED)
+        found.is_some_and(|c| c.status == "True" || c.reason == Reason::NotRequired)
     };
     conditions::is_true(&status.conditions, conditions::FINISHED)
         && is_known(conditions::PUBLISHED)

@@ -4,7 +4,7 @@
 use std::time::Duration;
 
 use jiff::Timestamp;
-use leaderboard_api::{Attempt, Submission, conditions};
+use leaderboard_api::{Attempt, Reason, Submission, conditions};
 use serde_json::json;
 
 use super::matrix::Case;
@@ -47,7 +47,7 @@ async fn a_participant_who_edits_the_own_row_gets_one_attempt_at_most() {
         let refused = |s: &Submission| {
             let conditions = s.status.as_ref().map(|status| status.conditions.as_slice());
             let stalled = conditions::get(conditions.unwrap_or_default(), conditions::STALLED);
-            stalled.is_some_and(|c| c.status == "True" && c.reason == "AttemptWithoutMessage")
+            stalled.is_some_and(|c| c.status == "True" && c.reason == Reason::AttemptWithoutMessage)
         };
         let after = scene.submission(&name, "another attempt is refused", LOST, refused).await;
         case.also(&format!("attempt {} is the last", after.spec.attempt));

@@ -8,7 +8,7 @@ use std::time::Duration;
 
 use evalai_stand_in::model::Status;
 use kube::ResourceExt;
-use leaderboard_api::{Submission, names, reasons};
+use leaderboard_api::{Reason, Submission, names};
 use serde_json::{Value, json};
 
 use super::matrix::Case;
@@ -210,7 +210,7 @@ impl Rehearsal<'_> {
     async fn held_back(&self, pk: u64) {
         let is_held = |submission: &Submission| {
             let status = submission.status.as_ref();
-            status.is_some_and(|status| status.reason.as_deref() == Some(reasons::FOREIGN))
+            status.is_some_and(|status| status.shows(Reason::Foreign))
         };
         let (name, what) = (submission(pk), "it waits for the old pipeline's run");
         self.scene.submission(&name, what, LOST, is_held).await;

@@ -13,7 +13,7 @@ use std::time::Duration;
 use k8s_openapi::api::core::v1::{Node, Pod};
 use kube::ResourceExt;
 use kube::api::{Api, ApiResource, DeleteParams, DynamicObject, GroupVersionKind, ListParams, Patch, PatchParams};
-use leaderboard_api::{FailureClass, State, Submission, reasons};
+use leaderboard_api::{FailureClass, Reason, State, Submission};
 use serde_json::{Value, json};
 
 use super::matrix;
@@ -103,7 +103,11 @@ pub async fn an_agent_that_gets_no_gpu_by_its_index_is_not_charged() {
         let _controller = controller(scene);
         scene.submit("one", "agent:standard").await;
         let failure = finds_no_gpu(scene).await;
-        matrix::as_expected("GPU, NodeIndex, agents without a device", reasons::NO_GPU, &failure);
+        matrix::as_expected(
+            "GPU, NodeIndex, agents without a device",
+            Reason::NoGPU.as_str(),
+            &failure,
+        );
         leave_the_node(scene).await;
     })
     .await;
@@ -137,7 +141,7 @@ async fn both_containers_of_a_pair_share_one_claim() {
             scene.submit("one", "agent:standard").await;
             // Claims are allocated and the Pod starts, but no container has a device: the engine ignores what the kubelet asks for.
             let failure = finds_no_gpu(scene).await;
-            matrix::as_expected("GPU, Claim, an engine without CDI", reasons::NO_GPU, &failure);
+            matrix::as_expected("GPU, Claim, an engine without CDI", Reason::NoGPU.as_str(), &failure);
             return;
         }
         let got = run(scene, gpu).await;
@@ -163,8 +167,8 @@ async fn finds_no_gpu(scene: &Scene) -> String {
     assert_eq!(state(&failed), Some(State::Failed));
     let failure = failed.status.unwrap().failure.unwrap();
     assert_eq!(
-        (failure.reason.as_str(), failure.class),
-        (reasons::NO_GPU, FailureClass::Infrastructure),
+        (failure.reason.known().unwrap(), failure.class),
+        (Reason::NoGPU, FailureClass::Infrastructure),
         "{}",
         failure.message
     );

@@ -5,7 +5,7 @@ use std::time::Duration;
 use k8s_openapi::api::core::v1::Pod;
 use k8s_openapi::api::networking::v1::NetworkPolicy;
 use kube::api::DeleteParams;
-use leaderboard_api::{FailureClass, Leaderboard, State, conditions, reasons};
+use leaderboard_api::{FailureClass, Leaderboard, Reason, State, conditions};
 use serde_json::json;
 
 use crate::operator::controller;
@@ -26,7 +26,7 @@ fn looked_for(pod: &Pod) -> Duration {
 }
 
 /// Whether the Leaderboard's condition `Isolated` shows it.
-fn says(status: &'static str, reason: &'static str) -> impl Fn(Option<&Leaderboard>) -> bool {
+fn says(status: &'static str, reason: Reason) -> impl Fn(Option<&Leaderboard>) -> bool {
     move |found: Option<&Leaderboard>| {
         let status_of = found.and_then(|board| board.status.as_ref());
         let isolated = status_of.and_then(|s| conditions::get(&s.conditions, conditions::ISOLATED));
@@ -43,7 +43,7 @@ async fn a_cluster_that_enforces_no_policy_is_found_out_and_loses_a_minute_once(
         let _controller = controller(scene);
         scene.submit("first", "agent:standard").await;
         scene.settled("first", LIMIT).await;
-        let open = says("False", reasons::NOT_ENFORCED);
+        let open = says("False", Reason::NotEnforced);
         scene
             .wait("lb", "its policy is known not to be enforced", LIMIT, open)
             .await;
@@ -79,8 +79,8 @@ async fn a_pod_that_has_to_be_isolated_and_is_not_runs_nothing() {
         let status = failed.status.unwrap();
         let failure = status.failure.unwrap();
         assert_eq!(
-            (failure.reason.as_str(), failure.class),
-            (reasons::NOT_ISOLATED, FailureClass::Infrastructure)
+            (failure.reason.known().unwrap(), failure.class),
+            (Reason::NotIsolated, FailureClass::Infrastructure)
         );
         assert!(
             failure.message.contains("network.enforcement is Require"),

@@ -12,7 +12,7 @@ use k8s_openapi::api::core::v1::{Container, ContainerState, Node, Pod, ResourceQ
 use kube::ResourceExt;
 use kube::api::{Api, DeleteParams, ListParams, Patch, PatchParams, PostParams};
 use leaderboard_api::names::{CONTAINER_CONTENTS, CONTAINER_WORKSPACE};
-use leaderboard_api::{State, Submission, conditions};
+use leaderboard_api::{Reason, State, Submission, conditions};
 use serde_json::{Value, json};
 
 use super::matrix::{Case, SHOWN, together};
@@ -285,7 +285,7 @@ async fn table_denied(scene: &Scene) {
     let finished = |s: &Submission| state(s).is_some_and(State::is_terminal);
     scene.submission("denied", "it has ended", LIMIT, finished).await;
     case.cause();
-    let refused = move |s: &Submission| recorded(s).is_some_and(|(_, reason, _)| reason == "Refused");
+    let refused = move |s: &Submission| recorded(s).is_some_and(|(_, reason, _)| reason == Reason::Refused);
     let denied = scene
         .submission("denied", "the table is said to refuse it", SHOWN, refused)
         .await;

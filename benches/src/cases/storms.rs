@@ -5,7 +5,7 @@ use std::time::Duration;
 
 use http::Method;
 use kube::Client;
-use leaderboard_api::reasons;
+use leaderboard_api::Reason;
 use serde_json::json;
 
 use crate::api::{self, JSON, MERGE};
@@ -123,11 +123,12 @@ async fn rest(bench: &Bench, world: &World, figures: &mut Figures) -> Outcome<()
 
 impl Storm {
     fn reason(self) -> &'static str {
-        match self {
-            Self::Quota => reasons::QUOTA_EXCEEDED,
-            Self::Policy => reasons::POD_REFUSED,
-            Self::Nodes => reasons::UNSCHEDULABLE,
-        }
+        let reason = match self {
+            Self::Quota => Reason::QuotaExceeded,
+            Self::Policy => Reason::PodRefused,
+            Self::Nodes => Reason::Unschedulable,
+        };
+        reason.as_str()
     }
 
     async fn begin(self, client: &Client) -> Outcome<()> {

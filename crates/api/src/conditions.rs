@@ -7,7 +7,7 @@ use schemars::{JsonSchema, Schema, SchemaGenerator};
 use serde::{Deserialize, Serialize};
 use serde_json::Value;
 
-use super::SharedText;
+use super::{ReasonName, SharedText};
 
 /// The submission has a Leaderboard, a track, an image and a place in EvalAI.
 pub const ACCEPTED: &str = "Accepted";
@@ -50,7 +50,7 @@ pub struct Condition {
     #[serde(default, skip_serializing_if = "Option::is_none")]
     pub observed_generation: Option<i64>,
     #[serde(default)]
-    pub reason: SharedText,
+    pub reason: ReasonName,
     /// One of `Truth`.
     #[serde(default)]
     pub status: SharedText,
@@ -59,9 +59,14 @@ pub struct Condition {
 }
 
 impl Condition {
-    /// All its texts.
-    pub fn shared_texts(&mut self) -> [&mut SharedText; 4] {
-        [&mut self.type_, &mut self.status, &mut self.reason, &mut self.message]
+    /// All texts that it may share with others.
+    pub fn shared_texts(&mut self) -> [&mut SharedText; 3] {
+        [&mut self.type_, &mut self.status, &mut self.message]
+    }
+
+    /// Whether it is True.
+    pub fn is_true(&self) -> bool {
+        self.status == Truth::True.as_str()
     }
 }
 
@@ -95,17 +100,17 @@ pub fn set(
     conditions: &mut Vec<Condition>,
     type_: &str,
     truth: Truth,
-    reason: &str,
+    reason: impl Into<ReasonName>,
     message: &str,
     generation: Option<i64>,
     now: &Time,
 ) -> bool {
-    let (status, message) = (truth.as_str(), fitting(message));
+    let (status, reason, message) = (truth.as_str(), reason.into(), fitting(message));
     let Some(old) = conditions.iter_mut().find(|c| c.type_ == type_) else {
         conditions.push(Condition {
             type_: type_.into(),
             status: status.into(),
-            reason: reason.into(),
+            reason,
             message: message.into(),
             observed_generation: generation,
             last_transition_time: now.clone(),
@@ -117,11 +122,11 @@ pub fn set(
     if old.status != status {
         old.last_transition_time = now.clone();
     }
-    for (old, new) in [
-        (&mut old.status, status),
-        (&mut old.reason, reason),
-        (&mut old.message, message),
-    ] {
+    if old.reason != reason {
+        old.reason = reason;
+        changed = true;
+    }
+    for (old, new) in [(&mut old.status, status), (&mut old.message, message)] {
         if *old != *new {
             *old = new.into();
             changed = true;
@@ -151,7 +156,7 @@ pub fn get<'a>(conditions: &'a [Condition], type_: &str) -> Option<&'a Condition
 
 /// Whether the condition of a type is True.
 pub fn is_true(conditions: &[Condition], type_: &str) -> bool {
-    get(conditions, type_).is_some_and(|c| c.status == "True")
+    get(conditions, type_).is_some_and(Condition::is_true)
 }
 
 /// A list of conditions, one of each type. Kubernetes bounds none of its texts, and a rule may walk only what is bounded.
@@ -174,6 +179,7 @@ pub(super) fn schema(generator: &mut SchemaGenerator) -> Schema {
 #[cfg(test)]
 mod tests {
     use super::*;
+    use crate::Reason;
 
     fn at(second: i64) -> Time {
         Time(jiff::Timestamp::from_second(second).unwrap())
@@ -200,19 +206,59 @@ mod tests {
     fn a_message_is_cut_to_what_the_definition_allows() {
         let mut list = Vec::new();
         let long = "é".repeat(MAX_MESSAGE + 1);
-        set(&mut list, READY, Truth::False, "A", &long, None, &at(1));
+        set(
+            &mut list,
+            READY,
+            Truth::False,
+            Reason::TokenMissing,
+            &long,
+            None,
+            &at(1),
+        );
         assert_eq!(list[0].message.chars().count(), MAX_MESSAGE);
-        assert!(!set(&mut list, READY, Truth::False, "A", &long, None, &at(2)));
+        assert!(!set(
+            &mut list,
+            READY,
+            Truth::False,
+            Reason::TokenMissing,
+            &long,
+            None,
+            &at(2)
+        ));
     }
 
     #[test]
     fn the_transition_time_moves_only_with_the_status() {
         let mut list = Vec::new();
-        assert!(set(&mut list, READY, Truth::False, "A", "a", Some(1), &at(1)));
-        assert!(set(&mut list, READY, Truth::False, "B", "b", Some(1), &at(2)));
+        assert!(set(
+            &mut list,
+            READY,
+            Truth::False,
+            Reason::TokenMissing,
+            "a",
+            Some(1),
+            &at(1)
+        ));
+        assert!(set(
+            &mut list,
+            READY,
+            Truth::False,
+            Reason::TokenRefused,
+            "b",
+            Some(1),
+            &at(2)
+        ));
         assert_eq!(list[0].last_transition_time, at(1));
-        assert!(!set(&mut list, READY, Truth::False, "B", "b", Some(1), &at(3)));
-        assert!(set(&mut list, READY, Truth::True, "C", "", Some(1), &at(4)));
+        assert!(!set(
+            &mut list,
+            READY,
+            Truth::False,
+            Reason::TokenRefused,
+            "b",
+            Some(1),
+            &at(3)
+        ));
+        assert!(set(&mut list, READY, Truth::True, Reason::Ready, "", Some(1), &at(4)));
         assert_eq!(list[0].last_transition_time, at(4));
         assert_eq!(list.len(), 1);
     }

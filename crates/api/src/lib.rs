@@ -61,6 +61,7 @@ pub use leaderboard::{
 };
 pub use leaderboard_parts::*;
 pub use progress::{MAX_METRICS, MAX_NAME, Metric, Progress, Score};
+pub use reasons::{Reason, ReasonName};
 pub use retention::Retention;
 pub use route_slice::{NotASlice, RouteSlice};
 pub use run_id::{NotARunId, RunId};

@@ -1,8 +1,12 @@
 //! Every reason that a status, a condition or an event can have: its name, its class, what it means, and the next step.
 //!
-//! One table, with a module for submissions and one for Leaderboards. `docs/states.md` is generated from it (`make docs`),
+//! One table. `docs/states.md` is generated from it (`make docs`),
 //! `kubectl leaderboard why` prints it, and the messages of failures take their next step from it. The texts are Markdown with
 //! code spans only; [`plain`] removes them. Pure.
+
+use std::fmt;
+
+use serde::{Serialize, Serializer};
 
 /// What kind of thing a reason explains. Each class is one table of docs/states.md.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
@@ -31,31 +35,68 @@ pub enum Class {
     Isolation,
 }
 
-/// One reason.
-#[derive(Clone, Copy, Debug, PartialEq, Eq)]
-pub struct Reason {
+/// The row of a reason.
+struct Row {
+    name: &'static str,
+    class: Class,
+    meaning: &'static str,
+    next_step: &'static str,
+    after_failure: Option<&'static str>,
+    log: Option<&'static str>,
+}
+
+impl Reason {
+    /// The reason of this name.
+    pub fn of(name: &str) -> Option<Self> {
+        Self::ALL.into_iter().find(|reason| reason.as_str() == name)
+    }
+
     /// As it stands in `reason`.
-    pub name: &'static str,
+    pub fn as_str(self) -> &'static str {
+        self.row().name
+    }
+
     /// What kind of thing it explains.
-    pub class: Class,
+    pub fn class(self) -> Class {
+        self.row().class
+    }
+
     /// What it means, in sentences.
-    pub meaning: &'static str,
+    pub fn meaning(self) -> &'static str {
+        self.row().meaning
+    }
+
     /// What to do next, in sentences.
-    pub next_step: &'static str,
-    /// What a host does once a submission has failed for this reason, where that is another step.
-    pub after_failure: Option<&'static str>,
-    /// Whose log explains a failure for this reason, if one does; `<n>` is the number of the pair.
-    pub log: Option<&'static str>,
+    pub fn next_step(self) -> &'static str {
+        self.row().next_step
+    }
+
+    /// What a host does once a submission has failed for this reason.
+    pub fn after_failure(self) -> &'static str {
+        self.own_after_failure().unwrap_or(self.next_step())
+    }
+
+    /// The same where it is another step than before the failure.
+    fn own_after_failure(self) -> Option<&'static str> {
+        self.row().after_failure
+    }
+
+    /// Whose log explains a failure for this reason, if one does; `<n>` is the number of the worker.
+    pub fn log(self) -> Option<&'static str> {
+        self.row().log
+    }
 }
 
-/// The reason of this name.
-pub fn of(name: &str) -> Option<&'static Reason> {
-    all().find(|reason| reason.name == name)
+impl fmt::Display for Reason {
+    fn fmt(&self, out: &mut fmt::Formatter<'_>) -> fmt::Result {
+        out.write_str(self.as_str())
+    }
 }
 
-/// What a host does once a submission has failed for this reason.
-pub fn after_failure(name: &str) -> Option<&'static str> {
-    of(name).map(|reason| reason.after_failure.unwrap_or(reason.next_step))
+impl Serialize for Reason {
+    fn serialize<S: Serializer>(&self, serializer: S) -> Result<S::Ok, S::Error> {
+        serializer.serialize_str(self.as_str())
+    }
 }
 
 /// A text of the table without its code spans.
@@ -63,24 +104,33 @@ pub fn plain(text: &str) -> String {
     text.replace('`', "")
 }
 
-/// Makes a constant of each name, and the table of a module: a reason cannot be in one of them only.
+/// Makes the enum and its table: a reason cannot be in one of them only.
 macro_rules! reasons {
-    ($($class:ident { $($constant:ident = $name:literal, $meaning:literal, $next:literal
+    ($($class:ident { $($reason:ident, $meaning:literal, $next:literal
         $(, after_failure: $after:literal)? $(, log: $log:literal)?;)* })*) => {
-        $($(
-            #[doc = $meaning]
-            pub const $constant: &str = $name;
-        )*)*
-        pub(super) const TABLE: &[Reason] = &[$($(
-            Reason {
-                name: $name,
-                class: Class::$class,
-                meaning: $meaning,
-                next_step: $next,
-                after_failure: optional!($($after)?),
-                log: optional!($($log)?),
-            },
-        )*)*];
+        /// Every reason, in the order of docs/states.md.
+        #[derive(Clone, Copy, Debug, PartialEq, Eq, Hash, PartialOrd, Ord)]
+        pub enum Reason {
+            $($(#[doc = $meaning] $reason,)*)*
+        }
+
+        impl Reason {
+            /// All reasons, in the order of docs/states.md.
+            pub const ALL: [Self; [$($(Self::$reason,)*)*].len()] = [$($(Self::$reason,)*)*];
+
+            pub(super) fn row(self) -> &'static Row {
+                match self {
+                    $($(Self::$reason => &Row {
+                        name: stringify!($reason),
+                        class: Class::$class,
+                        meaning: $meaning,
+                        next_step: $next,
+                        after_failure: optional!($($after)?),
+                        log: optional!($($log)?),
+                    },)*)*
+                }
+            }
+        }
     };
 }
 
@@ -93,16 +143,11 @@ macro_rules! optional {
     };
 }
 
-mod leaderboards;
-mod submissions;
+mod name;
+mod table;
 
-pub use leaderboards::*;
-pub use submissions::*;
-
-/// All reasons, in the order of docs/states.md.
-pub fn all() -> impl Iterator<Item = &'static Reason> {
-    submissions::TABLE.iter().chain(leaderboards::TABLE)
-}
+pub use name::ReasonName;
+pub use table::Reason;
 
 #[cfg(test)]
 mod tests;

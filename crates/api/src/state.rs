@@ -4,7 +4,7 @@
 //! Called by everyone who reads a status. Pure.
 
 use crate::conditions::{self, Condition, FINISHED, RUNNING};
-use crate::{Attempt, State, SubmissionStatus, reasons};
+use crate::{Attempt, Reason, ReasonName, State, SubmissionStatus};
 
 impl SubmissionStatus {
     /// A condition, if it was ever set.
@@ -20,8 +20,8 @@ impl SubmissionStatus {
     /// Whether another system has the end, or is to have none, by this condition.
     pub fn is_delivered(&self, type_: &str) -> bool {
         let found = self.condition(type_);
-        let settled = [reasons::NOT_REQUIRED, reasons::CANCELLED_IN_EVALAI];
-        found.is_some_and(|c| c.status == "True" || settled.contains(&c.reason.as_str()))
+        let settled = [Reason::NotRequired, Reason::CancelledInEvalAI];
+        found.is_some_and(|c| c.is_true() || c.reason.is_one_of(&settled))
     }
 
     /// The condition of the end that the present attempt has come to.
@@ -39,6 +39,17 @@ impl SubmissionStatus {
         self.attempt.is_some_and(|present| attempt > present) && self.state_of_conditions() != State::Finished
     }
 
+    /// Why the submission is in its state.
+    pub fn present_reason(&self) -> Option<ReasonName> {
+        let of_state = || Reason::of(self.known_state()?.as_str()).map(ReasonName::from);
+        self.reason.clone().or_else(of_state)
+    }
+
+    /// Whether it is in its state for this reason.
+    pub fn shows(&self, reason: Reason) -> bool {
+        self.present_reason().is_some_and(|present| present == reason)
+    }
+
     /// The state; none before the operator has processed the submission.
     pub fn known_state(&self) -> Option<State> {
         self.attempt.map(|_| self.state_of_conditions())
@@ -48,11 +59,11 @@ impl SubmissionStatus {
     pub fn state_of_conditions(&self) -> State {
         let running = self.condition(RUNNING);
         match self.end() {
-            Some(end) if end.reason == reasons::FINISHED => State::Finished,
+            Some(end) if end.reason == Reason::Finished => State::Finished,
             Some(_) if self.failure.is_some() => State::Failed,
             Some(_) => State::Cancelled,
             // Once its agents ran it is never Pending again while it has a Job.
-            None if running.is_some_and(|c| c.status == "True" || c.reason == reasons::REPLACING) => {
+            None if running.is_some_and(|c| c.status == "True" || c.reason == Reason::Replacing) => {
                 if self.is_resumed() {
                     State::Resumed
                 } else {
@@ -78,7 +89,7 @@ impl SubmissionStatus {
     /// shows is new.
     pub fn is_restart(&self) -> bool {
         let live = self.condition(FINISHED).filter(|finished| finished.status != "True");
-        live.is_some_and(|finished| finished.reason == reasons::REPLACING)
+        live.is_some_and(|finished| finished.reason == Reason::Replacing)
     }
 
     /// Whether its run continues from stored results.

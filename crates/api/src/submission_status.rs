@@ -13,6 +13,7 @@ use super::conditions::Condition;
 use super::failed_node::{FailedNode, MAX_FAILED_NODES};
 use super::leaderboard_parts::Storage;
 use super::progress::{MAX_METRICS, Metric, Progress, Score};
+use super::reasons::ReasonName;
 use super::run_id::RunId;
 use super::shared_text::SharedText;
 use super::submission_use::{Interruptions, Use};
@@ -83,10 +84,9 @@ pub struct SubmissionStatus {
     /// When the next Job of this attempt is made, after an infrastructure failure.
     #[serde(default, skip_serializing_if = "Option::is_none")]
     pub next_retry_time: Option<Time>,
-    /// Why it stands there, one of `api::reasons`.
+    /// Reason names in one word why the submission is in its state.
     #[serde(default, skip_serializing_if = "Option::is_none")]
-    #[schemars(length(max = 64))]
-    pub reason: Option<SharedText>,
+    pub reason: Option<ReasonName>,
     /// The same as a sentence.
     #[serde(default, skip_serializing_if = "Option::is_none")]
     #[schemars(length(max = MAX_MESSAGE))]
@@ -200,8 +200,7 @@ impl SubmissionStatus {
             ]
         });
         let of_conditions = self.conditions.iter_mut().flat_map(Condition::shared_texts);
-        let own = [self.reason.as_mut(), self.message.as_mut()];
-        own.into_iter().flatten().chain(of_plan).chain(of_conditions)
+        self.message.iter_mut().chain(of_plan).chain(of_conditions)
     }
 }
 
@@ -254,9 +253,8 @@ pub struct PinnedImage {
 /// What holds a submission up, and since when.
 #[derive(Serialize, Deserialize, JsonSchema, Clone, Debug, PartialEq, Eq)]
 pub struct BlockedSince {
-    /// One of `api::reasons`.
-    #[schemars(length(max = 64))]
-    pub reason: String,
+    /// Reason names the cause in one word.
+    pub reason: ReasonName,
     /// Since when it has been the same reason.
     pub time: Time,
 }
@@ -319,9 +317,8 @@ impl FailureClass {
 #[serde(rename_all = "camelCase")]
 pub struct Failure {
     pub class: FailureClass,
-    /// One of `api::reasons`.
-    #[schemars(length(max = 64))]
-    pub reason: String,
+    /// Reason names the cause in one word.
+    pub reason: ReasonName,
     /// A sentence with the next step, for the challenge's hosts.
     #[schemars(length(max = MAX_MESSAGE))]
     pub message: String,

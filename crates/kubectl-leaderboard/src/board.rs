@@ -4,7 +4,7 @@
 
 use leaderboard_api::conditions;
 use leaderboard_api::text::sentence;
-use leaderboard_api::{Leaderboard, reasons};
+use leaderboard_api::{Leaderboard, Reason};
 
 /// The Leaderboard of a submission, as far as this person can read it.
 #[derive(Clone, Copy, Debug)]
@@ -36,7 +36,7 @@ pub(super) struct Problem {
     /// A sentence.
     pub text: String,
     /// The reason whose next step fixes it.
-    pub reason: Option<String>,
+    pub reason: Option<Reason>,
 }
 
 /// All that is wrong with the Leaderboard of this name.
@@ -45,7 +45,7 @@ pub(super) fn problems(name: &str, observed: Observed<'_>) -> Vec<Problem> {
         Observed::Found(leaderboard) => leaderboard,
         Observed::Missing => {
             let text = format!("There is no Leaderboard {name} in this namespace: nothing new starts.");
-            return vec![problem(text, Some(reasons::LEADERBOARD_NOT_FOUND))];
+            return vec![problem(text, Some(Reason::LeaderboardNotFound))];
         }
         Observed::Forbidden => {
             let text = format!("You have no right to read Leaderboard {name}; it may be paused or not Ready.");
@@ -55,11 +55,11 @@ pub(super) fn problems(name: &str, observed: Observed<'_>) -> Vec<Problem> {
     let mut found = Vec::new();
     if leaderboard.metadata.deletion_timestamp.is_some() {
         let text = format!("Leaderboard {name} is being deleted and waits for its submissions.");
-        found.push(problem(text, Some(reasons::IN_USE)));
+        found.push(problem(text, Some(Reason::InUse)));
     }
     if leaderboard.spec.paused {
         let text = format!("Leaderboard {name} is paused: nothing new starts, and running submissions continue.");
-        found.push(problem(text, Some(reasons::PAUSED)));
+        found.push(problem(text, Some(Reason::Paused)));
     }
     found.extend(not_ready(name, leaderboard));
     found
@@ -85,12 +85,9 @@ fn not_ready(name: &str, leaderboard: &Leaderboard) -> Option<Problem> {
         ready.reason,
         sentence(&ready.message)
     );
-    Some(problem(text, Some(&ready.reason)))
+    Some(problem(text, ready.reason.known()))
 }
 
-fn problem(text: String, reason: Option<&str>) -> Problem {
-    Problem {
-        text,
-        reason: reason.map(str::to_owned),
-    }
+fn problem(text: String, reason: Option<Reason>) -> Problem {
+    Problem { text, reason }
 }

@@ -8,7 +8,7 @@ use serde_json::{Value, json};
 use super::board::{self, Observed};
 use super::facts::{command, has_ended, is_attempt_requested, is_run, shown};
 use super::text::{Frame, when, wrap};
-use leaderboard_api::{Attempt, Deadlines, State, Submission, SubmissionStatus, reasons};
+use leaderboard_api::{Attempt, Deadlines, Reason, State, Submission, SubmissionStatus};
 
 /// What a person asks for.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
@@ -158,7 +158,7 @@ fn resume(submission: &Submission, leaderboard: Observed<'_>, frame: Frame) -> R
             "The operator asks EvalAI first. If EvalAI shows submission {} as archived, deleted or finished, the attempt ends \
              as {}: then resume it in EvalAI.",
             evalai.submission,
-            reasons::ENDED_IN_EVALAI
+            Reason::EndedInEvalAI
         ));
     }
     page.paragraph(&format!("To follow it: `{} -w`.", command("status", submission)));

@@ -103,8 +103,8 @@ pub(super) fn lines(submission: &Submission, leaderboard: Observed<'_>, frame: F
     for found in conditions_of(leaderboard) {
         let text = format!("{}, {}: {}", found.status, found.reason, sentence(&found.message));
         page.row(&found.type_, text.trim_end_matches(": "));
-        if let Some(reason) = reasons::of(&found.reason).filter(|_| found.status != "True") {
-            page.row("", &reasons::plain(reason.next_step));
+        if let Some(reason) = found.reason.known().filter(|_| !found.is_true()) {
+            page.row("", &reasons::plain(reason.next_step()));
         }
     }
     let mut lines = why::explain(submission, leaderboard, frame);

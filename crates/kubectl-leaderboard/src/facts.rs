@@ -7,7 +7,7 @@ use k8s_openapi::apimachinery::pkg::apis::meta::v1::Time;
 use kube::ResourceExt;
 
 use super::text::{Frame, when};
-use leaderboard_api::{Attempt, FailureClass, State, Submission, SubmissionStatus, conditions};
+use leaderboard_api::{Attempt, FailureClass, ReasonName, State, Submission, SubmissionStatus, conditions};
 
 /// The state as people read it.
 pub(super) fn shown(submission: &Submission) -> &'static str {
@@ -60,7 +60,7 @@ pub(super) fn headline(submission: &Submission, now: Timestamp) -> String {
 /// the attempt has begun.
 pub(super) fn transition(submission: &Submission, attempt: Attempt, frame: Frame) -> Option<(String, Vec<String>)> {
     let status = submission.status.as_ref().filter(|s| s.attempt >= Some(attempt))?;
-    let reason = status.reason.as_deref().unwrap_or_default();
+    let reason = status.reason.as_ref().map(ReasonName::as_str).unwrap_or_default();
     let state = format!(
         "{} is {} ({reason})",
         submission.name_any(),

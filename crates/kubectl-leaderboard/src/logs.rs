@@ -139,9 +139,9 @@ pub(super) fn begins_again(container: &str, restarts: i32) -> String {
 pub(super) fn end(submission: &Submission) -> String {
     let status = submission.status.as_ref();
     let shown = facts::shown(submission);
-    let reason = status.and_then(|status| status.reason.as_deref());
+    let reason = status.and_then(|status| status.reason.as_ref());
     let reason = reason
-        .filter(|reason| *reason != shown)
+        .filter(|reason| reason.as_str() != shown)
         .map(|reason| format!(" ({reason})"));
     format!(
         "{} is {shown}{}. `{}` has the next step.",

@@ -14,7 +14,7 @@ use super::table::table;
 use super::text::{Frame, clean, join, span, wrap};
 use super::why;
 use leaderboard_api::conditions::{self, Condition};
-use leaderboard_api::{Leaderboard, State, Submission, SubmissionStatus, reasons};
+use leaderboard_api::{Leaderboard, Reason, ReasonName, State, Submission, SubmissionStatus};
 
 /// How long an end may wait for another system before that is a problem.
 const PATIENCE_SECONDS: i64 = 300;
@@ -177,7 +177,7 @@ fn row(place: Place<'_>, submission: &Submission, now: Timestamp) -> Option<Row>
 
 /// Why a submission is in its state; nothing if it is running, has finished, or was cancelled as requested.
 fn own_reason(submission: &Submission, status: &SubmissionStatus) -> Option<String> {
-    let reason = status.reason.as_deref().unwrap_or_default();
+    let reason = status.reason.as_ref().map(ReasonName::as_str).unwrap_or_default();
     let message = status.message.as_deref().unwrap_or_default();
     if status.has_ended() && facts::is_attempt_requested(submission) {
         let wanted = submission.spec.attempt;
@@ -198,8 +198,11 @@ fn own_reason(submission: &Submission, status: &SubmissionStatus) -> Option<Stri
             None => format!("{reason}: {message}"),
         }),
         Some(State::Running | State::Resumed) => {
-            let is_well = [reasons::RUNNING, reasons::RESUMED].contains(&reason);
-            let stalled = conditions::get(&status.conditions, conditions::STALLED).filter(|c| c.status == "True");
+            let is_well = status
+                .reason
+                .as_ref()
+                .is_none_or(|reason| reason.is_one_of(&[Reason::Running, Reason::Resumed]));
+            let stalled = conditions::get(&status.conditions, conditions::STALLED).filter(|c| c.is_true());
             match stalled {
                 Some(stalled) => Some(format!("{}: {}", stalled.reason, stalled.message)),
                 None => (!is_well).then(|| format!("{reason}: {message}")),
@@ -217,10 +220,10 @@ fn own_reason(submission: &Submission, status: &SubmissionStatus) -> Option<Stri
 fn other_systems(status: &SubmissionStatus, now: Timestamp) -> Option<String> {
     let late = |c: &&Condition| {
         let age = now.duration_since(c.last_transition_time.0).as_secs();
-        match c.reason.as_str() {
-            reasons::NOT_REQUIRED | reasons::CANCELLED_IN_EVALAI => false,
-            reasons::WAITING_FOR_PREVIOUS_CONTROLLER => age > PATIENCE_SECONDS,
-            reasons::WAITING => !c.message.is_empty() || age > PATIENCE_SECONDS,
+        match c.reason.known() {
+            Some(Reason::NotRequired | Reason::CancelledInEvalAI) => false,
+            Some(Reason::WaitingForPreviousController) => age > PATIENCE_SECONDS,
+            Some(Reason::Waiting) => !c.message.is_empty() || age > PATIENCE_SECONDS,
             _ => true,
         }
     };

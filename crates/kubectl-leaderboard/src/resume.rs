@@ -83,7 +83,7 @@ impl Resume {
         let failure = status.and_then(|status| status.failure.as_ref()).filter(|_| is_failed);
         failure.is_some_and(|failure| {
             let is_class = !self.infrastructure || failure.class == FailureClass::Infrastructure;
-            is_class && (self.reason.is_empty() || self.reason.contains(&failure.reason))
+            is_class && (self.reason.is_empty() || self.reason.iter().any(|name| *name == failure.reason.as_str()))
         })
     }
 
@@ -145,9 +145,9 @@ fn row(one: &Submission, now: Timestamp) -> Vec<String> {
             .map_or("", State::as_str)
             .to_owned(),
         status
-            .and_then(|status| status.reason.as_deref())
-            .unwrap_or_default()
-            .to_owned(),
+            .and_then(|status| status.reason.as_ref())
+            .map(ToString::to_string)
+            .unwrap_or_default(),
         class.to_owned(),
         since.unwrap_or_default(),
         status.and_then(|status| status.node_name.clone()).unwrap_or_default(),

@@ -3,7 +3,7 @@
 use jiff::Timestamp;
 use kube::ResourceExt;
 use leaderboard_api::text::sentence;
-use leaderboard_api::{State, Submission, SubmissionStatus, Times, WorkerState, WorkerStatus, conditions};
+use leaderboard_api::{ReasonName, State, Submission, SubmissionStatus, Times, WorkerState, WorkerStatus, conditions};
 use serde_json::{Value, json};
 
 use super::board::{self, Observed};
@@ -26,7 +26,7 @@ pub fn screen(submission: &Submission, leaderboard: Observed<'_>, frame: Frame) 
     }
     page.gap();
     page.row("Track", &facts::track(submission));
-    let reason = status.reason.as_deref().unwrap_or_default();
+    let reason = status.reason.as_ref().map(ReasonName::as_str).unwrap_or_default();
     let message = sentence(status.message.as_deref().unwrap_or_default());
     page.row("Reason", join(&[&format!("{reason}:"), &message]).trim_matches(':'));
     page.row("In line", &in_line(status));
@@ -195,7 +195,7 @@ fn row(submission: &Submission, is_qualified: bool, is_wide: bool, now: Timestam
     let mut row = vec![
         submission.name_any(),
         status.known_state().map_or("(new)", State::as_str).to_owned(),
-        text(status.reason.as_deref()),
+        text(status.reason.as_ref().map(ReasonName::as_str)),
         text(status.progress.as_ref().map(|progress| progress.text.as_str())),
         text(status.score.as_ref().map(|score| score.text.as_str())),
         text(status.waiting.as_ref().map(|waiting| waiting.text.as_str())),

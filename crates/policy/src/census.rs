@@ -4,7 +4,7 @@ use std::cmp::Reverse;
 use std::collections::{BTreeMap, BTreeSet};
 
 use leaderboard_api::leaderboard::Counts;
-use leaderboard_api::{MAX_USING_TEAMS, State, Submission, SubmissionStatus, TeamUse, conditions, reasons};
+use leaderboard_api::{MAX_USING_TEAMS, Reason, State, Submission, SubmissionStatus, TeamUse, conditions};
 
 /// Checks are in no count.
 #[derive(Debug, Default, PartialEq)]
@@ -82,7 +82,11 @@ impl Census {
 }
 
 fn lacks_image(status: &SubmissionStatus) -> bool {
-    !status.has_ended() && status.reason.as_deref() == Some(reasons::IMAGE_PULL)
+    !status.has_ended()
+        && status
+            .reason
+            .as_ref()
+            .is_some_and(|reason| *reason == Reason::ImagePull)
 }
 
 fn needs_leaderboard(status: &SubmissionStatus) -> bool {

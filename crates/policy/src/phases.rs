@@ -7,7 +7,7 @@ use jiff::Timestamp;
 
 use super::view::View;
 use leaderboard_api::conditions::{ARCHIVED, FINISHED, PUBLISHED, RECORDED, RUNNING};
-use leaderboard_api::{Attempt, Ingested, Submission, SubmissionStatus, reasons};
+use leaderboard_api::{Attempt, Ingested, Reason, Submission, SubmissionStatus};
 
 /// What a submission goes through.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
@@ -226,7 +226,7 @@ impl Step<'_> {
 fn has_run(status: &SubmissionStatus) -> bool {
     status
         .condition(RUNNING)
-        .is_some_and(|running| running.status == "True" || running.reason == reasons::REPLACING)
+        .is_some_and(|running| running.status == "True" || running.reason == Reason::Replacing)
 }
 
 fn created(view: &View) -> Timestamp {

@@ -27,7 +27,7 @@ fn verdict(reason: WorkspaceReason) -> WorkspaceVerdict {
 }
 
 /// A Leaderboard whose condition shows this of this generation.
-fn shown(reason: &str, of: i64) -> Leaderboard {
+fn shown(reason: Reason, of: i64) -> Leaderboard {
     let mut object = leaderboard(&json!({}), 2);
     let mut conditions = Vec::new();
     let now = Time(Timestamp::UNIX_EPOCH);
@@ -53,40 +53,34 @@ fn only_what_was_measured_is_called_enforced() {
     );
     let in_place = || Policy::InPlace;
     let cases = [
-        (&on, Policy::External, Some(Enforced), Truth::Unknown, reasons::EXTERNAL),
+        (&on, Policy::External, Some(Enforced), Truth::Unknown, Reason::External),
         (
             &on,
             Policy::Refused("no".into()),
             Some(Enforced),
             Truth::False,
-            reasons::FORBIDDEN,
+            Reason::Forbidden,
         ),
         (
             &on,
             Policy::NotApplied("no".into()),
             None,
             Truth::False,
-            reasons::NOT_APPLIED,
+            Reason::NotApplied,
         ),
-        (&on, in_place(), None, Truth::Unknown, reasons::NOT_MEASURED),
-        (
-            &on,
-            in_place(),
-            Some(NotMeasured),
-            Truth::Unknown,
-            reasons::NOT_MEASURED,
-        ),
-        (&on, in_place(), Some(Enforced), Truth::True, reasons::ENFORCED),
-        (&on, in_place(), Some(NotEnforced), Truth::False, reasons::NOT_ENFORCED),
-        (&on, in_place(), Some(NotIsolated), Truth::False, reasons::NOT_ENFORCED),
+        (&on, in_place(), None, Truth::Unknown, Reason::NotMeasured),
+        (&on, in_place(), Some(NotMeasured), Truth::Unknown, Reason::NotMeasured),
+        (&on, in_place(), Some(Enforced), Truth::True, Reason::Enforced),
+        (&on, in_place(), Some(NotEnforced), Truth::False, Reason::NotEnforced),
+        (&on, in_place(), Some(NotIsolated), Truth::False, Reason::NotEnforced),
         (
             &on,
             in_place(),
             Some(NotKnownIsolated),
             Truth::Unknown,
-            reasons::NOT_MEASURED,
+            Reason::NotMeasured,
         ),
-        (&off, in_place(), Some(Enforced), Truth::Unknown, reasons::NOT_MEASURED),
+        (&off, in_place(), Some(Enforced), Truth::Unknown, Reason::NotMeasured),
     ];
     for (leaderboard, policy, found, truth, reason) in cases {
         let (is, why, message) = condition(leaderboard, &policy, found.map(verdict).as_ref());
@@ -106,32 +100,28 @@ async fn what_a_pod_found_outlives_it_until_the_spec_changes() {
         }
         condition(leaderboard, &Policy::InPlace, found.as_ref())
     };
-    for (reason, of) in [
-        (reasons::NOT_ENFORCED, 1),
-        (reasons::ENFORCED, 1),
-        (reasons::FORBIDDEN, 2),
-    ] {
-        assert_eq!(said(&shown(reason, of)).1, reasons::NOT_MEASURED, "{reason} of {of}");
+    for (reason, of) in [(Reason::NotEnforced, 1), (Reason::Enforced, 1), (Reason::Forbidden, 2)] {
+        assert_eq!(said(&shown(reason, of)).1, Reason::NotMeasured, "{reason} of {of}");
     }
-    assert_eq!(said(&shown(reasons::ENFORCED, 2)).0, Truth::True);
-    let (truth, reason, message) = said(&shown(reasons::NOT_ENFORCED, 2));
+    assert_eq!(said(&shown(Reason::Enforced, 2)).0, Truth::True);
+    let (truth, reason, message) = said(&shown(Reason::NotEnforced, 2));
     assert_eq!(
         (truth, reason, message.as_str()),
-        (Truth::False, reasons::NOT_ENFORCED, "As before.")
+        (Truth::False, Reason::NotEnforced, "As before.")
     );
     let (truth, ..) = condition(
-        &shown(reasons::NOT_ENFORCED, 2),
+        &shown(Reason::NotEnforced, 2),
         &Policy::InPlace,
         Some(&verdict(WorkspaceReason::Enforced)),
     );
     assert_eq!(truth, Truth::True, "what was found last counts");
 
     // It was refused for a moment.
-    let (_, reason, message) = said(&shown(reasons::FORBIDDEN, 2));
-    assert_eq!((reason, message.as_str()), (reasons::NOT_ENFORCED, "As before."));
-    let mut edited = shown(reasons::FORBIDDEN, 2);
+    let (_, reason, message) = said(&shown(Reason::Forbidden, 2));
+    assert_eq!((reason, message.as_str()), (Reason::NotEnforced, "As before."));
+    let mut edited = shown(Reason::Forbidden, 2);
     edited.metadata.generation = Some(3);
-    assert_eq!(said(&edited).1, reasons::NOT_MEASURED, "of another spec");
+    assert_eq!(said(&edited).1, Reason::NotMeasured, "of another spec");
 }
 
 #[test]

@@ -94,11 +94,11 @@ fn each_leaderboard_shows_its_readiness_and_how_long_its_oldest_have_waited() {
             "a",
             &[("Finished", "False", "Preparing", 1), ("Running", "True", "Running", 2)],
         ),
-        ended(("False", reasons::WAITING), 40),
-        ended(("False", reasons::WAITING), 50),
-        ended(("False", reasons::REFUSED), 3),
-        ended(("False", reasons::NOT_REQUIRED), 3),
-        ended(("True", reasons::PUBLISHED), 3),
+        ended(("False", "Waiting"), 40),
+        ended(("False", "Waiting"), 50),
+        ended(("False", "Refused"), 3),
+        ended(("False", "NotRequired"), 3),
+        ended(("True", "Published"), 3),
         submission("unknown", &[("Finished", "False", "Preparing", 0)]),
     ];
     // Two have a slot; one that has ended has given it back.
@@ -132,7 +132,7 @@ fn in_state(state: State, reason: Option<&str>, class: Option<&str>) -> Submissi
     let conditions: &[_] = match state {
         State::Pending => &[("Finished", "False", "Preparing", 1)],
         State::Running | State::Resumed => &[("Running", "True", "Running", 1)],
-        State::Finished => &[("Finished", "True", reasons::FINISHED, 1)],
+        State::Finished => &[("Finished", "True", "Finished", 1)],
         State::Failed | State::Cancelled => &[("Finished", "True", "AsItEnded", 1)],
     };
     let mut one = submission("a", conditions);

@@ -16,7 +16,7 @@ use tokio::sync::mpsc;
 use super::*;
 use crate::fixtures::{Cluster, Surroundings, leaderboard, surroundings, with_job};
 use leaderboard_api::conditions::{self, Truth};
-use leaderboard_api::{Attempt, State, reasons};
+use leaderboard_api::{Attempt, Reason, State};
 use leaderboard_policy::ask::Lookup;
 use leaderboard_policy::view::{NodeView, ObservedFence, ObservedJob, ObservedLog, ObservedReport, ReportView, Turn};
 
@@ -205,11 +205,11 @@ fn an_attempt_that_evalai_has_asked_for_differs_from_one_that_a_person_has_begun
 fn an_attempt_that_goes_on_from_a_live_one_is_nobodys_new_request() {
     let (mut submission, _) = with_job("sub", &leaderboard("one", "http://s3"));
     submission.spec.attempt = Attempt(2);
-    let restart = |reason: &str| {
+    let restart = |reason: Reason| {
         json!({"attempt": 2, "conditions": [{"type": "Finished", "status": "False", "reason": reason, "message": "",
                                               "lastTransitionTime": "2026-01-01T00:00:00Z"}]})
     };
-    for (reason, is_restart) in [(reasons::REPLACING, true), (reasons::PREPARING, false)] {
+    for (reason, is_restart) in [(Reason::Replacing, true), (Reason::Preparing, false)] {
         submission.status = serde_json::from_value(restart(reason)).unwrap();
         let run = run_of(&submission);
         assert_eq!((run.by_hand, run.has_job), (!is_restart, is_restart), "{reason}");

@@ -8,7 +8,7 @@ use k8s_openapi::api::batch::v1::Job;
 use k8s_openapi::api::core::v1::Event;
 use kube::ResourceExt;
 use kube::api::{ListParams, PostParams};
-use leaderboard_api::{Submission, reasons};
+use leaderboard_api::{Reason, Submission};
 use serde::{Deserialize, Serialize};
 use serde_json::json;
 use tokio::time::sleep;
@@ -91,7 +91,7 @@ fn shows_quota(submission: &Submission) -> bool {
     let status = submission.status.as_ref();
     status.is_some_and(|status| {
         let message = status.message.as_deref().unwrap_or_default();
-        status.reason.as_deref() == Some(reasons::QUOTA_EXCEEDED) && message.contains("exceeded quota: none")
+        status.shows(Reason::QuotaExceeded) && message.contains("exceeded quota: none")
     })
 }
 

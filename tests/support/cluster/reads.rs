@@ -2,7 +2,7 @@
 
 use k8s_openapi::api::core::v1::{ContainerStatus, Pod};
 use kube::{Resource, ResourceExt};
-use leaderboard_api::{State, Submission, conditions};
+use leaderboard_api::{Reason, ReasonName, State, Submission, conditions};
 
 /// The STATE column.
 pub fn state(submission: &Submission) -> Option<State> {
@@ -14,8 +14,8 @@ pub fn reason(submission: &Submission) -> &str {
     submission
         .status
         .as_ref()
-        .and_then(|status| status.reason.as_deref())
-        .unwrap_or_default()
+        .and_then(|status| status.reason.as_ref())
+        .map_or("", ReasonName::as_str)
 }
 
 /// Its driving score.
@@ -57,7 +57,7 @@ pub fn is_settled(submission: &Submission) -> bool {
     let Some(status) = &submission.status else { return false };
     let known = |type_: &str| {
         let condition = conditions::get(&status.conditions, type_);
-        condition.is_some_and(|c| c.status == "True" || c.reason == "NotRequired")
+        condition.is_some_and(|c| c.status == "True" || c.reason == Reason::NotRequired)
     };
     status.attempt == Some(submission.spec.attempt)
         && is_true(submission, conditions::FINISHED)

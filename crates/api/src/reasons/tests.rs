@@ -1,6 +1,5 @@
 //! What holds for every row of the table, and that docs/states.md shows it.
 
-use std::collections::BTreeSet;
 use std::fmt::Write as _;
 
 use super::*;
@@ -51,16 +50,13 @@ fn with_section(text: &str, name: &str, table: &str) -> String {
 
 fn rows_of(class: Class) -> String {
     let mut table = String::from("| reason | meaning | next step |\n|---|---|---|\n");
-    for reason in all().filter(|reason| reason.class == class) {
-        let Reason {
-            name,
-            meaning,
-            next_step,
-            ..
-        } = reason;
-        let after = reason.after_failure.map(|step| format!(" Once it has failed: {step}"));
+    for reason in Reason::ALL.into_iter().filter(|reason| reason.class() == class) {
+        let (meaning, next_step) = (reason.meaning(), reason.next_step());
+        let after = reason
+            .own_after_failure()
+            .map(|step| format!(" Once it has failed: {step}"));
         let after = after.unwrap_or_default();
-        writeln!(table, "| `{name}` | {meaning} | {next_step}{after} |").unwrap();
+        writeln!(table, "| `{reason}` | {meaning} | {next_step}{after} |").unwrap();
     }
     table
 }
@@ -69,14 +65,14 @@ fn rows_of(class: Class) -> String {
 fn logs() -> String {
     let mut table = String::from("| whose log | failures |\n|---|---|\n");
     let mut logs: Vec<&str> = Vec::new();
-    for log in all().filter_map(|reason| reason.log) {
+    for log in Reason::ALL.into_iter().filter_map(Reason::log) {
         if !logs.contains(&log) {
             logs.push(log);
         }
     }
     for log in logs {
-        let names = all().filter(|reason| reason.log == Some(log));
-        let names: Vec<String> = names.map(|reason| format!("`{}`", reason.name)).collect();
+        let names = Reason::ALL.into_iter().filter(|reason| reason.log() == Some(log));
+        let names: Vec<String> = names.map(|reason| format!("`{reason}`")).collect();
         writeln!(table, "| {log} | {} |", names.join(", ")).unwrap();
     }
     table.push_str("| none: nothing has run, or the message explains it all | all others |\n");
@@ -85,37 +81,34 @@ fn logs() -> String {
 
 #[test]
 fn every_reason_is_explained_in_sentences() {
-    assert!(all().count() > 50);
-    for reason in all() {
-        let texts = [Some(reason.meaning), Some(reason.next_step), reason.after_failure];
-        for text in texts.into_iter().flatten() {
-            assert!(text.ends_with('.'), "{}: {text}", reason.name);
-            assert!(!text.contains(['|', '[', '\n']), "{}: {text}", reason.name);
-            assert_eq!(text.matches('`').count() % 2, 0, "{}: {text}", reason.name);
+    for reason in Reason::ALL {
+        for text in [reason.meaning(), reason.next_step(), reason.after_failure()] {
+            assert!(text.ends_with('.'), "{reason}: {text}");
+            assert!(!text.contains(['|', '[', '\n']), "{reason}: {text}");
+            assert_eq!(text.matches('`').count() % 2, 0, "{reason}: {text}");
             assert!(!plain(text).contains('`'));
         }
     }
 }
 
 #[test]
-fn every_name_is_there_once_as_kubernetes_writes_reasons() {
-    let names: BTreeSet<&str> = all().map(|reason| reason.name).collect();
-    assert_eq!(names.len(), all().count());
-    for name in names {
+fn every_name_is_as_kubernetes_writes_reasons_and_leads_back() {
+    for reason in Reason::ALL {
+        let name = reason.as_str();
         assert!(name.starts_with(|c: char| c.is_ascii_uppercase()), "{name}");
         assert!(name.chars().all(|c| c.is_ascii_alphanumeric()), "{name}");
-        assert_eq!(of(name).map(|reason| reason.name), Some(name));
+        assert!(name.len() <= 64, "{name}");
+        assert_eq!(Reason::of(name), Some(reason));
     }
-    assert_eq!(of("NoSuchReason"), None);
+    assert_eq!(Reason::of("NoSuchReason"), None);
 }
 
 #[test]
 fn only_a_failure_has_a_log() {
-    for reason in all().filter(|reason| reason.log.is_some()) {
+    for reason in Reason::ALL.into_iter().filter(|reason| reason.log().is_some()) {
         assert!(
-            matches!(reason.class, Class::Participant | Class::Infrastructure),
-            "{}",
-            reason.name
+            matches!(reason.class(), Class::Participant | Class::Infrastructure),
+            "{reason}"
         );
     }
 }
@@ -123,9 +116,11 @@ fn only_a_failure_has_a_log() {
 #[test]
 fn the_step_after_a_failure_is_that_of_the_reason_unless_it_has_another() {
     assert_eq!(
-        after_failure(NODE_LOST),
-        Some("Look at the node, then resume the submission.")
+        Reason::NodeLost.after_failure(),
+        "Look at the node, then resume the submission."
     );
-    assert_eq!(after_failure(IMAGE_PULL), Some("Fix this, then resume the submission."));
-    assert_eq!(after_failure("NoSuchReason"), None);
+    assert_eq!(
+        Reason::ImagePull.after_failure(),
+        "Fix this, then resume the submission."
+    );
 }

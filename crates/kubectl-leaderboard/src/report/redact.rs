@@ -2,6 +2,7 @@
 
 use std::collections::BTreeSet;
 
+use leaderboard_api::Reason;
 use serde_json::{Value, json};
 
 /// What stands where something was taken out.
@@ -16,7 +17,7 @@ const DROPPED: [&str; 6] = [
     "podOverrides",
 ];
 /// Reasons whose messages quote a checkpoint, and with it routes.
-const OF_RESULTS: [&str; 3] = ["InvalidResults", "NotEligible", "UnexplainedScores"];
+const OF_RESULTS: [Reason; 3] = [Reason::InvalidResults, Reason::NotEligible, Reason::UnexplainedScores];
 
 /// Names of the teams of submissions that have no id: counts and messages call these by their name.
 pub(super) fn names(submissions: &[Value]) -> BTreeSet<String> {
@@ -73,6 +74,7 @@ fn redacted(value: Value, names: &BTreeSet<String>) -> Value {
             let quotes = fields
                 .get("reason")
                 .and_then(Value::as_str)
+                .and_then(Reason::of)
                 .is_some_and(|reason| OF_RESULTS.contains(&reason));
             let kept = fields.into_iter().filter(|(key, _)| !DROPPED.contains(&key.as_str()));
             let fields = kept.map(|(key, value)| {
@@ -166,7 +168,10 @@ mod tests {
     #[test]
     fn an_event_that_quotes_results_keeps_its_reason_alone() {
         let event = |reason: &str, note: &str| json!({"reason": reason, "note": note, "regarding": {"name": "a"}});
-        let mut events: Vec<Value> = OF_RESULTS.iter().map(|reason| event(reason, "s3cr3t")).collect();
+        let mut events: Vec<Value> = OF_RESULTS
+            .iter()
+            .map(|reason| event(reason.as_str(), "s3cr3t"))
+            .collect();
         events.push(event("Replacing", "stays"));
         let text = objects("events", events, &BTreeSet::new()).to_string();
         assert!(!text.contains("s3cr3t"), "{text}");

@@ -9,7 +9,7 @@ use super::{
 };
 use crate::board::Observed;
 use crate::why::explain;
-use leaderboard_api::{Attempt, Leaderboard, Submission, reasons};
+use leaderboard_api::{Attempt, Leaderboard, Reason, Submission};
 
 fn printed(submission: &Submission, leaderboard: Observed<'_>) -> String {
     let lines = explain(submission, leaderboard, frame());
@@ -54,7 +54,7 @@ fn next_of(page: &str) -> &str {
 
 #[test]
 fn the_next_step_of_a_failure_is_not_that_of_a_wait_for_the_same_reason() {
-    for reason in [reasons::NOT_ISOLATED, reasons::PHASE_DIFFERS] {
+    for reason in [Reason::NotIsolated, Reason::PhaseDiffers] {
         let wait = explained(&json!({"state": "Pending", "reason": reason, "attempt": 1}));
         let message = "Something failed. Correct that.";
         let failure = json!({"class": "Infrastructure", "reason": reason, "message": message});
@@ -160,7 +160,7 @@ fn the_log_is_read_where_the_run_was_stored() {
 /// Each reason in each state: there is a next step, and no line is too long (but for a command with a name of 52 letters).
 #[test]
 fn every_reason_has_a_next_step_within_the_width() {
-    for reason in reasons::all().map(|reason| reason.name) {
+    for reason in Reason::ALL {
         for status in [waiting(), running(), crashed(), finished(), cancelled()] {
             let long = format!("{} {}", "word ".repeat(80), "x".repeat(300));
             let status = with(

@@ -17,7 +17,9 @@ use super::text::{Frame, Page, join, span, when};
 use leaderboard_api::conditions::{self, Condition};
 use leaderboard_api::names::FAILURE_LOG_KEY;
 use leaderboard_api::text::sentence;
-use leaderboard_api::{EndReason, FailureClass, LastEnd, Submission, SubmissionStatus, WorkerStatus, reasons};
+use leaderboard_api::{
+    EndReason, FailureClass, LastEnd, Reason, ReasonName, Submission, SubmissionStatus, WorkerStatus, reasons,
+};
 
 /// What is known, and the lines about it so far.
 struct Explanation<'a> {
@@ -38,7 +40,7 @@ pub fn value(submission: &Submission, leaderboard: Observed<'_>) -> Value {
         "namespace": submission.namespace(),
         "state": status.known_state(),
         "reason": status.reason,
-        "meaning": status.reason.as_deref().map(meaning),
+        "meaning": status.reason.as_ref().map(meaning),
         "message": status.message,
         "failure": status.failure,
         "waiting": status.waiting,
@@ -87,7 +89,7 @@ impl Explanation<'_> {
 
     fn reason(&mut self) {
         let Some(reason) = &self.status.reason else { return };
-        let stalled = conditions::get(&self.status.conditions, conditions::STALLED).filter(|c| c.status == "True");
+        let stalled = conditions::get(&self.status.conditions, conditions::STALLED).filter(|c| c.is_true());
         let same = stalled.filter(|c| c.reason == *reason);
         let since = same.map(|c| format!("Since {}.", when(c.last_transition_time.0, self.now)));
         let text = [&format!("{reason}:"), &meaning(reason), &since.unwrap_or_default()];
@@ -211,7 +213,7 @@ impl Explanation<'_> {
         let Some(failure) = self.status.failure.as_ref().filter(|_| has_ended(self.submission)) else {
             return;
         };
-        let log = reasons::of(&failure.reason).and_then(|reason| reason.log);
+        let log = failure.reason.known().and_then(Reason::log);
         let (Some(log), Some(results)) = (log, &self.status.results_url) else {
             return self
                 .page
@@ -238,8 +240,9 @@ impl Explanation<'_> {
     }
 }
 
-pub(super) fn meaning(reason: &str) -> String {
-    reasons::of(reason).map_or_else(String::new, |reason| reasons::plain(reason.meaning))
+pub(super) fn meaning(reason: &ReasonName) -> String {
+    let known = reason.known();
+    known.map_or_else(String::new, |reason| reasons::plain(reason.meaning()))
 }
 
 /// How a worker crashed. The message of a failure has the count at which the worker failed; its containers may end once more before
@@ -267,9 +270,10 @@ fn crashes(worker: &WorkerStatus, is_failed: bool, now: Timestamp) -> String {
 
 fn system_text(condition: &Condition, system: &str, now: Timestamp) -> String {
     let meaning = meaning(&condition.reason).replacen("The other system", system, 1);
-    let since = match (condition.status.as_str(), condition.reason.as_str()) {
-        ("True", _) | (_, reasons::NOT_REQUIRED) => String::new(),
-        _ => format!("Since {}.", when(condition.last_transition_time.0, now)),
+    let since = if condition.is_true() || condition.reason == Reason::NotRequired {
+        String::new()
+    } else {
+        format!("Since {}.", when(condition.last_transition_time.0, now))
     };
     let message = sentence(&condition.message);
     join(&[&format!("{}:", condition.reason), &meaning, &message, &since])

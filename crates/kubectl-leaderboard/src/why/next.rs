@@ -1,6 +1,6 @@
 //! The next steps of one submission: those of the table of reasons, and the command of this plugin that takes one.
 
-use leaderboard_api::{Failure, FailureClass, Submission, SubmissionStatus, conditions, reasons};
+use leaderboard_api::{Failure, FailureClass, Reason, ReasonName, Submission, SubmissionStatus, conditions, reasons};
 
 use crate::board::{self, Observed};
 use crate::facts::has_ended;
@@ -13,21 +13,21 @@ pub(super) fn of_worker(text: &str, worker: Option<i32>) -> String {
 
 /// What to do next; the step of the reason comes first.
 pub(super) fn next_steps(submission: &Submission, status: &SubmissionStatus, leaderboard: Observed<'_>) -> Vec<String> {
-    let mut reasons: Vec<&str> = status.reason.as_deref().into_iter().collect();
+    let mut reasons: Vec<Reason> = status.reason.as_ref().and_then(ReasonName::known).into_iter().collect();
     // While the run is being stopped, the reason is that of the stop.
-    reasons.extend(status.failure.as_ref().map(|failure| failure.reason.as_str()));
+    reasons.extend(status.failure.as_ref().and_then(|failure| failure.reason.known()));
     let doubt = conditions::get(&status.conditions, conditions::PLAUSIBLE).filter(|c| c.status == "False");
-    reasons.extend(doubt.map(|c| c.reason.as_str()));
+    reasons.extend(doubt.and_then(|c| c.reason.known()));
     let problems = if has_ended(submission) {
         Vec::new()
     } else {
         board::problems(&submission.spec.leaderboard_name, leaderboard)
     };
-    reasons.extend(problems.iter().filter_map(|problem| problem.reason.as_deref()));
+    reasons.extend(problems.iter().filter_map(|problem| problem.reason));
     let worker = status.failure.as_ref().and_then(|failure| failure.worker);
     let mut steps: Vec<String> = Vec::new();
     let next = |reason| next_step(status.failure.as_deref(), reason);
-    for next in reasons.into_iter().filter_map(next).map(|next| of_worker(next, worker)) {
+    for next in reasons.into_iter().map(next).map(|next| of_worker(next, worker)) {
         if !steps.contains(&next) {
             steps.push(next);
         }
@@ -39,12 +39,12 @@ pub(super) fn next_steps(submission: &Submission, status: &SubmissionStatus, lea
 }
 
 /// The next step of a reason: of an infrastructure failure the one that hosts do after it.
-fn next_step(failure: Option<&Failure>, reason: &str) -> Option<&'static str> {
+fn next_step(failure: Option<&Failure>, reason: Reason) -> &'static str {
     let is_of_host = failure.is_some_and(|f| f.reason == reason && f.class == FailureClass::Infrastructure);
     if is_of_host {
-        reasons::after_failure(reason)
+        reason.after_failure()
     } else {
-        reasons::of(reason).map(|reason| reason.next_step)
+        reason.next_step()
     }
 }
 
@@ -54,13 +54,14 @@ pub(super) fn verb(submission: &Submission, status: &SubmissionStatus) -> Option
     if submission.metadata.deletion_timestamp.is_some() || submission.spec.check {
         return None;
     }
-    let reason = status.reason.as_deref().unwrap_or_default();
     if has_ended(submission) {
         let is_infrastructure = |f: &Failure| f.class == FailureClass::Infrastructure;
         let is_resumable = status.failure.as_deref().is_some_and(is_infrastructure);
-        return (is_resumable || reason == reasons::CANCELLED).then_some("resume");
+        return (is_resumable || status.shows(Reason::Cancelled)).then_some("resume");
     }
-    [reasons::TRACK_NOT_FOUND, reasons::IMAGE_MISSING, reasons::PHASE_DIFFERS]
-        .contains(&reason)
+    let of_people = [Reason::TrackNotFound, Reason::ImageMissing, Reason::PhaseDiffers];
+    let reason = status.reason.as_ref();
+    reason
+        .is_some_and(|reason| reason.is_one_of(&of_people))
         .then_some("cancel")
 }

@@ -42,7 +42,7 @@ use crate::owner::owner_reference;
 pub use gpu_count::gpus;
 use leaderboard_api::{
     Attempt, Deadlines, Enforcement, FailedNode, GpuSource, JobNumber, Leaderboard, LeaderboardSpec, PolicySource,
-    RunPlan, Submission, Track, conditions, effective, names, reasons,
+    Reason, RunPlan, Submission, Track, conditions, effective, names,
 };
 use leaderboard_contract::run::{Isolation, Run, SCHEMA};
 use leaderboard_evaluation::Evaluation;
@@ -181,7 +181,7 @@ fn isolation(leaderboard: &Leaderboard, now: Timestamp) -> Option<Isolation> {
     }
     let is_open = leaderboard.condition(conditions::ISOLATED).is_some_and(|found| {
         let age = now.duration_since(found.last_transition_time.0).unsigned_abs();
-        found.reason == reasons::NOT_ENFORCED
+        found.reason == Reason::NotEnforced
             && found.observed_generation == leaderboard.metadata.generation
             && age < KNOWN_OPEN_FOR
     });

@@ -11,8 +11,8 @@ use crate::submissions::previous_controller;
 use leaderboard_api::conditions::{self, Truth};
 use leaderboard_api::leaderboard::Counts;
 use leaderboard_api::{
-    CarlaShape, Evalai, EvalaiUse, Leaderboard, LeaderboardStatus, ResourceExt, TableUse, TeamUse, Track, TrackStatus,
-    effective, names, reasons,
+    CarlaShape, Evalai, EvalaiUse, Leaderboard, LeaderboardStatus, Reason, ResourceExt, TableUse, TeamUse, Track,
+    TrackStatus, effective, names,
 };
 use leaderboard_contract::verdict::WorkspaceVerdict;
 
@@ -87,7 +87,7 @@ pub fn decide(view: &LeaderboardView) -> LeaderboardPlan {
     status.table = view.rows_waiting.filter(|waiting| *waiting > 0).map(table_use);
     status.tracks = tracks(leaderboard);
     let now = Time(view.now);
-    let set = |status: &mut LeaderboardStatus, type_, (truth, reason, message): (Truth, &str, String)| {
+    let set = |status: &mut LeaderboardStatus, type_, (truth, reason, message): (Truth, Reason, String)| {
         conditions::set(&mut status.conditions, type_, truth, reason, &message, generation, &now);
     };
     if let Some(ready) = ready(view) {
@@ -98,7 +98,7 @@ pub fn decide(view: &LeaderboardView) -> LeaderboardPlan {
     let deleting = leaderboard.metadata.deletion_timestamp.is_some();
     let is_in_use = view.in_use > 0 || view.pods > 0;
     if deleting && is_in_use {
-        let in_use = (Truth::True, reasons::IN_USE, in_use(view));
+        let in_use = (Truth::True, Reason::InUse, in_use(view));
         set(&mut status, conditions::TERMINATING, in_use);
     }
     let held = leaderboard
@@ -133,7 +133,7 @@ fn in_use(view: &LeaderboardView) -> String {
 
 /// The first thing that is wrong, the gravest first; what nobody knows comes after what is surely wrong. None: what was shown of an earlier
 /// spec, or by the controller before, stays until the first look has ended.
-fn ready(view: &LeaderboardView) -> Option<(Truth, &'static str, String)> {
+fn ready(view: &LeaderboardView) -> Option<(Truth, Reason, String)> {
     if let Some(wrong) = of_spec(view) {
         return Some(wrong);
     }
@@ -141,11 +141,11 @@ fn ready(view: &LeaderboardView) -> Option<(Truth, &'static str, String)> {
         return Some(found(view));
     }
     let is_new = view.leaderboard.condition(conditions::READY).is_none();
-    is_new.then(|| (Truth::Unknown, reasons::CHECKING, FIRST_LOOK.to_owned()))
+    is_new.then(|| (Truth::Unknown, Reason::Checking, FIRST_LOOK.to_owned()))
 }
 
 /// What the looks at its places and EvalAI have found.
-fn found(view: &LeaderboardView) -> (Truth, &'static str, String) {
+fn found(view: &LeaderboardView) -> (Truth, Reason, String) {
     let unreachable = |truth| view.unreachable.as_ref().filter(|found| found.truth == truth);
     let (evalai_truth, reason, message) = evalai(&view.evalai);
     if let Some(found) = unreachable(Truth::False) {
@@ -159,7 +159,7 @@ fn found(view: &LeaderboardView) -> (Truth, &'static str, String) {
 
 /// A Leaderboard that is ready shows what its host should know all the same: that a new controller waits with its first write to
 /// EvalAI, which runs have no limit, which images several teams lack, and what its Pods give to strangers.
-fn with_notes(view: &LeaderboardView, ready: (Truth, &'static str, String)) -> (Truth, &'static str, String) {
+fn with_notes(view: &LeaderboardView, ready: (Truth, Reason, String)) -> (Truth, Reason, String) {
     let (truth, reason, message) = ready;
     if truth != Truth::True {
         return (truth, reason, message);
@@ -180,20 +180,20 @@ fn with_notes(view: &LeaderboardView, ready: (Truth, &'static str, String)) -> (
 }
 
 /// What is wrong with the Leaderboard as it is written.
-fn of_spec(view: &LeaderboardView) -> Option<(Truth, &'static str, String)> {
+fn of_spec(view: &LeaderboardView) -> Option<(Truth, Reason, String)> {
     let no = |reason, message: String| Some((Truth::False, reason, message));
     if let Some(refusal) = &view.refusal {
         return no(refusal.reason, refusal.message.clone());
     }
     if let Some(older) = phase_conflict(view) {
         return no(
-            reasons::PHASE_CONFLICT,
+            Reason::PhaseConflict,
             format!("Leaderboard {older} is older and serves a phase of this one; give each phase to one Leaderboard."),
         );
     }
     if let Some(older) = prefix_conflict(view) {
         return no(
-            reasons::PREFIX_CONFLICT,
+            Reason::PrefixConflict,
             format!(
                 "Leaderboard {older} is older, of another namespace or another EvalAI server, and stores below the same bucket and prefix: \
                  the runs of one could replace those of the other. Make this one anew with a storage.s3.prefix of its own."
@@ -201,38 +201,38 @@ fn of_spec(view: &LeaderboardView) -> Option<(Truth, &'static str, String)> {
         );
     }
     if let Some(why) = &view.invalid_pod {
-        return no(reasons::INVALID_POD, why.clone());
+        return no(Reason::InvalidPod, why.clone());
     }
     match &view.claims {
-        Claims::NotServed => return no(reasons::CLAIMS_NOT_SERVED, CLAIMS_NOT_SERVED.to_owned()),
-        Claims::Missing(why) => return no(reasons::CLAIM_TEMPLATE_MISSING, why.clone()),
+        Claims::NotServed => return no(Reason::ClaimsNotServed, CLAIMS_NOT_SERVED.to_owned()),
+        Claims::Missing(why) => return no(Reason::ClaimTemplateMissing, why.clone()),
         Claims::NotRequired | Claims::InPlace => {}
     }
     match &view.policy {
-        Policy::Refused(why) | Policy::NotApplied(why) => no(reasons::NOT_ISOLATED, why.clone()),
+        Policy::Refused(why) | Policy::NotApplied(why) => no(Reason::NotIsolated, why.clone()),
         Policy::InPlace | Policy::External => None,
     }
 }
 
-fn evalai(standing: &EvalaiStanding) -> (Truth, &'static str, String) {
+fn evalai(standing: &EvalaiStanding) -> (Truth, Reason, String) {
     let no = |reason, message: String| (Truth::False, reason, message);
     match standing {
-        EvalaiStanding::NoToken(why) => no(reasons::TOKEN_MISSING, why.clone()),
-        EvalaiStanding::TokenRefused(why) => no(reasons::TOKEN_REFUSED, why.clone()),
-        EvalaiStanding::QueueUnread { is_refused: true, why } => no(reasons::QUEUE_UNREACHABLE, why.clone()),
+        EvalaiStanding::NoToken(why) => no(Reason::TokenMissing, why.clone()),
+        EvalaiStanding::TokenRefused(why) => no(Reason::TokenRefused, why.clone()),
+        EvalaiStanding::QueueUnread { is_refused: true, why } => no(Reason::QueueUnreachable, why.clone()),
         EvalaiStanding::QueueUnread { why, .. } => {
             let message = format!("EvalAI's queue has not been read for minutes: {why}. It is retried each minute.");
-            (Truth::Unknown, reasons::QUEUE_UNREACHABLE, message)
+            (Truth::Unknown, Reason::QueueUnreachable, message)
         }
-        EvalaiStanding::Misfit(why) => no(reasons::LABELS_DIFFER, why.clone()),
+        EvalaiStanding::Misfit(why) => no(Reason::LabelsDiffer, why.clone()),
         EvalaiStanding::Unchecked(why) => {
             let why = why
                 .clone()
                 .unwrap_or_else(|| "EvalAI is being asked for its phases and labels.".into());
-            (Truth::Unknown, reasons::ASKING_EVALAI, why)
+            (Truth::Unknown, Reason::AskingEvalAI, why)
         }
-        EvalaiStanding::Fits { note } => (Truth::True, reasons::READY, note.clone().unwrap_or_default()),
-        EvalaiStanding::NotRequired => (Truth::True, reasons::READY, String::new()),
+        EvalaiStanding::Fits { note } => (Truth::True, Reason::Ready, note.clone().unwrap_or_default()),
+        EvalaiStanding::NotRequired => (Truth::True, Reason::Ready, String::new()),
     }
 }
 

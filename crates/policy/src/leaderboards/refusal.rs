@@ -3,7 +3,7 @@
 use std::net::IpAddr;
 
 use crate::allowed::Allowed;
-use leaderboard_api::{Leaderboard, ranges, reasons};
+use leaderboard_api::{Leaderboard, Reason, ranges};
 
 /// Ends of names that a cluster or a machine gives itself, which the internet has not.
 const LOCAL_NAMES: [&str; 5] = [".svc", ".local", ".localhost", ".internal", ".home.arpa"];
@@ -11,7 +11,7 @@ const LOCAL_NAMES: [&str; 5] = [".svc", ".local", ".localhost", ".internal", ".h
 /// Why a Leaderboard is not served as it is written.
 #[derive(Clone, Debug, PartialEq, Eq)]
 pub struct Refusal {
-    pub reason: &'static str,
+    pub reason: Reason,
     pub message: String,
 }
 
@@ -19,13 +19,13 @@ pub struct Refusal {
 pub fn of(allowed: &Allowed, leaderboard: &Leaderboard) -> Option<Refusal> {
     if let Some(refused) = allowed.refusal(leaderboard) {
         return Some(Refusal {
-            reason: reasons::NOT_ALLOWED,
+            reason: Reason::NotAllowed,
             message: refused.to_string(),
         });
     }
     let server = &leaderboard.spec.evalai.as_ref()?.api_server;
     is_exposed(server).then(|| Refusal {
-        reason: reasons::INSECURE_SERVER,
+        reason: Reason::InsecureServer,
         message: format!(
             "evalai.apiServer {server} would get the host's token unencrypted over the internet; use https. http is for servers inside the \
              cluster and at private addresses."

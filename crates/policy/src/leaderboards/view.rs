@@ -1,5 +1,6 @@
 //! How the things stand that a Leaderboard names, as `decide` sees them.
 
+use leaderboard_api::Reason;
 use leaderboard_api::conditions::Truth;
 
 /// How the template of a Leaderboard stands.
@@ -28,7 +29,7 @@ pub struct Unreachable {
     /// Never True.
     pub truth: Truth,
     /// Of the gravest.
-    pub reason: &'static str,
+    pub reason: Reason,
     /// Of all.
     pub message: String,
 }

@@ -16,8 +16,8 @@ use leaderboard_api::conditions::{self, Truth};
 use leaderboard_api::evalai_status::Status;
 use leaderboard_api::text::{LONGEST_NAME, one_line, sentence};
 use leaderboard_api::{
-    Attempt, Failure, ImagePattern, ImageReference, LeaderboardSpec, Repository, RunPlan, Team, TeamStatus, Track,
-    effective, image_pattern, reasons,
+    Attempt, Failure, ImagePattern, ImageReference, LeaderboardSpec, Reason, Repository, RunPlan, Team, TeamStatus,
+    Track, effective, image_pattern,
 };
 
 /// Pins the plan and returns true if the submission may go on to its turn. Otherwise the draft shows why not. EvalAI's own end goes before all
@@ -25,13 +25,13 @@ use leaderboard_api::{
 pub(super) fn decide(draft: &mut PlanBuilder<'_>) -> bool {
     let Some(leaderboard) = draft.leaderboard() else {
         let message = draft.no_leaderboard();
-        draft.refuse(reasons::LEADERBOARD_NOT_FOUND, &message);
+        draft.refuse(Reason::LeaderboardNotFound, &message);
         return false;
     };
     // Before anything of it is looked at: the bucket and the table may be somebody else's.
     if let Some(why) = &draft.view.not_allowed {
-        let message = gates::leaderboard_not_ready(draft, reasons::NOT_ALLOWED, why);
-        draft.refuse(reasons::LEADERBOARD_NOT_READY, &message);
+        let message = gates::leaderboard_not_ready(draft, Reason::NotAllowed, why);
+        draft.refuse(Reason::LeaderboardNotReady, &message);
         return false;
     }
     if !is_wanted(draft) {
@@ -40,7 +40,7 @@ pub(super) fn decide(draft: &mut PlanBuilder<'_>) -> bool {
     take_team(draft);
     let Some(track) = find_track(draft, leaderboard) else {
         let message = missing_track(draft, leaderboard);
-        draft.refuse(reasons::TRACK_NOT_FOUND, &message);
+        draft.refuse(Reason::TrackNotFound, &message);
         return false;
     };
     draft.status.track = Some(track.name.clone());
@@ -54,7 +54,7 @@ pub(super) fn decide(draft: &mut PlanBuilder<'_>) -> bool {
         return false;
     }
     pin(draft, leaderboard, track, image);
-    draft.condition(conditions::ACCEPTED, Truth::True, reasons::ACCEPTED, "");
+    draft.condition(conditions::ACCEPTED, Truth::True, Reason::Accepted, "");
     true
 }
 
@@ -69,14 +69,14 @@ fn allowed_image(draft: &mut PlanBuilder<'_>, leaderboard: &LeaderboardSpec, tra
         Image::Invalid { image, what } => (image, Some(failure::image_invalid(&what))),
         Image::Unknown => {
             let message = image_unread(draft);
-            draft.stall_with(reasons::IMAGE_MISSING, &message);
-            draft.refuse(reasons::IMAGE_MISSING, &message);
+            draft.stall_with(Reason::ImageMissing, &message);
+            draft.refuse(Reason::ImageMissing, &message);
             return None;
         }
     };
     let Some(found) = fault else { return Some(image) };
     pin(draft, leaderboard, track, image);
-    draft.condition(conditions::ACCEPTED, Truth::False, &found.reason, &found.message);
+    draft.condition(conditions::ACCEPTED, Truth::False, found.reason.clone(), &found.message);
     end::failed(draft, found);
     None
 }
@@ -152,7 +152,7 @@ fn is_wanted(draft: &mut PlanBuilder<'_>) -> bool {
     }
     if let Some(info) = draft.evalai_info() {
         if info.standing == Standing::Ended {
-            end::close_as(draft, reasons::ENDED_IN_EVALAI, &ended_in_evalai(info.status));
+            end::close_as(draft, Reason::EndedInEvalAI, &ended_in_evalai(info.status));
         }
         return info.standing != Standing::Ended;
     }
@@ -163,11 +163,11 @@ fn is_wanted(draft: &mut PlanBuilder<'_>) -> bool {
     }
     draft.look_again(Wait::EVALAI);
     let message = match view.and_then(|view| view.error.as_deref()) {
-        Some(error) => draft.stall(reasons::ASKING_EVALAI, &asking(Some(error))),
+        Some(error) => draft.stall(Reason::AskingEvalAI, &asking(Some(error))),
         None => asking(None),
     };
-    draft.show(reasons::ASKING_EVALAI, message);
-    draft.condition(conditions::ACCEPTED, Truth::Unknown, reasons::ASKING_EVALAI, "");
+    draft.show(Reason::AskingEvalAI, message);
+    draft.condition(conditions::ACCEPTED, Truth::Unknown, Reason::AskingEvalAI, "");
     false
 }
 
@@ -247,7 +247,7 @@ fn image_not_allowed(draft: &PlanBuilder<'_>, leaderboard: &LeaderboardSpec, ima
         return None;
     }
     let what = "The submitted image is not one that your team may submit to this leaderboard.";
-    Some(charged(reasons::IMAGE_NOT_ALLOWED, what))
+    Some(charged(Reason::ImageNotAllowed, what))
 }
 
 /// True if a check runs what its Leaderboard names for that.

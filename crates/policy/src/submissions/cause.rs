@@ -11,7 +11,7 @@ use super::failure::{self, charged, for_both, infrastructure, participant};
 use super::status::PlanBuilder;
 use crate::view::{ContainerView, PodView};
 use leaderboard_api::text::sentence;
-use leaderboard_api::{Failure, LeaderboardSpec, names, reasons};
+use leaderboard_api::{Failure, LeaderboardSpec, Reason, names};
 use leaderboard_contract::run::TOOLS;
 use leaderboard_contract::verdict::WorkspaceReason;
 use leaderboard_pod_spec::layout::{LOGS_VOLUME, SHM_VOLUME};
@@ -23,7 +23,7 @@ const NOT_ISOLATED: &str = "The Pod was not shown to be isolated from the networ
 
 /// A container that does not start.
 pub(super) struct Trouble {
-    pub(super) reason: &'static str,
+    pub(super) reason: Reason,
     /// A sentence. It stays the same while Kubernetes goes back and forth between trying and waiting.
     pub(super) message: String,
     pub(super) cause: Cause,
@@ -89,12 +89,12 @@ fn cannot_be_pulled(container: &ContainerView, reason: &str, words: &str) -> Tro
         let message = format!("The image of {name} is not a valid image reference: {words}");
         return Trouble {
             is_hopeless: true,
-            ..trouble(container, reasons::IMAGE_INVALID, &message, Cause::ImageName)
+            ..trouble(container, Reason::ImageInvalid, &message, Cause::ImageName)
         };
     }
     let words = pull_error(words);
     let message = format!("The image of {name} cannot be pulled: {words}");
-    trouble(container, reasons::IMAGE_PULL, &message, of_pull(words))
+    trouble(container, Reason::ImagePull, &message, of_pull(words))
 }
 
 fn cannot_be_set_up(container: &ContainerView, words: &str) -> Trouble {
@@ -105,10 +105,10 @@ fn cannot_be_set_up(container: &ContainerView, words: &str) -> Trouble {
         // The kubelet finds the same on every node.
         return Trouble {
             is_hopeless: true,
-            ..trouble(container, reasons::IMAGE_INVALID, &message, cause)
+            ..trouble(container, Reason::ImageInvalid, &message, cause)
         };
     }
-    trouble(container, reasons::CONTAINER_CONFIG, &message, cause)
+    trouble(container, Reason::ContainerConfig, &message, cause)
 }
 
 /// How a container that ended, and is being tried again, speaks of its start.
@@ -129,16 +129,16 @@ fn of_end(container: &ContainerView, is_init: bool) -> Option<Trouble> {
         let why = end.why.as_deref().unwrap_or(NOT_ISOLATED);
         return Some(Trouble {
             is_hopeless: true,
-            ..trouble(container, reasons::NOT_ISOLATED, why, Cause::Host)
+            ..trouble(container, Reason::NotIsolated, why, Cause::Host)
         });
     }
     let code = || format!("it ended with code {} ({})", end.exit_code, end.reason);
     let why = end.why.clone().unwrap_or_else(code);
     let message = format!("{name} fails: {why}");
-    Some(trouble(container, reasons::PREPARING, &message, Cause::Host))
+    Some(trouble(container, Reason::Preparing, &message, Cause::Host))
 }
 
-fn trouble(container: &ContainerView, reason: &'static str, message: &str, cause: Cause) -> Trouble {
+fn trouble(container: &ContainerView, reason: Reason, message: &str, cause: Cause) -> Trouble {
     let worker = agent(container);
     // The hosts' own images are theirs to fix.
     let cause = if worker.is_none() && cause.is_images() {
@@ -160,9 +160,9 @@ fn cannot_start(container: &ContainerView, words: &str) -> Trouble {
     let message = format!("{} cannot be started: {words}", container.name);
     let cause = of_start(words);
     let reason = if cause == Cause::Node {
-        reasons::NODE_CANNOT_START
+        Reason::NodeCannotStart
     } else {
-        reasons::CANNOT_START
+        Reason::CannotStart
     };
     trouble(container, reason, &message, cause)
 }
@@ -185,36 +185,36 @@ pub(super) fn failure_of(found: &Trouble, pod: &PodView, seconds: i64) -> Failur
     let failure = match found.cause {
         Cause::ImageName => failure::image_invalid(message),
         Cause::ImageUser => of_image(
-            reasons::IMAGE_INVALID,
+            Reason::ImageInvalid,
             message,
             "The submitted image runs as root, or names its user, and this challenge runs agents as another user.",
             "Set USER of the image to a number other than 0, and submit again.",
         ),
         Cause::ImageProgram => {
             let next = for_both("Push the image again and check that it runs on linux/amd64.");
-            participant(reasons::CANNOT_START, &tried, &next)
+            participant(Reason::CannotStart, &tried, &next)
         }
         Cause::ImageMissing => of_image(
-            reasons::IMAGE_NOT_FOUND,
+            Reason::ImageNotFound,
             &tried,
             "The submitted image is not in its registry.",
             "Push the image under the name that is submitted, and submit again.",
         ),
         Cause::ImagePlatform => of_image(
-            reasons::IMAGE_PLATFORM,
+            Reason::ImagePlatform,
             &tried,
             "The submitted image is not for linux/amd64.",
             "Build the image for linux/amd64, and submit again.",
         ),
         Cause::ImageKind => of_image(
-            reasons::IMAGE_INVALID,
+            Reason::ImageInvalid,
             &tried,
             "The submitted image is of a kind that cannot be run.",
             "Build the image with a present version of its tool, and submit again.",
         ),
         Cause::Registry | Cause::Node | Cause::Host => match found.reason {
-            reasons::NOT_ISOLATED => infrastructure(found.reason, message),
-            reasons::PREPARING => infrastructure(reasons::START_DEADLINE, &tried),
+            Reason::NotIsolated => infrastructure(found.reason, message),
+            Reason::Preparing => infrastructure(Reason::StartDeadline, &tried),
             reason => infrastructure(reason, &tried),
         },
     };
@@ -232,7 +232,7 @@ pub(super) fn node_of(pod: &PodView) -> String {
 
 /// A failure of the image, of which hosts read all. The words of a registry or of a node would show a participant what the nodes can
 /// reach.
-fn of_image(reason: &str, what: &str, for_participants: &str, step: &str) -> Failure {
+fn of_image(reason: Reason, what: &str, for_participants: &str, step: &str) -> Failure {
     Failure {
         participant_message: Some(format!("{for_participants} {step}")),
         ..participant(reason, what, &for_both(step))
@@ -396,9 +396,9 @@ pub(super) fn disk_full(draft: &PlanBuilder<'_>) -> Option<Failure> {
         Account::Pod => false,
     };
     Some(if is_agents {
-        charged(reasons::DISK_FULL, &what)
+        charged(Reason::DiskFull, &what)
     } else {
-        infrastructure(reasons::DISK_FULL, &what)
+        infrastructure(Reason::DiskFull, &what)
     })
 }
 

@@ -12,13 +12,13 @@ use crate::report_digest::{ReportDigest, clamp};
 use crate::view::{JobEnd, ObservedReport, Stage};
 use leaderboard_api::conditions::{self, Truth};
 use leaderboard_api::text::sentence;
-use leaderboard_api::{FailedNode, Failure, FailureClass, MAX_FAILED_NODES, reasons};
+use leaderboard_api::{FailedNode, Failure, FailureClass, MAX_FAILED_NODES, Reason, ReasonName};
 
 /// Shown while the report of an ended run has been asked for and no answer has come, not even a refusal.
 const NO_ANSWER: &str = "its bucket has not answered yet.";
 
 /// Failures of a node, which gets no third Job of the attempt.
-const OF_NODES: [&str; 2] = [reasons::NO_GPU, reasons::NODE_CANNOT_START];
+const OF_NODES: [Reason; 2] = [Reason::NoGPU, Reason::NodeCannotStart];
 
 /// The Job is terminal, or gone because we ended it (`None`).
 pub(super) fn decide(draft: &mut PlanBuilder<'_>, job_end: Option<&JobEnd>) {
@@ -93,13 +93,13 @@ fn wait_for_bucket(draft: &mut PlanBuilder<'_>, why: &str) -> bool {
         "The results cannot be read: {} The submission goes on when they can.",
         sentence(why)
     );
-    let message = draft.stall(reasons::NOT_STORED, &message);
-    let since = draft.blocked_since(reasons::NOT_STORED).unwrap_or(draft.now());
+    let message = draft.stall(Reason::NotStored, &message);
+    let since = draft.blocked_since(Reason::NotStored).unwrap_or(draft.now());
     let until = after(since, limit);
     if draft.now() >= until {
         return false;
     }
-    draft.show(reasons::NOT_STORED, message);
+    draft.show(Reason::NotStored, message);
     draft.requeue_at(until);
     draft.look_again(Wait::REPORT);
     true
@@ -108,7 +108,7 @@ fn wait_for_bucket(draft: &mut PlanBuilder<'_>, why: &str) -> bool {
 /// Ends as Cancelled; nothing needs to be stopped any more. `when` goes on with the sentence.
 pub(super) fn cancelled(draft: &mut PlanBuilder<'_>, when: &str) {
     let reason = cancel_reason(draft);
-    let what = if reason == reasons::ENDED_IN_EVALAI {
+    let what = if reason == Reason::EndedInEvalAI {
         "EvalAI ended the submission"
     } else {
         "The submission was cancelled"
@@ -117,21 +117,21 @@ pub(super) fn cancelled(draft: &mut PlanBuilder<'_>, when: &str) {
 }
 
 /// Ends without a failure.
-pub(super) fn close_as(draft: &mut PlanBuilder<'_>, reason: &str, message: &str) {
+pub(super) fn close_as(draft: &mut PlanBuilder<'_>, reason: Reason, message: &str) {
     draft.status.failure = None;
     close(draft, reason, message);
 }
 
 /// Why a cancelled submission was cancelled.
-fn cancel_reason(draft: &PlanBuilder<'_>) -> &'static str {
+fn cancel_reason(draft: &PlanBuilder<'_>) -> Reason {
     if draft.spec().cancel {
-        reasons::CANCELLED
+        Reason::Cancelled
     } else if draft.is_deleting() {
-        reasons::DELETED
+        Reason::Deleted
     } else if draft.is_ended_in_evalai() {
-        reasons::ENDED_IN_EVALAI
+        Reason::EndedInEvalAI
     } else {
-        reasons::CANCELLED
+        Reason::Cancelled
     }
 }
 
@@ -161,24 +161,24 @@ fn of_job(draft: &PlanBuilder<'_>, end: &JobEnd) -> Failure {
         JobEnd::Failed { reason, .. } if reason == "DeadlineExceeded" && draft.deadlines().run_seconds.is_some() => {
             let units = draft.words().units;
             let what = format!("The Pod reached its time limit; finished {units} are kept.");
-            failure::charged(reasons::TIME_LIMIT, &what)
+            failure::charged(Reason::TimeLimit, &what)
         }
         JobEnd::Failed { reason, message, .. } => failure::worst(&draft.status).unwrap_or_else(|| {
             let what = format!("The Job failed with {reason}: {}", sentence(message));
-            failure::infrastructure(reasons::JOB_FAILED, &what)
+            failure::infrastructure(Reason::JobFailed, &what)
         }),
     }
 }
 
 /// Failures that a second try may fix.
 fn may_retry(draft: &PlanBuilder<'_>, found: &Failure) -> bool {
-    const FINAL: [&str; 4] = [
-        reasons::GRAPHICS_DRIVER_MISSING,
-        reasons::JOB_DELETED,
-        reasons::JOB_EXPIRED,
-        reasons::SCHEDULE_DEADLINE,
+    const FINAL: [Reason; 4] = [
+        Reason::GraphicsDriverMissing,
+        Reason::JobDeleted,
+        Reason::JobExpired,
+        Reason::ScheduleDeadline,
     ];
-    let can_recover = !FINAL.contains(&found.reason.as_str());
+    let can_recover = !found.reason.is_one_of(&FINAL);
     let is_left = stop::is_interruption(found)
         || (leaves_a_job(draft, found) && stop::other_failures(&draft.status) < draft.retries().infrastructure);
     can_recover && is_left
@@ -204,7 +204,7 @@ fn retry(draft: &mut PlanBuilder<'_>, found: &Failure) {
     note_provoked(draft, found);
     draft.status.retry += 1;
     draft.status.job_name = None;
-    let is_of_node = OF_NODES.contains(&found.reason.as_str());
+    let is_of_node = found.reason.is_one_of(&OF_NODES);
     let node = draft.status.node_name.take();
     if let Some(node) = node.filter(|_| is_of_node || is_provoked(found)) {
         note_failed_node(&mut draft.status.failed_nodes, node, i32::from(is_of_node));
@@ -222,8 +222,8 @@ fn retry(draft: &mut PlanBuilder<'_>, found: &Failure) {
     let what = &found.message;
     let message = format!("{what} {next}");
     draft.moves();
-    draft.condition(conditions::RUNNING, Truth::False, &found.reason, what);
-    draft.show(reasons::REPLACING, message);
+    draft.condition(conditions::RUNNING, Truth::False, found.reason.clone(), what);
+    draft.show(Reason::Replacing, message);
     draft.requeue_at(at);
 }
 
@@ -245,7 +245,7 @@ fn finished(draft: &mut PlanBuilder<'_>, report: &ReportDigest) {
     let score = draft.status.score.as_ref();
     let score = score.map_or_else(String::new, |score| format!(", {} {}", score.name, score.text));
     let message = format!("{} of {} {}{score}.", report.done, report.total, report.unit);
-    close_as(draft, reasons::FINISHED, &message);
+    close_as(draft, Reason::Finished, &message);
 }
 
 /// Ends as Failed; nothing needs to be stopped any more.
@@ -253,10 +253,11 @@ pub(super) fn failed(draft: &mut PlanBuilder<'_>, found: Failure) {
     let found = failure::at_the_end(found);
     let (reason, message) = (found.reason.clone(), found.message.clone());
     draft.status.failure = Some(Box::new(found));
-    close(draft, &reason, &message);
+    close(draft, reason, &message);
 }
 
-fn close(draft: &mut PlanBuilder<'_>, reason: &str, message: &str) {
+fn close(draft: &mut PlanBuilder<'_>, reason: impl Into<ReasonName>, message: &str) {
+    let reason = reason.into();
     run::count_attempts(draft);
     let ended = draft.view.ended_at().unwrap_or(draft.now());
     let ended = ended.min(draft.now());
@@ -270,19 +271,19 @@ fn close(draft: &mut PlanBuilder<'_>, reason: &str, message: &str) {
     draft.status.next_retry_time = None;
     let stored = draft.view.report.ours().is_some_and(|r| r.is_final);
     let (truth, why) = if stored {
-        (Truth::True, reasons::STORED)
+        (Truth::True, Reason::Stored)
     } else {
-        (Truth::False, reasons::NOT_STORED)
+        (Truth::False, Reason::NotStored)
     };
     draft.condition(conditions::ARCHIVED, truth, why, "");
-    draft.condition(conditions::RUNNING, Truth::False, reason, "");
+    draft.condition(conditions::RUNNING, Truth::False, reason.clone(), "");
     draft.moves();
-    draft.condition(conditions::FINISHED, Truth::True, reason, message);
+    draft.condition(conditions::FINISHED, Truth::True, reason.clone(), message);
     if draft.spec().evalai.is_some() {
-        draft.condition(conditions::PUBLISHED, Truth::False, reasons::WAITING, "");
+        draft.condition(conditions::PUBLISHED, Truth::False, Reason::Waiting, "");
     }
     if draft.view.record.is_some() {
-        draft.condition(conditions::RECORDED, Truth::False, reasons::WAITING, "");
+        draft.condition(conditions::RECORDED, Truth::False, Reason::Waiting, "");
     }
     draft.show(reason, message);
 }
@@ -299,15 +300,15 @@ fn duration(seconds: i64) -> String {
 }
 
 /// An announced end of a node is `NodeInterrupted`, which no agent can provoke.
-const REASONS: [&str; 8] = [
-    reasons::SIMULATION_CRASHED,
-    reasons::RESULTS_NOT_STORED,
-    reasons::JOB_FAILED,
-    reasons::CANNOT_START,
-    reasons::NODE_CANNOT_START,
-    reasons::NODE_LOST,
-    reasons::DISK_FULL,
-    reasons::IMAGE_PULL,
+const REASONS: [Reason; 8] = [
+    Reason::SimulationCrashed,
+    Reason::ResultsNotStored,
+    Reason::JobFailed,
+    Reason::CannotStart,
+    Reason::NodeCannotStart,
+    Reason::NodeLost,
+    Reason::DiskFull,
+    Reason::ImagePull,
 ];
 
 /// Added to the words of a failure that gets no further Job because of the rule.
@@ -317,8 +318,8 @@ const NO_ROUTE: &str =
 /// True if an agent can have provoked a failure.
 fn is_provoked(found: &Failure) -> bool {
     // A pull of the hosts' own images belongs to no worker.
-    let is_of_hosts = found.reason == reasons::IMAGE_PULL && found.worker.is_none();
-    found.class == FailureClass::Infrastructure && !is_of_hosts && REASONS.contains(&found.reason.as_str())
+    let is_of_hosts = found.reason == Reason::ImagePull && found.worker.is_none();
+    found.class == FailureClass::Infrastructure && !is_of_hosts && found.reason.is_one_of(&REASONS)
 }
 
 /// True if the rule leaves another Job: `before` has the units that were stored when the failed Job was due, None for the attempt's first

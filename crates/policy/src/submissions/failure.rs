@@ -5,14 +5,16 @@
 use crate::report_digest::{ReportDigest, clamp};
 use crate::view::{ContainerView, LogAt, LogPlace, ObservedNode, PodView};
 use leaderboard_api::text::sentence;
-use leaderboard_api::{EndReason, Failure, FailureClass, SubmissionStatus, WorkerStatus, names, reasons};
+use leaderboard_api::{
+    EndReason, Failure, FailureClass, Reason, ReasonName, SubmissionStatus, WorkerStatus, names, reasons,
+};
 use leaderboard_contract::keys::agent_log;
 use leaderboard_contract::run::{Stop, console};
 use leaderboard_evaluation::{Words, words};
 use leaderboard_protocol::files::Pair;
 
 /// A failure that is the participant's: `what` happened, in one sentence, and what each reader does about it.
-pub(super) fn participant(reason: &str, what: &str, next: &Steps) -> Failure {
+pub(super) fn participant(reason: Reason, what: &str, next: &Steps) -> Failure {
     let message = format!("{what} {}", next.hosts);
     let for_participants = format!("{what} {}", next.participant);
     Failure {
@@ -26,12 +28,12 @@ pub(super) fn participant(reason: &str, what: &str, next: &Steps) -> Failure {
 }
 
 /// A participant's failure with the next step of the table of reasons, which both readers can take.
-pub(super) fn charged(reason: &str, what: &str) -> Failure {
+pub(super) fn charged(reason: Reason, what: &str) -> Failure {
     participant(reason, what, &for_both(&of_participant(reason)))
 }
 
 /// A failure that is not: `what` happened, in one sentence for hosts. As long as another Job may follow there is no next step.
-pub(super) fn infrastructure(reason: &str, what: &str) -> Failure {
+pub(super) fn infrastructure(reason: Reason, what: &str) -> Failure {
     Failure {
         class: FailureClass::Infrastructure,
         reason: reason.into(),
@@ -59,16 +61,16 @@ pub(super) fn at_the_end(found: Failure) -> Failure {
 
 /// The submitted text names no image that could ever be pulled.
 pub(super) fn image_invalid(what: &str) -> Failure {
-    charged(reasons::IMAGE_INVALID, what)
+    charged(Reason::ImageInvalid, what)
 }
 
 pub(super) fn job_deleted() -> Failure {
-    infrastructure(reasons::JOB_DELETED, "The Job was deleted repeatedly by somebody else.")
+    infrastructure(Reason::JobDeleted, "The Job was deleted repeatedly by somebody else.")
 }
 
 pub(super) fn job_expired() -> Failure {
     infrastructure(
-        reasons::JOB_EXPIRED,
+        Reason::JobExpired,
         "The Job ended and was removed after its time to live, and nobody had read its end; what was stored is kept.",
     )
 }
@@ -81,7 +83,7 @@ pub(super) fn node_lost(node: Option<&str>, node_state: ObservedNode, words: &Wo
         "was lost and its Pod with it"
     };
     let what = format!("{node} {what}; finished {} are kept.", words.units);
-    infrastructure(reasons::NODE_LOST, &what)
+    infrastructure(Reason::NodeLost, &what)
 }
 
 pub(super) fn time_limit(seconds: i64, words: &Words) -> Failure {
@@ -89,12 +91,12 @@ pub(super) fn time_limit(seconds: i64, words: &Words) -> Failure {
         "The run took longer than {seconds} s and was stopped; finished {} are kept.",
         words.units
     );
-    charged(reasons::TIME_LIMIT, &what)
+    charged(Reason::TimeLimit, &what)
 }
 
 pub(super) fn results_not_stored() -> Failure {
     infrastructure(
-        reasons::RESULTS_NOT_STORED,
+        Reason::ResultsNotStored,
         "The Pod ended before its final results were stored; what was stored is kept.",
     )
 }
@@ -103,7 +105,7 @@ pub(super) fn invalid_results(why: &str) -> Failure {
     let what = format!("The results cannot be used: {}", sentence(why));
     Failure {
         worker: pair_named(why),
-        ..charged(reasons::INVALID_RESULTS, &what)
+        ..charged(Reason::InvalidResults, &what)
     }
 }
 
@@ -119,7 +121,7 @@ pub(super) fn not_eligible(report: &ReportDigest, status: &SubmissionStatus) -> 
         return named_crash(report, status);
     }
     let what = format!("The run ended as {}, so its results do not count.", report.entry_status);
-    charged(reasons::NOT_ELIGIBLE, &what)
+    charged(Reason::NotEligible, &what)
 }
 
 /// Results that name a crash of the simulation. The agent writes them, and knows its score by then, so a crash that no host's container had is
@@ -140,14 +142,14 @@ fn named_crash(report: &ReportDigest, status: &SubmissionStatus) -> Failure {
         );
         return Failure {
             worker: Some(id),
-            ..charged(reasons::INVALID_RESULTS, &what)
+            ..charged(Reason::InvalidResults, &what)
         };
     }
     // One of an older operator's Pod names no pair.
     Failure {
         worker: first,
         ..infrastructure(
-            reasons::SIMULATION_CRASHED,
+            Reason::SimulationCrashed,
             &format!(
                 "The simulation crashed during a {}, so the results do not count.",
                 words.unit
@@ -158,10 +160,10 @@ fn named_crash(report: &ReportDigest, status: &SubmissionStatus) -> Failure {
 
 /// The stop that a failure calls for, or a higher attempt.
 pub(super) fn stop_of(failure: Option<&Failure>) -> Stop {
-    match failure.map(|failure| failure.reason.as_str()) {
-        Some(reasons::TIME_LIMIT) => Stop::RunDeadline,
+    match failure.map(|failure| failure.reason.known()) {
+        Some(Some(Reason::TimeLimit)) => Stop::RunDeadline,
         // Without a failure it is stopped for a higher attempt.
-        Some(reasons::NODE_INTERRUPTED) | None => Stop::Interruption,
+        Some(Some(Reason::NodeInterrupted)) | None => Stop::Interruption,
         _ => Stop::Retries,
     }
 }
@@ -177,7 +179,7 @@ pub(super) fn worst(status: &SubmissionStatus) -> Option<Failure> {
 /// results that can be read is tried again as one that crashed.
 pub(super) fn is_refusal(status: &SubmissionStatus, found: &Failure, report: &ReportDigest) -> bool {
     let by_itself = |worker: &WorkerStatus| matches!(cause_of(worker), Some(EndReason::Exited | EndReason::Incomplete));
-    let is_of_results = [reasons::AGENT_CRASHED, reasons::INVALID_RESULTS].contains(&found.reason.as_str());
+    let is_of_results = found.reason.is_one_of(&[Reason::AgentCrashed, Reason::InvalidResults]);
     is_of_results && status.workers.iter().any(by_itself) && report.is_verdict() && report.why.is_some()
 }
 
@@ -195,7 +197,7 @@ pub(super) fn of_worker(worker: &WorkerStatus, cause: EndReason, status: &Submis
         infrastructure(reason, &what)
     } else if let Some(what) = of_host(cause) {
         let what = format!("The {} of pair {id} failed {times}: {what}.", words.host);
-        infrastructure(reasons::SIMULATION_CRASHED, &what)
+        infrastructure(Reason::SimulationCrashed, &what)
     } else {
         let (reason, what, next) = of_agent(id, &times, cause, words);
         participant(reason, &what, &next)
@@ -207,37 +209,32 @@ pub(super) fn of_worker(worker: &WorkerStatus, cause: EndReason, status: &Submis
 }
 
 /// The node's fault: it cannot draw, or start an agent.
-fn of_node(
-    id: i32,
-    times: &str,
-    (cause, node): (EndReason, Option<&str>),
-    words: &Words,
-) -> Option<(&'static str, String)> {
+fn of_node(id: i32, times: &str, (cause, node): (EndReason, Option<&str>), words: &Words) -> Option<(Reason, String)> {
     let host = words.host;
     let node = node.map_or_else(|| "the node".to_owned(), |node| format!("node {node}"));
     match cause {
         EndReason::NoGPU => Some((
-            reasons::NO_GPU,
+            Reason::NoGPU,
             format!(
                 "Pair {id} lacks a GPU on {node}, although the Leaderboard gives it one: its {host} or its agent saw none. The \
                  {host}'s log says which."
             ),
         )),
         EndReason::GraphicsDriverMissing => Some((
-            reasons::GRAPHICS_DRIVER_MISSING,
+            Reason::GraphicsDriverMissing,
             format!(
                 "The {host} of pair {id} had a GPU and could not draw: the NVIDIA driver of {node} has no Vulkan/OpenGL part \
                  (nvidia_icd.json)."
             ),
         )),
         EndReason::NodeCannotStart => Some((
-            reasons::NODE_CANNOT_START,
+            Reason::NodeCannotStart,
             format!(
                 "The container of agent {id} could not be started {times} on {node}; nothing of its image is the cause."
             ),
         )),
         EndReason::EndedFromOutside => Some((
-            reasons::JOB_FAILED,
+            Reason::JobFailed,
             format!("The containers of pair {id} were ended from outside the Pod on {node}."),
         )),
         _ => None,
@@ -255,21 +252,21 @@ fn of_host(cause: EndReason) -> Option<&'static str> {
     }
 }
 
-fn of_agent(id: i32, times: &str, cause: EndReason, words: &Words) -> (&'static str, String, Steps) {
+fn of_agent(id: i32, times: &str, cause: EndReason, words: &Words) -> (Reason, String, Steps) {
     let host = words.host;
     match cause {
         EndReason::OutOfMemory => (
-            reasons::OUT_OF_MEMORY,
+            Reason::OutOfMemory,
             format!("Agent {id} crashed {times}, the last time for lack of memory."),
             smaller(),
         ),
         EndReason::Idle => (
-            reasons::IDLE,
+            Reason::Idle,
             format!("Agent {id} ended too early {times}, the last time because it printed nothing for too long."),
             in_the_log_of(id, words),
         ),
         EndReason::Incomplete => (
-            reasons::INVALID_RESULTS,
+            Reason::InvalidResults,
             format!(
                 "Agent {id} ended by itself {times} without complete results: its checkpoint is missing, malformed or has \
                  no global record."
@@ -277,29 +274,29 @@ fn of_agent(id: i32, times: &str, cause: EndReason, words: &Words) -> (&'static 
             in_the_log_of(id, words),
         ),
         EndReason::CannotStart | EndReason::StartError => (
-            reasons::CANNOT_START,
+            Reason::CannotStart,
             format!("Agent {id} could not be started: its command is missing in the image or not for this machine."),
-            for_both(&of_participant(reasons::CANNOT_START)),
+            for_both(&of_participant(Reason::CannotStart)),
         ),
         EndReason::NoProcess => (
-            reasons::AGENT_CRASHED,
+            Reason::AgentCrashed,
             format!("Pair {id} failed {times}: the agents left the Pod no process to start it again."),
             for_both("Let the agents start fewer processes and threads, and submit again."),
         ),
         EndReason::BlamesSimulator => (
-            reasons::AGENT_CRASHED,
+            Reason::AgentCrashed,
             format!("Agent {id} ended {times} and blamed its {host}, which had not failed."),
             for_both("Leave the files of the evaluator's runner alone, and submit again."),
         ),
         EndReason::PortTaken => (
-            reasons::AGENT_CRASHED,
+            Reason::AgentCrashed,
             format!("Another container of the Pod listened on the port of {host} {id}, which failed {times}."),
             for_both(&format!(
                 "Let the agents listen on no port of a {host}, and submit again."
             )),
         ),
         _ => (
-            reasons::AGENT_CRASHED,
+            Reason::AgentCrashed,
             format!("Agent {id} crashed {times}."),
             in_the_log_of(id, words),
         ),
@@ -324,7 +321,7 @@ pub(super) fn for_both(step: &str) -> Steps {
 /// The log of an agent explains what happened. Only hosts can read it.
 fn in_the_log_of(agent: i32, words: &Words) -> Steps {
     Steps {
-        hosts: of_participant(reasons::AGENT_CRASHED).replace("<n>", &agent.to_string()),
+        hosts: of_participant(Reason::AgentCrashed).replace("<n>", &agent.to_string()),
         participant: format!(
             "Reproduce it on {} of your own, fix the agent and submit again; the challenge's hosts have its log.",
             words.units
@@ -335,42 +332,43 @@ fn in_the_log_of(agent: i32, words: &Words) -> Steps {
 /// An agent needs more memory than there is.
 fn smaller() -> Steps {
     Steps {
-        hosts: of_participant(reasons::OUT_OF_MEMORY),
+        hosts: of_participant(Reason::OutOfMemory),
         participant: "Reduce the memory it uses and submit again; ask the challenge's hosts for the limit.".to_owned(),
     }
 }
 
 /// The next step of the table of reasons.
-fn of_participant(reason: &str) -> String {
-    reasons::of(reason).map_or_else(String::new, |reason| reasons::plain(reason.next_step))
+fn of_participant(reason: Reason) -> String {
+    reasons::plain(reason.next_step())
 }
 
 /// The host's next step after a failure of the infrastructure that no retry has ended.
-fn of_infrastructure(reason: &str) -> &'static str {
-    match reason {
+fn of_infrastructure(reason: &ReasonName) -> &'static str {
+    match reason.known() {
         // The text of `workspace` has the step before this one.
-        reasons::NOT_ISOLATED => "Then resume the submission.",
-        _ => reasons::after_failure(reason).unwrap_or("Fix this, then resume the submission."),
+        Some(Reason::NotIsolated) => "Then resume the submission.",
+        Some(reason) => reason.after_failure(),
+        None => "Fix this, then resume the submission.",
     }
 }
 
 /// All that a participant reads of a failure of the infrastructure.
-fn infrastructure_for_participants(reason: &str) -> String {
+fn infrastructure_for_participants(reason: Reason) -> String {
     let what = match reason {
-        reasons::IMAGE_PULL => "An image could not be pulled.",
-        reasons::NODE_LOST => "The machine that ran the submission was lost.",
-        reasons::NODE_INTERRUPTED => "The machine that ran the submission was taken away.",
-        reasons::RESULTS_NOT_STORED => "The results could not be stored.",
-        reasons::SIMULATION_CRASHED => "The simulation crashed.",
-        reasons::NO_GPU => "The machine that ran the submission had no GPU for it.",
-        reasons::NODE_CANNOT_START => "The machine that was to run the submission could not start it.",
-        reasons::DISK_FULL => "The run's disk was full.",
-        reasons::GRAPHICS_DRIVER_MISSING => "The machine that ran the submission had no driver for its simulation.",
-        reasons::START_DEADLINE => "The run could not be started in time.",
-        reasons::SCHEDULE_DEADLINE => "No machine was free for the submission in time.",
-        reasons::JOB_DELETED | reasons::JOB_EXPIRED | reasons::JOB_FAILED => "The cluster ended the run.",
-        reasons::PHASE_DIFFERS => "The submission's phase in EvalAI is not the one it was submitted to.",
-        reasons::NOT_ISOLATED => "The run could not be isolated from the network.",
+        Reason::ImagePull => "An image could not be pulled.",
+        Reason::NodeLost => "The machine that ran the submission was lost.",
+        Reason::NodeInterrupted => "The machine that ran the submission was taken away.",
+        Reason::ResultsNotStored => "The results could not be stored.",
+        Reason::SimulationCrashed => "The simulation crashed.",
+        Reason::NoGPU => "The machine that ran the submission had no GPU for it.",
+        Reason::NodeCannotStart => "The machine that was to run the submission could not start it.",
+        Reason::DiskFull => "The run's disk was full.",
+        Reason::GraphicsDriverMissing => "The machine that ran the submission had no driver for its simulation.",
+        Reason::StartDeadline => "The run could not be started in time.",
+        Reason::ScheduleDeadline => "No machine was free for the submission in time.",
+        Reason::JobDeleted | Reason::JobExpired | Reason::JobFailed => "The cluster ended the run.",
+        Reason::PhaseDiffers => "The submission's phase in EvalAI is not the one it was submitted to.",
+        Reason::NotIsolated => "The run could not be isolated from the network.",
         _ => "The run could not be set up.",
     };
     format!("{what} Your agent is not the cause. Ask the challenge's hosts to resume the submission, or submit again.")
@@ -391,10 +389,10 @@ pub(super) fn log_places(status: &SubmissionStatus, pod: Option<&PodView>) -> Ve
     };
     let (agent, host) = (pair.agent().to_string(), pair.host().to_string());
     let on_node = |container: &str| pod.and_then(|pod| on_node(pod, container));
-    let found = match failure.reason.as_str() {
-        reasons::SIMULATION_CRASHED => vec![on_node(&host), Some(stored(&host, console(pair)))],
-        reasons::START_DEADLINE => vec![pod.and_then(failing_before_agents).and_then(on_node)],
-        reasons::RESULTS_NOT_STORED | reasons::JOB_FAILED => vec![
+    let found = match failure.reason.known() {
+        Some(Reason::SimulationCrashed) => vec![on_node(&host), Some(stored(&host, console(pair)))],
+        Some(Reason::StartDeadline) => vec![pod.and_then(failing_before_agents).and_then(on_node)],
+        Some(Reason::ResultsNotStored | Reason::JobFailed) => vec![
             on_node(names::CONTAINER_LOGCOPY),
             Some(stored(
                 names::CONTAINER_LOGCOPY,
@@ -402,13 +400,15 @@ pub(super) fn log_places(status: &SubmissionStatus, pod: Option<&PodView>) -> Ve
             )),
         ],
         // It never ran.
-        reasons::IMAGE_INVALID
-        | reasons::IMAGE_NOT_FOUND
-        | reasons::IMAGE_PLATFORM
-        | reasons::IMAGE_PULL
-        | reasons::IMAGE_CHANGED
-        | reasons::CONTAINER_CONFIG => Vec::new(),
-        reasons::DISK_FULL => vec![Some(stored(&agent, agent_log(pair))), on_node(&agent)],
+        Some(
+            Reason::ImageInvalid
+            | Reason::ImageNotFound
+            | Reason::ImagePlatform
+            | Reason::ImagePull
+            | Reason::ImageChanged
+            | Reason::ContainerConfig,
+        ) => Vec::new(),
+        Some(Reason::DiskFull) => vec![Some(stored(&agent, agent_log(pair))), on_node(&agent)],
         _ if failure.class == FailureClass::Participant => vec![Some(stored(&agent, agent_log(pair))), on_node(&agent)],
         _ => Vec::new(),
     };

@@ -1,5 +1,7 @@
 //! The gates between acceptance and a Job: another program's run, a Leaderboard that is ready, its NetworkPolicy, a slot.
 
+use std::fmt;
+
 use super::failure::infrastructure;
 use super::plan::{Action, Question};
 use super::status::PlanBuilder;
@@ -12,7 +14,7 @@ use crate::slots::turns::{InLine, Turn};
 use crate::view::{ContainerView, JobView, PodView};
 use leaderboard_api::conditions::{self, Truth};
 use leaderboard_api::text::{LONGEST_NAME, one_line, sentence};
-use leaderboard_api::{Eta, PolicySource, ResourceExt, Waiting, names, reasons};
+use leaderboard_api::{Eta, PolicySource, Reason, ResourceExt, Waiting, names};
 use leaderboard_contract::verdict::WorkspaceReason;
 
 /// A condition that a submission passes on its way to a Job.
@@ -46,26 +48,26 @@ pub(super) fn closed(draft: &mut PlanBuilder<'_>, gates: &[Gate]) -> Option<Gate
 
 /// Faults of the Leaderboard with which no Job can be made, or none may. The others speak for themselves where they hurt.
 fn waits_for_leaderboard(draft: &mut PlanBuilder<'_>) -> bool {
-    const BLOCKS: [&str; 4] = [
-        reasons::CLAIMS_NOT_SERVED,
-        reasons::CLAIM_TEMPLATE_MISSING,
-        reasons::INVALID_POD,
-        reasons::PREFIX_CONFLICT,
+    const BLOCKS: [Reason; 4] = [
+        Reason::ClaimsNotServed,
+        Reason::ClaimTemplateMissing,
+        Reason::InvalidPod,
+        Reason::PrefixConflict,
     ];
     let ready = draft
         .view
         .leaderboard
         .as_ref()
         .and_then(|board| board.condition(conditions::READY));
-    let blocks = ready.filter(|c| c.status == "False" && BLOCKS.contains(&c.reason.as_str()));
+    let blocks = ready.filter(|c| c.status == "False" && c.reason.is_one_of(&BLOCKS));
     let Some(why) = blocks.map(|c| leaderboard_not_ready(draft, &c.reason, &c.message)) else {
         return false;
     };
-    draft.refuse(reasons::LEADERBOARD_NOT_READY, &why);
+    draft.refuse(Reason::LeaderboardNotReady, &why);
     true
 }
 
-pub(super) fn leaderboard_not_ready(draft: &PlanBuilder<'_>, reason: &str, why: &str) -> String {
+pub(super) fn leaderboard_not_ready(draft: &PlanBuilder<'_>, reason: impl fmt::Display, why: &str) -> String {
     format!(
         "Leaderboard {} is not ready ({reason}): {} Fix it, and the submission goes on.",
         draft.spec().leaderboard_name,
@@ -85,9 +87,9 @@ fn waits_for_policy(draft: &mut PlanBuilder<'_>) -> bool {
         draft.requeue_at(until);
     }
     let reason = if is_silent {
-        reasons::PREPARING
+        Reason::Preparing
     } else {
-        reasons::NOT_ISOLATED
+        Reason::NotIsolated
     };
     draft.refuse(reason, &missing.message);
     true
@@ -115,14 +117,14 @@ fn waits_for_phase(draft: &mut PlanBuilder<'_>) -> bool {
         draft.spec().evalai.map_or(0, |evalai| evalai.phase),
         Wait::PHASE.longest / 60
     );
-    let message = draft.stall(reasons::PHASE_DIFFERS, &message);
-    let since = draft.blocked_since(reasons::PHASE_DIFFERS).unwrap_or(draft.now());
+    let message = draft.stall(Reason::PhaseDiffers, &message);
+    let since = draft.blocked_since(Reason::PhaseDiffers).unwrap_or(draft.now());
     let until = Wait::PHASE.over_at(since);
     if draft.now() >= until {
-        end::failed(draft, infrastructure(reasons::PHASE_DIFFERS, &what));
+        end::failed(draft, infrastructure(Reason::PhaseDiffers, &what));
     } else {
         draft.requeue_at(until);
-        draft.refuse(reasons::PHASE_DIFFERS, &message);
+        draft.refuse(Reason::PhaseDiffers, &message);
     }
     true
 }
@@ -165,14 +167,14 @@ pub(super) fn missing_policy(draft: &PlanBuilder<'_>) -> Option<Missing> {
 pub(super) fn is_held_up(draft: &mut PlanBuilder<'_>) -> bool {
     if draft.leaderboard().is_none() {
         let message = draft.no_leaderboard();
-        let message = draft.stall(reasons::LEADERBOARD_NOT_FOUND, &message);
-        draft.show(reasons::LEADERBOARD_NOT_FOUND, message);
+        let message = draft.stall(Reason::LeaderboardNotFound, &message);
+        draft.show(Reason::LeaderboardNotFound, message);
         draft.look_again(Wait::SLOT);
         return true;
     }
     if let Some(missing) = missing_policy(draft) {
-        draft.stall_with(reasons::NOT_ISOLATED, &missing.message);
-        draft.show(reasons::NOT_ISOLATED, missing.message);
+        draft.stall_with(Reason::NotIsolated, &missing.message);
+        draft.show(Reason::NotIsolated, missing.message);
         draft.look_again(Wait::SLOT);
         return true;
     }
@@ -231,8 +233,8 @@ fn show_reading(draft: &mut PlanBuilder<'_>) {
         return;
     }
     let message = "The table is asked whether another program runs the submission, and has not answered yet.";
-    draft.condition(conditions::ACCEPTED, Truth::Unknown, reasons::FOREIGN, message);
-    draft.show(reasons::FOREIGN, message);
+    draft.condition(conditions::ACCEPTED, Truth::Unknown, Reason::Foreign, message);
+    draft.show(Reason::Foreign, message);
 }
 
 /// Another program ends its run in EvalAI first and in the row then: EvalAI decides by an answer that is newer than the row.
@@ -249,8 +251,8 @@ fn awaits_evalai(draft: &mut PlanBuilder<'_>, answer: &Answered<Row>) -> bool {
 }
 
 fn hold(draft: &mut PlanBuilder<'_>, message: &str) {
-    draft.condition(conditions::ACCEPTED, Truth::False, reasons::FOREIGN, message);
-    draft.show(reasons::FOREIGN, message);
+    draft.condition(conditions::ACCEPTED, Truth::False, Reason::Foreign, message);
+    draft.show(Reason::Foreign, message);
 }
 
 /// While that cannot be known nothing starts: a second run would write over the results of the first.
@@ -262,7 +264,7 @@ fn not_known(draft: &mut PlanBuilder<'_>, failure: &Failure) -> String {
         adoption()
     );
     if failure.is_refused {
-        return draft.stall(reasons::FOREIGN, &message);
+        return draft.stall(Reason::Foreign, &message);
     }
     draft.moves();
     message
@@ -322,8 +324,8 @@ pub(super) fn holds_back(draft: &mut PlanBuilder<'_>, job: &JobView) -> bool {
         run::count_use(draft, draft.now());
         run::restart_clock(draft);
         draft.status.node_name = None;
-        draft.condition(conditions::RUNNING, Truth::False, reasons::FOREIGN, "");
-        draft.stall_with(reasons::FOREIGN, &message);
+        draft.condition(conditions::RUNNING, Truth::False, Reason::Foreign, "");
+        draft.stall_with(Reason::Foreign, &message);
         hold(draft, &message);
     }
     // The next Job has the name of this one, so it waits until this one is gone.
@@ -344,9 +346,9 @@ fn waits_for_next_try(draft: &mut PlanBuilder<'_>) -> bool {
     if at <= draft.now() || at > latest {
         return false;
     }
-    if draft.status.reason.as_deref() != Some(reasons::REPLACING) {
+    if !draft.status.shows(Reason::Replacing) {
         let message = "The submission is tried again after a failure that is not the participant's.";
-        draft.show(reasons::REPLACING, message);
+        draft.show(Reason::Replacing, message);
     }
     draft.requeue_at(at);
     true
@@ -365,13 +367,13 @@ fn waits_for_slot(draft: &mut PlanBuilder<'_>) -> bool {
         Turn::Wait { position, eta } => (
             position,
             known_eta(draft, position).or(eta),
-            reasons::WAITING_FOR_SLOT,
+            Reason::WaitingForSlot,
             "All slots of the Leaderboard are in use; concurrency.total and concurrency.perTeam set their number.",
         ),
         Turn::Paused { position } => (
             position,
             None,
-            reasons::PAUSED,
+            Reason::Paused,
             "The Leaderboard is paused; it starts again with paused: false.",
         ),
     };

@@ -8,7 +8,7 @@ use super::stop;
 use super::waits::{Wait, after};
 use crate::view::ObservedJob;
 use leaderboard_api::conditions;
-use leaderboard_api::{Ingested, JOB_SECONDS, State, reasons};
+use leaderboard_api::{Ingested, JOB_SECONDS, Reason, State};
 
 /// Why an attempt does not begin.
 const NO_MESSAGE: &str = "no queue message announced it, and participants can edit the status there. Raise spec.attempt if it is to \
@@ -25,9 +25,9 @@ pub(super) fn show_refused_attempt(draft: &mut PlanBuilder<'_>) {
     };
     let has_finished = draft.status.state_of_conditions() == State::Finished;
     let (reason, why) = if has_finished {
-        (reasons::ATTEMPT_AFTER_FINISH, HAS_FINISHED)
+        (Reason::AttemptAfterFinish, HAS_FINISHED)
     } else {
-        (reasons::ATTEMPT_WITHOUT_MESSAGE, NO_MESSAGE)
+        (Reason::AttemptWithoutMessage, NO_MESSAGE)
     };
     let (attempt, since) = (refused.attempt, seconds(refused.at));
     let message =
@@ -104,7 +104,7 @@ pub(super) fn release(draft: &mut PlanBuilder<'_>, complete: bool) {
     if draft.now() >= until {
         draft.event(
             true,
-            reasons::RELEASED_UNPUBLISHED,
+            Reason::ReleasedUnpublished,
             "The submission was deleted, and its end was not published within deadlines.finalizeSeconds: the finalizer is removed.",
         );
         draft.act(Action::Forget);

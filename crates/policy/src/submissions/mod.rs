@@ -33,7 +33,7 @@ use std::time::Duration;
 use crate::report_digest::ReportDigest;
 use crate::view::{JobView, ObservedJob, Stage, View};
 use gates::Gate;
-use leaderboard_api::{JOB_SECONDS, LeaderboardSpec, reasons};
+use leaderboard_api::{JOB_SECONDS, LeaderboardSpec, Reason};
 pub use plan::{Action, EvalaiUpdate, Event, Plan, Question, SlotUse, StatusWrite, TableUpdate, job_name};
 pub use publish::previous_controller;
 pub use run::pinned;
@@ -188,7 +188,7 @@ fn without_its_job(draft: &mut PlanBuilder<'_>) {
         run::restart_clock(draft);
         draft.event(
             true,
-            reasons::JOB_RECREATED,
+            Reason::JobRecreated,
             "The Job was deleted by somebody else; it is created again.",
         );
     }

@@ -5,7 +5,7 @@ use std::time::Duration;
 use crate::questions::Row;
 use crate::slots::turns::InLine;
 use crate::view::{LogPlace, ReportDemand};
-use leaderboard_api::{JobNumber, SubmissionStatus, names};
+use leaderboard_api::{JobNumber, ReasonName, SubmissionStatus, names};
 use leaderboard_contract::run::Stop;
 
 /// The result of a reconcile: the status to show, the actions in order, and the events.
@@ -134,7 +134,7 @@ pub enum TableUpdate {
 #[derive(Clone, Debug, PartialEq, Eq)]
 pub struct Event {
     pub warning: bool,
-    pub reason: String,
+    pub reason: ReasonName,
     pub message: String,
 }
 

@@ -17,7 +17,7 @@ use crate::view::{EvalaiEnd, EvalaiView, ObservedLog};
 use leaderboard_api::conditions::{self, Truth};
 use leaderboard_api::evalai_status::Status;
 use leaderboard_api::text::sentence;
-use leaderboard_api::{State, SubmissionStatus, reasons};
+use leaderboard_api::{Reason, State, SubmissionStatus};
 
 const SENT_AGAIN: &str = "EvalAI may have lost its own end of this submission: one of our requests may have overwritten it, or \
                            the submission was deleted before its end. EvalAI is read again, and `cancelled` is written if \
@@ -83,11 +83,11 @@ fn show_published(draft: &mut PlanBuilder<'_>, at: Timestamp, recorded: bool) {
 /// A Leaderboard that is gone can't show what is wanted: what was decided before stands, and what never ran needs nothing.
 fn without_leaderboard(draft: &mut PlanBuilder<'_>, type_: &str) -> Delivery {
     let known = draft.status.condition(type_);
-    if known.is_some_and(|c| c.reason == reasons::NOT_REQUIRED) {
+    if known.is_some_and(|c| c.reason == Reason::NotRequired) {
         return Delivery::Done;
     }
     let message = draft.no_leaderboard();
-    draft.condition(type_, Truth::False, reasons::LEADERBOARD_NOT_FOUND, &message);
+    draft.condition(type_, Truth::False, Reason::LeaderboardNotFound, &message);
     if draft.status.plan.is_none() {
         Delivery::Done
     } else {
@@ -110,7 +110,7 @@ enum CancelRace {
 
 fn cancel_race(draft: &PlanBuilder<'_>) -> CancelRace {
     let end = draft.status.condition(conditions::FINISHED);
-    let is_evalais = end.is_some_and(|c| c.reason == reasons::ENDED_IN_EVALAI);
+    let is_evalais = end.is_some_and(|c| c.reason == Reason::EndedInEvalAI);
     let is_overtaken = is_evalais && is_overtaken(draft);
     // One that was deleted before its end is ended there all the same: EvalAI counts it against its team until then.
     let is_ours = draft.spec().evalai.is_some() && (is_overtaken || !is_of_another_phase(draft));
@@ -131,7 +131,7 @@ fn publish(draft: &mut PlanBuilder<'_>, log_left: Option<Duration>) -> Delivery 
     let race = cancel_race(draft);
     match race {
         CancelRace::NotOurs(message) => {
-            draft.condition(conditions::PUBLISHED, Truth::False, reasons::NOT_REQUIRED, message);
+            draft.condition(conditions::PUBLISHED, Truth::False, Reason::NotRequired, message);
             return Delivery::Done;
         }
         CancelRace::Over => {
@@ -169,7 +169,7 @@ fn note_late_cancel(draft: &mut PlanBuilder<'_>) {
     }
     // The status has whole seconds. An older list shows what the result has replaced, and the next one wakes for no id a second time.
     if listed > after(published.0, 1) {
-        draft.condition(conditions::PUBLISHED, Truth::False, reasons::CANCELLED_IN_EVALAI, "");
+        draft.condition(conditions::PUBLISHED, Truth::False, Reason::CancelledInEvalAI, "");
     } else {
         draft.look_again(Wait::DELIVERY);
     }
@@ -198,18 +198,12 @@ fn send_end(draft: &mut PlanBuilder<'_>, evalai: EvalaiView, is_overtaken: bool,
         .map(|e| format!("The last request failed: {}", sentence(&e)));
     let failed = failed.or(unread);
     let (reason, message) = if is_overtaken {
-        (
-            reasons::CONCURRENT_UPDATE,
-            failed.or_else(|| Some(SENT_AGAIN.to_owned())),
-        )
+        (Reason::ConcurrentUpdate, failed.or_else(|| Some(SENT_AGAIN.to_owned())))
     } else if let Some(until) = evalai.writes_from {
         draft.requeue_at(until);
-        (
-            reasons::WAITING_FOR_PREVIOUS_CONTROLLER,
-            Some(previous_controller(until)),
-        )
+        (Reason::WaitingForPreviousController, Some(previous_controller(until)))
     } else {
-        (reasons::WAITING, failed)
+        (Reason::Waiting, failed)
     };
     let message = message.unwrap_or_default();
     draft.condition(conditions::PUBLISHED, Truth::False, reason, &message);
@@ -227,16 +221,16 @@ fn published(draft: &mut PlanBuilder<'_>, team: Option<&str>) {
     });
     let left_out = draft.view.report.ours().and_then(|report| report.left_out.as_deref());
     let shown = message.as_deref().or(left_out).unwrap_or_default().to_owned();
-    draft.condition(conditions::PUBLISHED, Truth::True, reasons::PUBLISHED, &shown);
+    draft.condition(conditions::PUBLISHED, Truth::True, Reason::Published, &shown);
     if let Some(message) = message {
-        draft.event(true, reasons::TEAM_DIFFERS, message);
+        draft.event(true, Reason::TeamDiffers, message);
     }
 }
 
 /// True if it was taken back before it was ever accepted, because EvalAI's row is another phase's: the row is not ours to end.
 fn is_of_another_phase(draft: &PlanBuilder<'_>) -> bool {
     let accepted = draft.status.condition(conditions::ACCEPTED);
-    let differs = accepted.is_some_and(|c| c.reason == reasons::PHASE_DIFFERS);
+    let differs = accepted.is_some_and(|c| c.reason == Reason::PhaseDiffers);
     differs && draft.status.plan.is_none() && draft.status.state_of_conditions() == State::Cancelled
 }
 
@@ -266,7 +260,7 @@ fn cannot_be_read(draft: &PlanBuilder<'_>, type_: &str, why: &str) -> String {
 fn is_overtaken(draft: &PlanBuilder<'_>) -> bool {
     let published = draft.status.condition(conditions::PUBLISHED);
     draft.view.evalai.as_ref().is_some_and(|e| e.overtaken)
-        || published.is_some_and(|c| c.reason == reasons::CONCURRENT_UPDATE)
+        || published.is_some_and(|c| c.reason == Reason::ConcurrentUpdate)
 }
 
 fn refused(draft: &mut PlanBuilder<'_>, message: &str) {
@@ -276,30 +270,30 @@ fn refused(draft: &mut PlanBuilder<'_>, message: &str) {
         sentence(message)
     );
     let known = draft.status.condition(conditions::PUBLISHED);
-    let is_new = known.is_none_or(|c| c.reason != reasons::REFUSED);
-    draft.condition(conditions::PUBLISHED, Truth::False, reasons::REFUSED, &message);
+    let is_new = known.is_none_or(|c| c.reason != Reason::Refused);
+    draft.condition(conditions::PUBLISHED, Truth::False, Reason::Refused, &message);
     if is_new {
-        draft.event(true, reasons::REFUSED, message);
+        draft.event(true, Reason::Refused, message);
     }
 }
 
 /// EvalAI had ended it first: its cancel wins until our result is answered, so that all systems agree.
 fn amend(draft: &mut PlanBuilder<'_>, status: Status) -> Delivery {
-    draft.condition(conditions::PUBLISHED, Truth::False, reasons::NOT_REQUIRED, "");
+    draft.condition(conditions::PUBLISHED, Truth::False, Reason::NotRequired, "");
     if draft.status.state_of_conditions() == State::Cancelled {
         keep_evalais_end(draft, status);
         return Delivery::Done;
     }
     draft.status.failure = None;
     let message = format!("EvalAI shows {status}, so the result is not published.");
-    draft.condition(conditions::FINISHED, Truth::True, reasons::ENDED_IN_EVALAI, &message);
-    draft.show(reasons::ENDED_IN_EVALAI, message);
+    draft.condition(conditions::FINISHED, Truth::True, Reason::EndedInEvalAI, &message);
+    draft.show(Reason::EndedInEvalAI, message);
     // While EvalAI refused the result, the table was handed the outcome that no longer holds; the status may not show that yet.
     let is_written = draft.view.record.as_ref().is_some_and(|row| row.end_written);
     if !is_written && !draft.status.is_true(conditions::RECORDED) && superseded(draft).is_none() {
         return Delivery::Done;
     }
-    draft.condition(conditions::RECORDED, Truth::False, reasons::WAITING, "");
+    draft.condition(conditions::RECORDED, Truth::False, Reason::Waiting, "");
     draft.act(Action::Record(TableUpdate::End));
     Delivery::Waiting
 }
@@ -307,11 +301,11 @@ fn amend(draft: &mut PlanBuilder<'_>, status: Status) -> Delivery {
 /// A cancel of what EvalAI calls finished: that is kept, and the object says whose end holds.
 fn keep_evalais_end(draft: &mut PlanBuilder<'_>, status: Status) {
     let end = draft.status.condition(conditions::FINISHED);
-    let is_ours = end.is_some_and(|end| end.reason != reasons::ENDED_IN_EVALAI);
+    let is_ours = end.is_some_and(|end| end.reason != Reason::EndedInEvalAI);
     if is_ours && status == Status::Finished {
         let message = format!("EvalAI showed {status} before the submission was run here; that is kept.");
-        draft.condition(conditions::FINISHED, Truth::True, reasons::ENDED_IN_EVALAI, &message);
-        draft.show(reasons::ENDED_IN_EVALAI, message);
+        draft.condition(conditions::FINISHED, Truth::True, Reason::EndedInEvalAI, &message);
+        draft.show(Reason::EndedInEvalAI, message);
     }
 }
 
@@ -359,12 +353,12 @@ fn record(draft: &mut PlanBuilder<'_>, is_shown: bool) -> Delivery {
         return without_leaderboard(draft, conditions::RECORDED);
     }
     if let Some(message) = why_without_row(draft) {
-        draft.condition(conditions::RECORDED, Truth::False, reasons::NOT_REQUIRED, &message);
+        draft.condition(conditions::RECORDED, Truth::False, Reason::NotRequired, &message);
         return Delivery::Done;
     }
     let view = draft.view.record.clone().unwrap_or_default();
     if view.end_written {
-        draft.condition(conditions::RECORDED, Truth::True, reasons::RECORDED, "");
+        draft.condition(conditions::RECORDED, Truth::True, Reason::Recorded, "");
         return Delivery::Done;
     }
     let mut unread = None;
@@ -380,14 +374,14 @@ fn record(draft: &mut PlanBuilder<'_>, is_shown: bool) -> Delivery {
     }
     let (reason, message) = match view.error {
         Some(error) => (
-            reasons::REFUSED,
+            Reason::Refused,
             format!(
                 "The last write failed: {} It is tried again; look at the table and the operator's rights.",
                 sentence(&error)
             ),
         ),
         None => (
-            reasons::WAITING,
+            Reason::Waiting,
             unread.unwrap_or_else(|| (if is_shown { IN_LINE } else { FOLLOWS_EVALAI }).to_owned()),
         ),
     };
@@ -416,9 +410,9 @@ fn why_without_row(draft: &PlanBuilder<'_>) -> Option<String> {
 /// Shows that the row waits for EvalAI, where there will be one.
 fn follow_evalai(draft: &mut PlanBuilder<'_>) {
     let known = draft.status.condition(conditions::RECORDED);
-    let is_waiting = known.is_some_and(|known| known.reason == reasons::WAITING);
+    let is_waiting = known.is_some_and(|known| known.reason == Reason::Waiting);
     if is_waiting && draft.leaderboard().is_some() && why_without_row(draft).is_none() {
-        draft.condition(conditions::RECORDED, Truth::False, reasons::WAITING, FOLLOWS_EVALAI);
+        draft.condition(conditions::RECORDED, Truth::False, Reason::Waiting, FOLLOWS_EVALAI);
     }
 }
 
@@ -432,6 +426,6 @@ fn superseded(draft: &PlanBuilder<'_>) -> Option<String> {
         ));
     }
     let shown = draft.status.condition(conditions::RECORDED)?;
-    let is_shown = shown.reason == reasons::NOT_REQUIRED && shown.message.starts_with(SUPERSEDED);
+    let is_shown = shown.reason == Reason::NotRequired && shown.message.starts_with(SUPERSEDED);
     is_shown.then(|| shown.message.to_string())
 }

@@ -19,7 +19,7 @@ use crate::view::{ContainerView, ObservedJob, ObservedReport, PodView, ReportDem
 use leaderboard_api::conditions::{self, Condition, Truth};
 use leaderboard_api::text::sentence;
 use leaderboard_api::{
-    Failure, ImageReference, PinnedImage, Repository, State, SubmissionStatus, WorkerStatus, names, reasons,
+    Failure, ImageReference, PinnedImage, Reason, Repository, State, SubmissionStatus, WorkerStatus, names,
 };
 use leaderboard_contract::report::Logs;
 use leaderboard_contract::report::Patience;
@@ -119,7 +119,7 @@ fn image_changed(draft: &PlanBuilder<'_>) -> Option<Failure> {
     let found = digests(&draft.status, draft.view.pod.as_ref()?);
     let is_one = found.windows(2).all(|pair| pair[0] == pair[1]);
     let what = "The tag of the submitted image moved while the run started, so its agents would run different images.";
-    (!is_one).then(|| charged(reasons::IMAGE_CHANGED, what))
+    (!is_one).then(|| charged(Reason::ImageChanged, what))
 }
 
 /// The digests of the submitted image that a Pod's agents run. A node may show an image under the name of another repository that has
@@ -213,10 +213,10 @@ fn note_scores(draft: &mut PlanBuilder<'_>, report: &ReportDigest) {
     let (truth, reason, message) = match &report.warning {
         Some(first) => {
             let message = format!("Scores do not follow from the infractions: {}", sentence(first));
-            (Truth::False, reasons::UNEXPLAINED_SCORES, message)
+            (Truth::False, Reason::UnexplainedScores, message)
         }
         None if draft.status.condition(conditions::PLAUSIBLE).is_none() => return,
-        None => (Truth::True, reasons::SCORES_EXPLAINED, String::new()),
+        None => (Truth::True, Reason::ScoresExplained, String::new()),
     };
     draft.condition(conditions::PLAUSIBLE, truth, reason, &message);
 }
@@ -227,10 +227,10 @@ fn note_logs(draft: &mut PlanBuilder<'_>, report: &ReportDigest) {
     match &report.logs {
         Some(Logs::Refused(why)) => {
             let why = sentence(why);
-            draft.condition(conditions::LOGGED, Truth::False, reasons::LOGS_REFUSED, &why);
+            draft.condition(conditions::LOGGED, Truth::False, Reason::LogsRefused, &why);
         }
         Some(Logs::Sent) if is_known => {
-            draft.condition(conditions::LOGGED, Truth::True, reasons::LOGS_SENT, "");
+            draft.condition(conditions::LOGGED, Truth::True, Reason::LogsSent, "");
         }
         _ => {}
     }
@@ -323,7 +323,7 @@ pub(super) fn report_of_end(draft: &mut PlanBuilder<'_>) -> Reading {
 /// True if an end is still to be sent to EvalAI, with the texts that were read.
 pub fn awaits_publication(status: &SubmissionStatus) -> bool {
     let published = status.condition(conditions::PUBLISHED);
-    let is_open = |c: &Condition| c.reason != reasons::REFUSED && !status.is_delivered(conditions::PUBLISHED);
+    let is_open = |c: &Condition| c.reason != Reason::Refused && !status.is_delivered(conditions::PUBLISHED);
     status.has_ended() && published.is_some_and(is_open)
 }
 

@@ -15,7 +15,7 @@ use super::waits::{Wait, after};
 use crate::view::{ContainerView, JobView, ObservedJob, ObservedNode, PodView, ScaleUp};
 use leaderboard_api::conditions::{self, Truth};
 use leaderboard_api::text::sentence;
-use leaderboard_api::{Deadlines, Failure, names, reasons};
+use leaderboard_api::{Deadlines, Failure, Reason, names};
 use leaderboard_pod_spec::job as job_spec;
 use leaderboard_protocol::files::Member;
 
@@ -41,13 +41,13 @@ pub(super) fn start_job(draft: &mut PlanBuilder<'_>) {
     if let ObservedJob::Absent { refused: Some(words) } = &view.job {
         job_refused(draft, words);
     } else if draft.is_running() {
-        draft.waits(reasons::PREPARING);
+        draft.waits(Reason::Preparing);
         let message = "The Job was deleted by somebody else. A new Job will resume from the results in S3.";
         draft.replacing(message);
     } else {
-        draft.waits(reasons::PREPARING);
-        draft.condition(conditions::RUNNING, Truth::False, reasons::PREPARING, "");
-        draft.show(reasons::PREPARING, PREPARED);
+        draft.waits(Reason::Preparing);
+        draft.condition(conditions::RUNNING, Truth::False, Reason::Preparing, "");
+        draft.show(Reason::Preparing, PREPARED);
     }
     run::update_evalai(draft);
     run::record_progress(draft);
@@ -72,8 +72,8 @@ pub(super) fn name_taken(draft: &mut PlanBuilder<'_>) {
         "The Job {} belongs to an older object of this name and is going away. If it stays, delete it.",
         draft.job_name()
     );
-    let message = draft.stall(reasons::JOB_NAME_TAKEN, &message);
-    draft.show(reasons::JOB_NAME_TAKEN, message);
+    let message = draft.stall(Reason::JobNameTaken, &message);
+    draft.show(Reason::JobNameTaken, message);
     draft.look_again(Wait::JOB_NAME);
 }
 
@@ -138,7 +138,7 @@ fn ended_by_node(draft: &mut PlanBuilder<'_>, pod: &PodView, reason: &str, words
         let what = sentence(&format!(
             "On {node} the kubelet did not admit the Pod ({reason}): {words}"
         ));
-        return draft.fail(infrastructure(reasons::NODE_CANNOT_START, &what));
+        return draft.fail(infrastructure(Reason::NodeCannotStart, &what));
     }
     let what = sentence(&format!("On {node} the kubelet ended the Pod ({reason}): {words}"));
     draft.moves();
@@ -174,9 +174,9 @@ fn left_by_node(draft: &PlanBuilder<'_>, pod: &PodView) -> Option<String> {
 
 fn show_running(draft: &mut PlanBuilder<'_>) {
     let reason = if draft.status.is_resumed() {
-        reasons::RESUMED
+        Reason::Resumed
     } else {
-        reasons::RUNNING
+        Reason::Running
     };
     let progress = draft.status.progress.as_ref();
     let message = progress
@@ -188,7 +188,7 @@ fn show_running(draft: &mut PlanBuilder<'_>) {
 }
 
 /// Shows what a Pod waits for whose agents have not started.
-fn show_wait(draft: &mut PlanBuilder<'_>, reason: &str, message: &str) {
+fn show_wait(draft: &mut PlanBuilder<'_>, reason: Reason, message: &str) {
     if draft.is_running() {
         draft.replacing(&format!("The Pod was lost, and the new one waits. {message}"));
     } else {
@@ -225,7 +225,7 @@ fn show_preparing(draft: &mut PlanBuilder<'_>, pod: &PodView, since: Timestamp) 
     if draft.is_running() {
         draft.replacing(&format!("The Pod was lost. {message}"));
     } else {
-        draft.show(reasons::PREPARING, message);
+        draft.show(Reason::Preparing, message);
     }
 }
 
@@ -268,8 +268,8 @@ fn without_pod(draft: &mut PlanBuilder<'_>, job: &JobView) {
         }
         let message = "The Job has not created a Pod and no event explains why. Look at the Job, and check that the \
                        cluster's controller manager runs.";
-        draft.stall_with(reasons::PREPARING, message);
-        show_wait(draft, reasons::PREPARING, message);
+        draft.stall_with(Reason::Preparing, message);
+        show_wait(draft, Reason::Preparing, message);
     }
 }
 
@@ -286,13 +286,13 @@ fn job_refused(draft: &mut PlanBuilder<'_>, words: &str) {
 }
 
 /// A reason and what to show of an object that the API server refuses.
-fn refused(what: &str, words: &str) -> (&'static str, String) {
+fn refused(what: &str, words: &str) -> (Reason, String) {
     let is_quota = words.contains("exceeded quota") || words.contains("failed quota");
     let (reason, what) = if is_quota {
         let what = format!("The namespace's quota does not allow the {what}");
-        (reasons::QUOTA_EXCEEDED, what)
+        (Reason::QuotaExceeded, what)
     } else {
-        (reasons::POD_REFUSED, format!("The API server refuses the {what}"))
+        (Reason::PodRefused, format!("The API server refuses the {what}"))
     };
     (reason, sentence(&format!("{what}: {words}")))
 }
@@ -316,7 +316,7 @@ fn unschedulable(draft: &mut PlanBuilder<'_>, job: &JobView, words: &str, scale_
         Some(ScaleUp::Refused(words)) => format!(" The autoscaler adds no node: {}", sentence(words)),
         None => String::new(),
     };
-    let (reason, message) = (reasons::UNSCHEDULABLE, sentence(words) + &of_nodes);
+    let (reason, message) = (Reason::Unschedulable, sentence(words) + &of_nodes);
     if is_late(draft, job, reason, &message) {
         return;
     }
@@ -329,7 +329,7 @@ fn unschedulable(draft: &mut PlanBuilder<'_>, job: &JobView, words: &str, scale_
 }
 
 /// True if no node has had the Pod for as long as `scheduleSeconds` allows: then the attempt fails.
-fn is_late(draft: &mut PlanBuilder<'_>, job: &JobView, reason: &str, message: &str) -> bool {
+fn is_late(draft: &mut PlanBuilder<'_>, job: &JobView, reason: Reason, message: &str) -> bool {
     let Some(limit) = draft.deadlines().schedule_seconds else {
         return false;
     };
@@ -342,7 +342,7 @@ fn is_late(draft: &mut PlanBuilder<'_>, job: &JobView, reason: &str, message: &s
     let deadline = after(since.unwrap_or(draft.now()), limit);
     if draft.now() >= deadline {
         let what = format!("No node accepted the Pod within {limit} s: {message}");
-        draft.fail(infrastructure(reasons::SCHEDULE_DEADLINE, &what));
+        draft.fail(infrastructure(Reason::ScheduleDeadline, &what));
         return true;
     }
     draft.requeue_at(deadline);
@@ -361,7 +361,7 @@ fn start_deadline(pod: &PodView, over: Limit) -> Failure {
             stage(pod)
         )
     };
-    failure::infrastructure(reasons::START_DEADLINE, &what)
+    failure::infrastructure(Reason::StartDeadline, &what)
 }
 
 /// How a container waits that the kubelet has not come to yet.

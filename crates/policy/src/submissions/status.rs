@@ -11,17 +11,17 @@ use super::write::{self, Change};
 use crate::view::{EvalaiInfo, ObservedJob, ReportDemand, View};
 use leaderboard_api::conditions::{self, Truth};
 use leaderboard_api::{
-    Attempt, BlockedSince, Deadlines, Failure, Ingested, LeaderboardSpec, Retries, RunPlan, Score, State, Submission,
-    SubmissionSpec, SubmissionStatus, effective, names, reasons,
+    Attempt, BlockedSince, Deadlines, Failure, Ingested, LeaderboardSpec, Reason, ReasonName, Retries, RunPlan, Score,
+    State, Submission, SubmissionSpec, SubmissionStatus, effective, names,
 };
 use leaderboard_evaluation::{Words, words};
 
 /// Reasons that Kubernetes' own events and the status show anyway: a write for each would cost every submission the same again.
-const WITHOUT_EVENT: [&str; 4] = [
-    reasons::PREPARING,
-    reasons::ASKING_EVALAI,
-    reasons::RUNNING,
-    reasons::RESUMED,
+const WITHOUT_EVENT: [Reason; 4] = [
+    Reason::Preparing,
+    Reason::AskingEvalAI,
+    Reason::Running,
+    Reason::Resumed,
 ];
 
 /// A plan in the making.
@@ -164,7 +164,7 @@ impl<'a> PlanBuilder<'a> {
     /// It is held back, or was when it ended here: its row in EvalAI and in the table may be another program's.
     pub(super) fn is_held(&self) -> bool {
         let accepted = self.status.condition(conditions::ACCEPTED);
-        accepted.is_some_and(|c| c.status == "False" && c.reason == reasons::FOREIGN)
+        accepted.is_some_and(|c| c.status == "False" && c.reason == Reason::Foreign)
     }
 
     /// The table has a row for it: without a team's id, as a check has none, there is no key.
@@ -224,9 +224,9 @@ impl<'a> PlanBuilder<'a> {
     pub(super) fn restart(&mut self) {
         let (before, wanted) = (self.status.attempt.unwrap_or_default(), self.spec().attempt);
         self.start_status(wanted);
-        self.condition(conditions::FINISHED, Truth::False, reasons::REPLACING, "");
+        self.condition(conditions::FINISHED, Truth::False, Reason::Replacing, "");
         let message = format!("Attempt {before} was stopped; attempt {wanted} resumes from the results in S3.");
-        self.show(reasons::REPLACING, message);
+        self.show(Reason::Replacing, message);
         self.requeue_in(Duration::ZERO);
     }
 
@@ -258,8 +258,8 @@ impl<'a> PlanBuilder<'a> {
             },
             ..Default::default()
         };
-        self.condition(conditions::FINISHED, Truth::False, reasons::PREPARING, "");
-        self.show(reasons::PREPARING, "The submission was just taken in.");
+        self.condition(conditions::FINISHED, Truth::False, Reason::Preparing, "");
+        self.show(Reason::Preparing, "The submission was just taken in.");
     }
 
     /// Shows that no message has announced an attempt: its row may have been edited by the participant.
@@ -271,7 +271,7 @@ impl<'a> PlanBuilder<'a> {
              re-run, but participants can edit the row. Check who asked for it; cancel the submission if nobody did.",
             seconds(record.sent)
         );
-        self.event(true, reasons::ATTEMPT_WITHOUT_MESSAGE, message);
+        self.event(true, Reason::AttemptWithoutMessage, message);
     }
 
     pub(super) fn act(&mut self, action: Action) {
@@ -286,7 +286,7 @@ impl<'a> PlanBuilder<'a> {
         self.actions.iter().any(is_meant)
     }
 
-    pub(super) fn event(&mut self, warning: bool, reason: &str, message: impl Into<String>) {
+    pub(super) fn event(&mut self, warning: bool, reason: impl Into<ReasonName>, message: impl Into<String>) {
         self.events.push(Event {
             warning,
             reason: reason.into(),
@@ -320,7 +320,7 @@ impl<'a> PlanBuilder<'a> {
         self.requeue_in(Duration::try_from(left).unwrap_or_default() + Duration::from_millis(50));
     }
 
-    pub(super) fn condition(&mut self, type_: &str, truth: Truth, reason: &str, message: &str) {
+    pub(super) fn condition(&mut self, type_: &str, truth: Truth, reason: impl Into<ReasonName>, message: &str) {
         let now = self.time();
         let generation = self.status.observed_generation;
         conditions::set(
@@ -335,13 +335,13 @@ impl<'a> PlanBuilder<'a> {
     }
 
     /// Remembers since when it has been blocked for one reason, and returns it: the condition's own time moves with its status alone.
-    pub(super) fn blocked(&mut self, reason: &str) -> Timestamp {
+    pub(super) fn blocked(&mut self, reason: Reason) -> Timestamp {
         let now = self.now();
         // A later time is that of a clock that was set back since: what is counted from it would not end.
         let known = self.blocked_since(reason).filter(|since| *since <= now);
         known.unwrap_or_else(|| {
             let since = BlockedSince {
-                reason: reason.to_owned(),
+                reason: reason.into(),
                 time: self.time(),
             };
             self.status.blocked_since = Some(Box::new(since));
@@ -350,14 +350,14 @@ impl<'a> PlanBuilder<'a> {
     }
 
     /// Shows why the submission is in its state.
-    pub(super) fn show(&mut self, reason: &str, message: impl Into<String>) {
+    pub(super) fn show(&mut self, reason: impl Into<ReasonName>, message: impl Into<String>) {
         let message = message.into();
         self.status.reason = Some(reason.into());
         self.status.message = (!message.is_empty()).then(|| message.into());
     }
 
     /// Shows why it is not accepted.
-    pub(super) fn refuse(&mut self, reason: &str, message: &str) {
+    pub(super) fn refuse(&mut self, reason: Reason, message: &str) {
         self.condition(conditions::ACCEPTED, Truth::False, reason, message);
         self.show(reason, message);
     }
@@ -365,9 +365,9 @@ impl<'a> PlanBuilder<'a> {
     /// Shows a live submission whose agents are gone and come back.
     pub(super) fn replacing(&mut self, message: &str) {
         if self.is_running() {
-            self.condition(conditions::RUNNING, Truth::False, reasons::REPLACING, "");
+            self.condition(conditions::RUNNING, Truth::False, Reason::Replacing, "");
         }
-        self.show(reasons::REPLACING, message);
+        self.show(Reason::Replacing, message);
     }
 
     /// The message while the Leaderboard does not exist.
@@ -378,11 +378,11 @@ impl<'a> PlanBuilder<'a> {
 
     /// Shows that nothing moves. The first message is kept while the reason stays, so that a changing detail of an error
     /// (a time, a request id) is not a write to the API in each reconcile.
-    pub(super) fn stall(&mut self, reason: &str, message: &str) -> String {
+    pub(super) fn stall(&mut self, reason: Reason, message: &str) -> String {
         let known = self
             .status
             .condition(conditions::STALLED)
-            .filter(|c| c.status == "True" && c.reason == reason)
+            .filter(|c| c.is_true() && c.reason == reason)
             .map(|c| c.message.to_string());
         let message = known.unwrap_or_else(|| message.to_owned());
         self.stall_with(reason, &message);
@@ -390,23 +390,23 @@ impl<'a> PlanBuilder<'a> {
     }
 
     /// Stalls with the words of this moment: for a cause that changes while the reason stays.
-    pub(super) fn stall_with(&mut self, reason: &str, message: &str) {
+    pub(super) fn stall_with(&mut self, reason: Reason, message: &str) {
         self.blocked(reason);
         self.condition(conditions::STALLED, Truth::True, reason, message);
     }
 
     pub(super) fn moves(&mut self) {
-        self.waits(reasons::NOT_STALLED);
+        self.waits(Reason::NotStalled);
     }
 
     /// Shows that it waits for what comes without a person: it is not stalled.
-    pub(super) fn waits(&mut self, reason: &str) {
+    pub(super) fn waits(&mut self, reason: Reason) {
         self.status.blocked_since = None;
         self.condition(conditions::STALLED, Truth::False, reason, "");
     }
 
     /// Shows a wait that is a stall once it has lasted for so long.
-    pub(super) fn stalls_after(&mut self, wait: Wait, reason: &str, message: &str) {
+    pub(super) fn stalls_after(&mut self, wait: Wait, reason: Reason, message: &str) {
         let until = wait.over_at(self.blocked(reason));
         if self.now() >= until {
             return self.stall_with(reason, message);
@@ -416,13 +416,13 @@ impl<'a> PlanBuilder<'a> {
     }
 
     /// Shows a wait, and remembers since when it has lasted.
-    pub(super) fn waits_since(&mut self, reason: &str, message: &str) {
+    pub(super) fn waits_since(&mut self, reason: Reason, message: &str) {
         self.blocked(reason);
         self.condition(conditions::STALLED, Truth::False, reason, message);
     }
 
     /// Since when it is blocked for this reason.
-    pub(super) fn blocked_since(&self, reason: &str) -> Option<Timestamp> {
+    pub(super) fn blocked_since(&self, reason: Reason) -> Option<Timestamp> {
         let blocked = self.status.blocked_since.as_ref();
         blocked
             .filter(|blocked| blocked.reason == reason)
@@ -486,12 +486,12 @@ impl<'a> PlanBuilder<'a> {
             return;
         }
         let (state, Some(reason)) = new else { return };
-        if WITHOUT_EVENT.contains(&reason.as_str()) {
+        if reason.is_one_of(&WITHOUT_EVENT) {
             return;
         }
         let message = self.status.message.clone();
         let message = message.unwrap_or_else(|| state.as_str().into());
-        self.event(state == State::Failed, &reason, message);
+        self.event(state == State::Failed, reason, message);
     }
 }
 

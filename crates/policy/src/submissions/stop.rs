@@ -13,7 +13,7 @@ use super::plan::Action;
 use super::status::PlanBuilder;
 use super::waits::{Wait, after};
 use crate::view::{JobView, ObservedFence, ObservedLog, ObservedNode, PodView};
-use leaderboard_api::{Failure, Interruptions, MAX_INTERRUPTED_NODES, SubmissionStatus, reasons};
+use leaderboard_api::{Failure, Interruptions, MAX_INTERRUPTED_NODES, Reason, SubmissionStatus};
 use leaderboard_contract::run::Stop;
 
 /// Brings a Job to its end: first by word, then by deletion, then by force.
@@ -80,7 +80,7 @@ fn stopping_since(draft: &mut PlanBuilder<'_>) -> Timestamp {
 fn show(draft: &mut PlanBuilder<'_>) {
     let failure = draft.status.failure.as_deref().filter(|_| !draft.is_cancelled());
     let message = match failure {
-        Some(failure) if failure.reason == reasons::NODE_LOST => {
+        Some(failure) if failure.reason == Reason::NodeLost => {
             let what = failure.message.clone();
             return draft.replacing(&what);
         }
@@ -104,7 +104,7 @@ fn show(draft: &mut PlanBuilder<'_>) {
             return draft.replacing(&what);
         }
     };
-    draft.show(reasons::STOPPING, message);
+    draft.show(Reason::Stopping, message);
 }
 
 fn annotate(draft: &mut PlanBuilder<'_>, pod: &PodView) {
@@ -187,7 +187,7 @@ fn given_up_at(node: ObservedNode, pod: &PodView) -> Option<Timestamp> {
 /// gone, the infrastructure's retry follows. Returns whether it did.
 pub(super) fn leaves_lost_pod(draft: &mut PlanBuilder<'_>, job: &JobView) -> bool {
     let failure = draft.status.failure.as_deref();
-    let other_end = draft.is_cancelled() || failure.is_some_and(|f| f.reason != reasons::NODE_LOST);
+    let other_end = draft.is_cancelled() || failure.is_some_and(|f| f.reason != Reason::NodeLost);
     let pod = draft.view.pod.as_ref().filter(|_| !other_end);
     let Some((pod, at)) = pod.and_then(|pod| Some((pod, given_up_at(draft.view.node.state, pod)?))) else {
         return false;
@@ -259,7 +259,7 @@ pub(super) fn notice(draft: &mut PlanBuilder<'_>) {
         return;
     };
     if let Some(what) = interruption(draft, pod) {
-        draft.fail(infrastructure(reasons::NODE_INTERRUPTED, &what));
+        draft.fail(infrastructure(Reason::NodeInterrupted, &what));
     }
 }
 
@@ -289,7 +289,7 @@ fn taken_by(pod: &PodView) -> Option<&str> {
 
 /// True if a failure is an interruption.
 pub(super) fn is_interruption(found: &Failure) -> bool {
-    found.reason == reasons::NODE_INTERRUPTED
+    found.reason == Reason::NodeInterrupted
 }
 
 /// Jobs of the attempt that ended otherwise, because of the infrastructure.

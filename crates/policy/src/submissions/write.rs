@@ -6,7 +6,7 @@ use std::time::Duration;
 
 use super::waits::Wait;
 use leaderboard_api::conditions::STALLED;
-use leaderboard_api::{SharedText, SubmissionStatus, WorkerState};
+use leaderboard_api::{ReasonName, SharedText, SubmissionStatus, WorkerState};
 
 /// Places in line that are written without waiting for their turn.
 pub(super) const FIRST_PLACES: i32 = 20;
@@ -77,7 +77,7 @@ fn steady(status: &SubmissionStatus) -> SubmissionStatus {
     for condition in &mut steady.conditions {
         // Why nothing is stalled is no news.
         if condition.type_ == STALLED && condition.status != "True" {
-            condition.reason = SharedText::default();
+            condition.reason = ReasonName::default();
         }
         condition.message = SharedText::default();
         condition.observed_generation = None;
@@ -92,7 +92,7 @@ mod tests {
 
     use super::*;
     use leaderboard_api::conditions::{self, Truth};
-    use leaderboard_api::{Progress, State, WorkerStatus, reasons};
+    use leaderboard_api::{Progress, Reason, State, WorkerStatus};
 
     fn running(done: i32) -> SubmissionStatus {
         SubmissionStatus {
@@ -116,7 +116,7 @@ mod tests {
 
     #[test]
     fn the_way_to_a_node_is_no_news() {
-        let preparing = |truth: Truth, reason: &str, node: Option<&str>| {
+        let preparing = |truth: Truth, reason: Reason, node: Option<&str>| {
             let mut status = SubmissionStatus {
                 state: Some(State::Pending),
                 node_name: node.map(str::to_owned),
@@ -127,12 +127,12 @@ mod tests {
             conditions::set(&mut status.conditions, STALLED, truth, reason, "", None, &now);
             status
         };
-        let before = preparing(Truth::False, reasons::PREPARING, None);
-        let on_node = preparing(Truth::False, reasons::NOT_STALLED, Some("node-a"));
+        let before = preparing(Truth::False, Reason::Preparing, None);
+        let on_node = preparing(Truth::False, Reason::NotStalled, Some("node-a"));
         assert_eq!(change(&before, &on_node), Change::Progress);
-        let blocked = preparing(Truth::True, reasons::IMAGE_PULL, Some("node-a"));
+        let blocked = preparing(Truth::True, Reason::ImagePull, Some("node-a"));
         assert_eq!(change(&before, &blocked), Change::Real);
-        let other = preparing(Truth::True, reasons::CONTAINER_CONFIG, Some("node-a"));
+        let other = preparing(Truth::True, Reason::ContainerConfig, Some("node-a"));
         assert_eq!(change(&blocked, &other), Change::Real);
     }
 

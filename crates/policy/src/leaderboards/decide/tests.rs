@@ -3,6 +3,7 @@
 use serde_json::json;
 
 use super::*;
+use leaderboard_api::ReasonName;
 
 fn leaderboard(name: &str, second: i64, phase: i64, server: &str, prefix: &str) -> Arc<Leaderboard> {
     let spec = json!({
@@ -50,9 +51,9 @@ fn view(mine: &Arc<Leaderboard>, all: &[Arc<Leaderboard>]) -> LeaderboardView {
     }
 }
 
-fn reason(plan: &LeaderboardPlan) -> (String, String) {
+fn reason(plan: &LeaderboardPlan) -> (String, ReasonName) {
     let condition = conditions::get(&plan.status.conditions, conditions::READY).unwrap();
-    (condition.status.to_string(), condition.reason.to_string())
+    (condition.status.to_string(), condition.reason.clone())
 }
 
 #[test]
@@ -62,11 +63,11 @@ fn of_two_with_the_same_phase_the_older_serves() {
     let all = [Arc::clone(&old), Arc::clone(&new)];
     assert_eq!(
         reason(&decide(&view(&old, &all))),
-        ("True".into(), reasons::READY.into())
+        ("True".into(), Reason::Ready.into())
     );
     assert_eq!(
         reason(&decide(&view(&new, &all))),
-        ("False".into(), reasons::PHASE_CONFLICT.into())
+        ("False".into(), Reason::PhaseConflict.into())
     );
 }
 
@@ -77,7 +78,7 @@ fn two_servers_may_not_share_a_prefix() {
     let all = [Arc::clone(&old), Arc::clone(&new)];
     assert_eq!(
         reason(&decide(&view(&new, &all))),
-        ("False".into(), reasons::PREFIX_CONFLICT.into())
+        ("False".into(), Reason::PrefixConflict.into())
     );
 }
 
@@ -92,7 +93,7 @@ fn two_namespaces_may_not_share_a_prefix_with_or_without_evalai() {
         Arc::new(object)
     };
     let one = Some("https://one");
-    let conflict = ("False".to_owned(), reasons::PREFIX_CONFLICT.to_owned());
+    let conflict = ("False".to_owned(), Reason::PrefixConflict.into());
     let cases = [
         (of("new", "other", 2, one, "a/"), true),
         (of("new", "other", 2, None, "a/"), true),
@@ -135,34 +136,24 @@ fn what_is_surely_wrong_comes_before_what_may_be_wrong() {
     let unreachable = |truth| {
         Some(Unreachable {
             truth,
-            reason: reasons::TABLE_UNREACHABLE,
+            reason: Reason::TableUnreachable,
             message: "It is not there.".into(),
         })
     };
     let fits = || EvalaiStanding::Fits { note: None };
     let missing = || EvalaiStanding::NoToken("x".into());
     let cases = [
-        (unreachable(Truth::False), fits(), "False", reasons::TABLE_UNREACHABLE),
-        (
-            unreachable(Truth::False),
-            missing(),
-            "False",
-            reasons::TABLE_UNREACHABLE,
-        ),
-        (
-            unreachable(Truth::Unknown),
-            fits(),
-            "Unknown",
-            reasons::TABLE_UNREACHABLE,
-        ),
-        (unreachable(Truth::Unknown), missing(), "False", reasons::TOKEN_MISSING),
+        (unreachable(Truth::False), fits(), "False", Reason::TableUnreachable),
+        (unreachable(Truth::False), missing(), "False", Reason::TableUnreachable),
+        (unreachable(Truth::Unknown), fits(), "Unknown", Reason::TableUnreachable),
+        (unreachable(Truth::Unknown), missing(), "False", Reason::TokenMissing),
         (
             unreachable(Truth::Unknown),
             EvalaiStanding::Unchecked(None),
             "Unknown",
-            reasons::TABLE_UNREACHABLE,
+            Reason::TableUnreachable,
         ),
-        (None, fits(), "True", reasons::READY),
+        (None, fits(), "True", Reason::Ready),
     ];
     for (unreachable, evalai, status, expected) in cases {
         let seen = LeaderboardView {
@@ -170,18 +161,14 @@ fn what_is_surely_wrong_comes_before_what_may_be_wrong() {
             evalai,
             ..view(&one, &[])
         };
-        assert_eq!(
-            reason(&decide(&seen)),
-            (status.to_owned(), expected.to_owned()),
-            "{seen:?}"
-        );
+        assert_eq!(reason(&decide(&seen)), (status.to_owned(), expected.into()), "{seen:?}");
         let broken = LeaderboardView {
             invalid_pod: Some("no".into()),
             ..seen
         };
         assert_eq!(
             reason(&decide(&broken)),
-            ("False".to_owned(), reasons::INVALID_POD.to_owned())
+            ("False".to_owned(), Reason::InvalidPod.into())
         );
     }
 }
@@ -192,12 +179,12 @@ fn no_leaderboard_is_ready_whose_claims_cannot_be_made() {
     for (claims, expected, begin) in [
         (
             Claims::NotServed,
-            reasons::CLAIMS_NOT_SERVED,
+            Reason::ClaimsNotServed,
             "gpu.mode is Claim, and the API server does not serve",
         ),
         (
             Claims::Missing("No template.".into()),
-            reasons::CLAIM_TEMPLATE_MISSING,
+            Reason::ClaimTemplateMissing,
             "No template.",
         ),
     ] {
@@ -206,7 +193,7 @@ fn no_leaderboard_is_ready_whose_claims_cannot_be_made() {
             ..view(&one, &[])
         };
         let plan = decide(&seen);
-        assert_eq!(reason(&plan), ("False".to_owned(), expected.to_owned()));
+        assert_eq!(reason(&plan), ("False".to_owned(), expected.into()));
         let ready = conditions::get(&plan.status.conditions, conditions::READY).unwrap();
         assert!(ready.message.starts_with(begin), "{}", ready.message);
     }
@@ -321,13 +308,13 @@ fn a_leaderboard_that_is_ready_shows_what_its_pods_give_to_strangers() {
 fn a_policy_that_is_not_in_place_is_why_nothing_can_run() {
     let one = leaderboard("one", 1, 7, "https://e", "a/");
     for (policy, ready, isolated) in [
-        (Policy::InPlace, reasons::READY, reasons::NOT_MEASURED),
-        (Policy::External, reasons::READY, reasons::EXTERNAL),
-        (Policy::Refused("No.".into()), reasons::NOT_ISOLATED, reasons::FORBIDDEN),
+        (Policy::InPlace, Reason::Ready, Reason::NotMeasured),
+        (Policy::External, Reason::Ready, Reason::External),
+        (Policy::Refused("No.".into()), Reason::NotIsolated, Reason::Forbidden),
         (
             Policy::NotApplied("No.".into()),
-            reasons::NOT_ISOLATED,
-            reasons::NOT_APPLIED,
+            Reason::NotIsolated,
+            Reason::NotApplied,
         ),
     ] {
         let seen = LeaderboardView {
@@ -349,24 +336,20 @@ fn what_is_wrong_with_evalai_is_shown() {
         why: "x".into(),
     };
     let cases = [
-        (EvalaiStanding::NoToken("x".into()), "False", reasons::TOKEN_MISSING),
-        (
-            EvalaiStanding::TokenRefused("x".into()),
-            "False",
-            reasons::TOKEN_REFUSED,
-        ),
-        (EvalaiStanding::Misfit("x".into()), "False", reasons::LABELS_DIFFER),
-        (unread(true), "False", reasons::QUEUE_UNREACHABLE),
-        (unread(false), "Unknown", reasons::QUEUE_UNREACHABLE),
-        (EvalaiStanding::Unchecked(None), "Unknown", reasons::ASKING_EVALAI),
-        (EvalaiStanding::NotRequired, "True", reasons::READY),
+        (EvalaiStanding::NoToken("x".into()), "False", Reason::TokenMissing),
+        (EvalaiStanding::TokenRefused("x".into()), "False", Reason::TokenRefused),
+        (EvalaiStanding::Misfit("x".into()), "False", Reason::LabelsDiffer),
+        (unread(true), "False", Reason::QueueUnreachable),
+        (unread(false), "Unknown", Reason::QueueUnreachable),
+        (EvalaiStanding::Unchecked(None), "Unknown", Reason::AskingEvalAI),
+        (EvalaiStanding::NotRequired, "True", Reason::Ready),
     ];
     for (evalai, status, expected) in cases {
         let seen = LeaderboardView {
             evalai,
             ..view(&one, &[])
         };
-        assert_eq!(reason(&decide(&seen)), (status.to_owned(), expected.to_owned()));
+        assert_eq!(reason(&decide(&seen)), (status.to_owned(), expected.into()));
     }
 }
 
@@ -375,11 +358,11 @@ fn what_it_may_not_name_comes_before_what_else_is_wrong() {
     let one = leaderboard("one", 1, 7, "https://e", "a/");
     let mut seen = view(&one, &[]);
     seen.refusal = Some(Refusal {
-        reason: reasons::NOT_ALLOWED,
+        reason: Reason::NotAllowed,
         message: "no".into(),
     });
     seen.invalid_pod = Some("no Pod".into());
-    assert_eq!(reason(&decide(&seen)), ("False".into(), reasons::NOT_ALLOWED.into()));
+    assert_eq!(reason(&decide(&seen)), ("False".into(), Reason::NotAllowed.into()));
 }
 
 #[test]
@@ -392,7 +375,7 @@ fn before_the_first_look_only_what_is_surely_wrong_is_shown() {
         ..view(&Arc::new(one.clone()), &[])
     };
     let plan = decide(&unseen(&one));
-    assert_eq!(reason(&plan), ("Unknown".into(), reasons::CHECKING.into()));
+    assert_eq!(reason(&plan), ("Unknown".into(), Reason::Checking.into()));
     assert_eq!(plan.status.observed_generation, None);
 
     let conditions = &mut one.status.get_or_insert_default().conditions;
@@ -401,7 +384,7 @@ fn before_the_first_look_only_what_is_surely_wrong_is_shown() {
         conditions,
         conditions::READY,
         Truth::True,
-        reasons::READY,
+        Reason::Ready,
         "As before.",
         Some(1),
         &now,
@@ -414,7 +397,7 @@ fn before_the_first_look_only_what_is_surely_wrong_is_shown() {
         before
     );
     seen.policy = Policy::NotApplied("No.".into());
-    assert_eq!(reason(&decide(&seen)), ("False".into(), reasons::NOT_ISOLATED.into()));
+    assert_eq!(reason(&decide(&seen)), ("False".into(), Reason::NotIsolated.into()));
     seen.is_looked_at = true;
     assert_eq!(decide(&seen).status.observed_generation, Some(2));
 }

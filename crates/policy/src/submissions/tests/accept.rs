@@ -11,15 +11,15 @@ use crate::view::{Standing, Turn};
 use leaderboard_api::State::{Cancelled, Failed, Pending};
 use leaderboard_api::conditions::{ACCEPTED, FINISHED, PUBLISHED, READY, RECORDED, STALLED};
 use leaderboard_api::evalai_status::Status;
-use leaderboard_api::{Attempt, FailureClass, JobNumber, SubmissionStatus, Team, conditions, reasons};
+use leaderboard_api::{Attempt, FailureClass, JobNumber, Reason, SubmissionStatus, Team, conditions};
 
 #[test]
 fn a_local_submission_is_accepted_and_its_job_made_in_one_reconcile() {
     let mut world = World::local();
-    let plan = world.pass_to(Pending, reasons::PREPARING);
+    let plan = world.pass_to(Pending, Reason::Preparing);
     assert_eq!(plan.actions[0], Action::CreateJob(JobNumber::first(Attempt(1))));
     assert!(events(&plan).is_empty(), "the status shows it");
-    assert_eq!(condition(&plan, ACCEPTED), ("True".into(), reasons::ACCEPTED.into()));
+    assert_eq!(condition(&plan, ACCEPTED), ("True".into(), Reason::Accepted.into()));
     assert_eq!(condition(&plan, FINISHED).0, "False");
     let status = world.status();
     assert_eq!(status.job_name.as_deref(), Some("sub-1"));
@@ -56,16 +56,16 @@ fn an_answer_of_evalai_within_five_seconds_costs_no_write() {
     assert_eq!(plan.requeue, Some(Duration::from_secs(3)));
     let mut answered = world.clone();
     answered.in_evalai().info = Some(info());
-    assert!(creates(&answered.pass_to(Pending, reasons::PREPARING)));
+    assert!(creates(&answered.pass_to(Pending, Reason::Preparing)));
     world.in_evalai().waited = Duration::from_secs(5);
-    let plan = world.pass_to(Pending, reasons::ASKING_EVALAI);
+    let plan = world.pass_to(Pending, Reason::AskingEvalAI);
     assert!(events(&plan).is_empty());
 }
 
 #[test]
 fn evalais_submission_takes_team_and_time_from_evalai_and_is_reported_as_queued() {
     let mut world = World::evalai();
-    let plan = world.pass_to(Pending, reasons::PREPARING);
+    let plan = world.pass_to(Pending, Reason::Preparing);
     assert_eq!(evalai_updates(&plan), [EvalaiUpdate::Queued]);
     let status = world.status();
     assert_eq!(status.plan.as_ref().unwrap().run_id.as_str(), "77");
@@ -89,7 +89,7 @@ fn an_image_is_taken_from_evalai_where_the_object_names_none() {
     world.submission().spec.image = None;
     world.in_evalai().info.as_mut().unwrap().image = None;
     world.in_evalai().error = Some("EvalAI answered 404: not found".into());
-    let plan = world.pass_to(Pending, reasons::IMAGE_MISSING);
+    let plan = world.pass_to(Pending, Reason::ImageMissing);
     assert_eq!(condition(&plan, ACCEPTED).0, "False");
     assert!(!creates(&plan));
     let message = plan.status.message.unwrap();
@@ -98,19 +98,19 @@ fn an_image_is_taken_from_evalai_where_the_object_names_none() {
         "{message}"
     );
     world.in_evalai().info.as_mut().unwrap().image = Some("ecr/agent:9".into());
-    assert!(creates(&world.pass_to(Pending, reasons::PREPARING)));
+    assert!(creates(&world.pass_to(Pending, Reason::Preparing)));
 }
 
 #[test]
 fn evalai_is_asked_and_its_silence_shown() {
     let mut world = World::evalai();
     world.in_evalai().info = None;
-    let plan = world.pass_to(Pending, reasons::ASKING_EVALAI);
+    let plan = world.pass_to(Pending, Reason::AskingEvalAI);
     assert!(has(&plan, |a| *a == Action::Ask(Question::Evalai)) && !creates(&plan));
     assert_eq!(condition(&plan, ACCEPTED).0, "Unknown");
 
     world.in_evalai().error = Some("401 Unauthorized, request 7".into());
-    let plan = world.pass_to(Pending, reasons::ASKING_EVALAI);
+    let plan = world.pass_to(Pending, Reason::AskingEvalAI);
     assert!(plan.status.message.unwrap().contains("401 Unauthorized"));
     assert_eq!(condition(&world.pass(), STALLED).0, "True");
     // Another request id of the same error is not another write.
@@ -127,11 +127,11 @@ fn what_evalai_has_ended_never_runs_and_is_not_written() {
         status: Status::Cancelled,
         ..info()
     });
-    let plan = world.pass_to(Cancelled, reasons::ENDED_IN_EVALAI);
+    let plan = world.pass_to(Cancelled, Reason::EndedInEvalAI);
     assert!(!creates(&plan) && evalai_updates(&plan).is_empty());
     assert_eq!(
         condition(&plan, PUBLISHED),
-        ("False".into(), reasons::NOT_REQUIRED.into())
+        ("False".into(), Reason::NotRequired.into())
     );
 }
 
@@ -147,24 +147,24 @@ fn resumed_in_evalai_takes_up_what_is_stored() {
 fn an_unknown_leaderboard_or_track_is_waited_for() {
     let mut world = World::local();
     let leaderboard = world.view.leaderboard.take();
-    let plan = world.pass_to(Pending, reasons::LEADERBOARD_NOT_FOUND);
+    let plan = world.pass_to(Pending, Reason::LeaderboardNotFound);
     assert_eq!(
         condition(&plan, ACCEPTED),
-        ("False".into(), reasons::LEADERBOARD_NOT_FOUND.into())
+        ("False".into(), Reason::LeaderboardNotFound.into())
     );
     assert!(events(&world.pass()).is_empty(), "one event a transition");
 
     world.view.leaderboard = leaderboard;
     world.leaderboard().tracks[0].name = "map".into();
-    let plan = world.pass_to(Pending, reasons::TRACK_NOT_FOUND);
+    let plan = world.pass_to(Pending, Reason::TrackNotFound);
     assert!(plan.status.message.unwrap().contains("whose tracks are map"));
 
     world.leaderboard().tracks[0].name = "sensors".into();
-    assert!(creates(&world.pass_to(Pending, reasons::PREPARING)));
+    assert!(creates(&world.pass_to(Pending, Reason::Preparing)));
 }
 
 /// Its Leaderboard is not ready, for this reason.
-fn not_ready(world: &mut World, reason: &str) {
+fn not_ready(world: &mut World, reason: Reason) {
     let leaderboard = Arc::make_mut(world.view.leaderboard.as_mut().unwrap());
     let conditions = &mut leaderboard.status.get_or_insert_default().conditions;
     let now = Time(at(0));
@@ -182,8 +182,8 @@ fn not_ready(world: &mut World, reason: &str) {
 #[test]
 fn a_leaderboard_that_cannot_make_jobs_is_waited_for() {
     let mut world = World::local();
-    not_ready(&mut world, reasons::INVALID_POD);
-    let plan = world.pass_to(Pending, reasons::LEADERBOARD_NOT_READY);
+    not_ready(&mut world, Reason::InvalidPod);
+    let plan = world.pass_to(Pending, Reason::LeaderboardNotReady);
     assert!(
         plan.status
             .message
@@ -192,7 +192,7 @@ fn a_leaderboard_that_cannot_make_jobs_is_waited_for() {
     );
 
     let mut world = World::local();
-    not_ready(&mut world, reasons::QUEUE_BLOCKED);
+    not_ready(&mut world, Reason::QueueBlocked);
     assert!(creates(&world.pass()), "a blocked queue is the bridge's affair");
 }
 
@@ -202,7 +202,7 @@ fn a_leaderboard_that_names_what_it_may_not_starts_nothing_and_has_nothing_looke
     for world in [World::local, World::evalai] {
         let mut world = world();
         world.view.not_allowed = Some("It may not name the bucket theirs.".to_owned());
-        let plan = world.pass_to(Pending, reasons::LEADERBOARD_NOT_READY);
+        let plan = world.pass_to(Pending, Reason::LeaderboardNotReady);
         let message = plan.status.message.as_ref().unwrap();
         assert!(
             message.contains("(NotAllowed): It may not name the bucket theirs."),
@@ -233,11 +233,11 @@ fn an_image_that_can_never_be_pulled_fails_at_once_without_a_job() {
                     continue;
                 }
             }
-            let plan = world.pass_to(Failed, reasons::IMAGE_INVALID);
+            let plan = world.pass_to(Failed, Reason::ImageInvalid);
             assert!(!creates(&plan), "{image:?}");
             assert_eq!(
                 condition(&plan, ACCEPTED),
-                ("False".into(), reasons::IMAGE_INVALID.into())
+                ("False".into(), Reason::ImageInvalid.into())
             );
             let failure = plan.status.failure.clone().unwrap();
             assert_eq!(failure.class, FailureClass::Participant);
@@ -268,11 +268,11 @@ fn a_later_attempt_with_an_image_runs_that_image() {
     world.submission().spec.image = None;
     let info = world.in_evalai().info.as_mut().unwrap();
     (info.image, info.image_problem) = (None, Some("the uploaded file is no JSON".into()));
-    world.pass_to(Failed, reasons::IMAGE_INVALID);
+    world.pass_to(Failed, Reason::ImageInvalid);
     world.submission().spec.attempt = Attempt(2);
     world.pass();
     world.in_evalai().info.as_mut().unwrap().image = Some("ecr/agent:9".into());
-    assert!(creates(&world.pass_to(Pending, reasons::PREPARING)));
+    assert!(creates(&world.pass_to(Pending, Reason::Preparing)));
     assert_eq!(world.status().plan.unwrap().image, "ecr/agent:9");
 }
 
@@ -285,11 +285,11 @@ fn moved_to(world: &mut World, phase: i64) {
 fn a_row_of_another_phase_is_not_run_until_it_is_of_ours_again() {
     let mut world = World::evalai();
     moved_to(&mut world, 9);
-    let plan = world.pass_to(Pending, reasons::PHASE_DIFFERS);
+    let plan = world.pass_to(Pending, Reason::PhaseDiffers);
     assert!(!creates(&plan) && evalai_updates(&plan).is_empty());
     assert_eq!(
         condition(&plan, ACCEPTED),
-        ("False".into(), reasons::PHASE_DIFFERS.into())
+        ("False".into(), Reason::PhaseDiffers.into())
     );
     let message = plan.status.message.unwrap();
     assert!(
@@ -297,12 +297,12 @@ fn a_row_of_another_phase_is_not_run_until_it_is_of_ours_again() {
         "{message}"
     );
     world.go_to(3599);
-    world.pass_to(Pending, reasons::PHASE_DIFFERS);
+    world.pass_to(Pending, Reason::PhaseDiffers);
     let mut back = world.clone();
     moved_to(&mut back, 7);
-    assert!(creates(&back.pass_to(Pending, reasons::PREPARING)));
+    assert!(creates(&back.pass_to(Pending, Reason::Preparing)));
     world.go_to(3600);
-    let plan = world.pass_to(Failed, reasons::PHASE_DIFFERS);
+    let plan = world.pass_to(Failed, Reason::PhaseDiffers);
     assert_eq!(plan.status.failure.unwrap().class, FailureClass::Infrastructure);
     assert_eq!(
         evalai_updates(&world.pass()),
@@ -311,10 +311,7 @@ fn a_row_of_another_phase_is_not_run_until_it_is_of_ours_again() {
     );
     world.published();
     let plan = world.pass();
-    assert_eq!(
-        condition(&plan, RECORDED),
-        ("False".into(), reasons::NOT_REQUIRED.into())
-    );
+    assert_eq!(condition(&plan, RECORDED), ("False".into(), Reason::NotRequired.into()));
     assert!(has(&plan, |a| *a == Action::Forget));
 }
 
@@ -322,23 +319,23 @@ fn a_row_of_another_phase_is_not_run_until_it_is_of_ours_again() {
 fn a_submission_with_a_wrong_phase_is_taken_back_without_ending_the_row() {
     let mut world = World::evalai();
     moved_to(&mut world, 9);
-    world.pass_to(Pending, reasons::PHASE_DIFFERS);
+    world.pass_to(Pending, Reason::PhaseDiffers);
     world.delete();
-    let plan = world.pass_to(Cancelled, reasons::DELETED);
+    let plan = world.pass_to(Cancelled, Reason::Deleted);
     assert_eq!(evalai_updates(&plan), []);
-    assert_eq!(condition(&plan, PUBLISHED).1, reasons::NOT_REQUIRED);
+    assert_eq!(condition(&plan, PUBLISHED).1, Reason::NotRequired);
     assert!(has(&plan, |a| *a == Action::SetFinalizer(false)), "{:?}", plan.actions);
 
     // It was accepted, and EvalAI has heard that it is queued.
     let mut world = World::evalai();
     let (position, eta) = (3, None);
     world.view.turn = Turn::Wait { position, eta };
-    world.pass_to(Pending, reasons::WAITING_FOR_SLOT);
+    world.pass_to(Pending, Reason::WaitingForSlot);
     moved_to(&mut world, 9);
-    world.pass_to(Pending, reasons::PHASE_DIFFERS);
+    world.pass_to(Pending, Reason::PhaseDiffers);
     world.submission().spec.cancel = true;
     assert_eq!(
-        evalai_updates(&world.pass_to(Cancelled, reasons::CANCELLED)),
+        evalai_updates(&world.pass_to(Cancelled, Reason::Cancelled)),
         [EvalaiUpdate::Cancelled]
     );
 }
@@ -346,18 +343,18 @@ fn a_submission_with_a_wrong_phase_is_taken_back_without_ending_the_row() {
 #[test]
 fn what_waits_before_its_acceptance_hears_of_its_end_in_evalai() {
     type Wait = fn(&mut World);
-    let waits: [(&str, Wait); 5] = [
-        (reasons::TRACK_NOT_FOUND, |w| w.leaderboard().tracks[0].phase = Some(8)),
-        (reasons::IMAGE_MISSING, |w| {
+    let waits: [(Reason, Wait); 5] = [
+        (Reason::TrackNotFound, |w| w.leaderboard().tracks[0].phase = Some(8)),
+        (Reason::ImageMissing, |w| {
             w.submission().spec.image = None;
             w.in_evalai().info.as_mut().unwrap().image = None;
         }),
-        (reasons::LEADERBOARD_NOT_READY, |w| not_ready(w, reasons::INVALID_POD)),
-        (reasons::NOT_ISOLATED, |w| {
+        (Reason::LeaderboardNotReady, |w| not_ready(w, Reason::InvalidPod)),
+        (Reason::NotIsolated, |w| {
             w.view.is_policy_in_place = false;
             w.go_to(5);
         }),
-        (reasons::PHASE_DIFFERS, |w| moved_to(w, 9)),
+        (Reason::PhaseDiffers, |w| moved_to(w, 9)),
     ];
     for (reason, wait) in waits {
         let mut world = World::evalai();
@@ -374,7 +371,7 @@ fn what_waits_before_its_acceptance_hears_of_its_end_in_evalai() {
             "{reason}: EvalAI's lists are asked from then on"
         );
         world.in_evalai().cancelled = true;
-        let plan = world.pass_to(Cancelled, reasons::ENDED_IN_EVALAI);
+        let plan = world.pass_to(Cancelled, Reason::EndedInEvalAI);
         assert_eq!(evalai_updates(&plan), [], "{reason}");
         assert!(has(&plan, |a| *a == Action::Forget), "{reason}: {:?}", plan.actions);
     }
@@ -391,7 +388,7 @@ fn evalai_is_asked_also_where_the_track_is_missing() {
         status: Status::Cancelled,
         ..info()
     });
-    world.pass_to(Cancelled, reasons::ENDED_IN_EVALAI);
+    world.pass_to(Cancelled, Reason::EndedInEvalAI);
 }
 
 #[test]
@@ -403,9 +400,9 @@ fn what_waits_between_two_tries_is_followed_after_a_restart() {
         message: "no".into(),
     });
     world.view.report.stored = crate::view::ObservedReport::Absent;
-    world.pass_to(Pending, reasons::REPLACING);
+    world.pass_to(Pending, Reason::Replacing);
     world.job_gone();
-    let plan = world.pass_to(Pending, reasons::REPLACING);
+    let plan = world.pass_to(Pending, Reason::Replacing);
     assert!(
         has(&plan, |a| *a == Action::Ask(Question::EvalaisEnd)),
         "{:?}",
@@ -417,10 +414,10 @@ fn what_waits_between_two_tries_is_followed_after_a_restart() {
 fn a_row_of_another_phase_that_its_participant_deleted_is_ended_there() {
     let mut world = World::evalai();
     moved_to(&mut world, 9);
-    world.pass_to(Pending, reasons::PHASE_DIFFERS);
+    world.pass_to(Pending, Reason::PhaseDiffers);
     let mut cancelled = world.clone();
     (world.in_evalai().cancelled, world.in_evalai().overtaken) = (true, true);
-    let plan = world.pass_to(Cancelled, reasons::ENDED_IN_EVALAI);
+    let plan = world.pass_to(Cancelled, Reason::EndedInEvalAI);
     assert_eq!(
         evalai_updates(&plan),
         [EvalaiUpdate::Cancelled],
@@ -428,15 +425,15 @@ fn a_row_of_another_phase_that_its_participant_deleted_is_ended_there() {
     );
     assert_eq!(
         condition(&plan, PUBLISHED),
-        ("False".into(), reasons::CONCURRENT_UPDATE.into())
+        ("False".into(), Reason::ConcurrentUpdate.into())
     );
     world.published();
     assert_eq!(condition(&world.pass(), PUBLISHED).0, "True");
 
     cancelled.in_evalai().cancelled = true;
-    let plan = cancelled.pass_to(Cancelled, reasons::ENDED_IN_EVALAI);
+    let plan = cancelled.pass_to(Cancelled, Reason::EndedInEvalAI);
     assert_eq!(evalai_updates(&plan), []);
-    assert_eq!(condition(&plan, PUBLISHED).1, reasons::NOT_REQUIRED);
+    assert_eq!(condition(&plan, PUBLISHED).1, Reason::NotRequired);
 }
 
 #[test]
@@ -456,11 +453,7 @@ fn the_next_step_after_evalais_own_end_is_one_that_evalai_takes() {
             status,
             ..info()
         });
-        let message = world
-            .pass_to(Cancelled, reasons::ENDED_IN_EVALAI)
-            .status
-            .message
-            .unwrap();
+        let message = world.pass_to(Cancelled, Reason::EndedInEvalAI).status.message.unwrap();
         assert!(message.starts_with(&format!("EvalAI shows {status}: ")), "{message}");
         assert!(message.ends_with(step), "{message}");
         assert_eq!(
@@ -478,11 +471,11 @@ fn why_an_image_is_unknown_follows_its_cause() {
     world.submission().spec.image = None;
     world.in_evalai().info.as_mut().unwrap().image = None;
     world.in_evalai().error = Some("EvalAI answered 404".into());
-    world.pass_to(Pending, reasons::IMAGE_MISSING);
+    world.pass_to(Pending, Reason::ImageMissing);
     let since = conditions::get(&world.status().conditions, STALLED).cloned().unwrap();
     world.wait(60);
     world.in_evalai().error = Some("EvalAI answered 503".into());
-    let status = world.pass_to(Pending, reasons::IMAGE_MISSING).status;
+    let status = world.pass_to(Pending, Reason::ImageMissing).status;
     let stalled = conditions::get(&status.conditions, STALLED).unwrap();
     for message in [&stalled.message, status.message.as_ref().unwrap()] {
         assert!(

@@ -8,17 +8,17 @@ use super::builders::*;
 use super::record::{finished, refused};
 use crate::submissions::{Action, EvalaiUpdate, Plan, TableUpdate};
 use crate::view::{EvalaiEnd, ObservedReport};
+use leaderboard_api::Reason;
 use leaderboard_api::State::{Cancelled, Failed, Finished};
 use leaderboard_api::conditions::{self, PUBLISHED, RECORDED};
 use leaderboard_api::evalai_status::Status;
-use leaderboard_api::reasons;
 
 fn failed() -> World {
     let mut world = World::evalai().running();
     world.see(ended("agent-1", 3, "exited", 1, 100));
     world.pass();
     world.complete();
-    world.pass_to(Failed, reasons::AGENT_CRASHED);
+    world.pass_to(Failed, Reason::AgentCrashed);
     world
 }
 
@@ -31,7 +31,7 @@ fn evalai_first_then_the_table_then_rest() {
         let mut plan = world.pass();
         plan.actions.retain(|a| !matches!(a, Action::KeepLog { .. }));
         assert_eq!(plan.actions, [Action::UpdateEvalai(update)]);
-        assert_eq!(condition(&plan, PUBLISHED), ("False".into(), reasons::WAITING.into()));
+        assert_eq!(condition(&plan, PUBLISHED), ("False".into(), Reason::Waiting.into()));
         let before = world.status();
         world.published();
         let plan = world.pass();
@@ -80,7 +80,7 @@ fn a_job_goes_early_only_by_the_hosts_choice_and_when_all_have_its_end() {
     world.leaderboard().ttl_seconds_after_finished = 600;
     world.complete();
     world.report(final_report());
-    world.pass_to(Finished, reasons::FINISHED);
+    world.pass_to(Finished, Reason::Finished);
     world.wait(600);
     assert!(!deletes(&world.pass()), "the table has no end yet");
     let mut late = world.clone();
@@ -110,10 +110,10 @@ fn an_end_whose_result_cannot_be_read_shows_why_it_waits() {
     world.view.report.stored = ObservedReport::Unreadable("the bucket results did not answer in time".into());
     let told = |plan: &Plan, type_: &str| {
         let condition = conditions::get(&plan.status.conditions, type_).unwrap();
-        (condition.reason.to_string(), condition.message.to_string())
+        (condition.reason.clone(), condition.message.to_string())
     };
     let waits = (
-        reasons::WAITING.to_owned(),
+        Reason::Waiting.into(),
         "The stored result cannot be read: the bucket results did not answer in time. It is published when it can; look at the bucket."
             .to_owned(),
     );
@@ -129,7 +129,7 @@ fn an_end_whose_result_cannot_be_read_shows_why_it_waits() {
     assert_eq!(told(&world.pass(), RECORDED), waits);
     world.report(final_report());
     let (reason, message) = told(&world.pass(), RECORDED);
-    assert_eq!(reason, reasons::WAITING);
+    assert_eq!(reason, Reason::Waiting);
     assert!(message.starts_with("The table's row is written when"), "{message}");
 }
 
@@ -140,18 +140,18 @@ fn a_cancel_that_our_own_write_may_have_undone_is_sent_again() {
     world.pass();
     world.job_gone();
     world.view.report.stored = ObservedReport::Absent;
-    let plan = world.pass_to(Cancelled, reasons::ENDED_IN_EVALAI);
+    let plan = world.pass_to(Cancelled, Reason::EndedInEvalAI);
     assert_eq!(evalai_updates(&plan), [EvalaiUpdate::Cancelled]);
     assert_eq!(
         condition(&plan, PUBLISHED),
-        ("False".into(), reasons::CONCURRENT_UPDATE.into())
+        ("False".into(), Reason::ConcurrentUpdate.into())
     );
     // Also by a controller that has seen nothing of it.
     world.in_evalai().overtaken = false;
     assert_eq!(evalai_updates(&world.pass()), [EvalaiUpdate::Cancelled]);
     world.published();
     world.recorded();
-    let plan = world.pass_to(Cancelled, reasons::ENDED_IN_EVALAI);
+    let plan = world.pass_to(Cancelled, Reason::EndedInEvalAI);
     assert_eq!(
         (evalai_updates(&plan), condition(&plan, PUBLISHED).0),
         (vec![], "True".into())
@@ -162,10 +162,10 @@ fn a_cancel_that_our_own_write_may_have_undone_is_sent_again() {
 fn evalais_end_wins_until_ours_is_answered_and_not_after() {
     for mut world in [finished(), failed()] {
         world.in_evalai().end = Some(EvalaiEnd::Ended(Status::Cancelled));
-        let plan = world.pass_to(Cancelled, reasons::ENDED_IN_EVALAI);
+        let plan = world.pass_to(Cancelled, Reason::EndedInEvalAI);
         assert_eq!(
             condition(&plan, PUBLISHED),
-            ("False".into(), reasons::NOT_REQUIRED.into())
+            ("False".into(), Reason::NotRequired.into())
         );
         assert_eq!(evalai_updates(&plan), []);
         world.recorded();
@@ -182,7 +182,7 @@ fn evalais_end_wins_until_ours_is_answered_and_not_after() {
     world.recorded();
     world.pass();
     world.in_evalai().end = Some(EvalaiEnd::Ended(Status::Cancelled));
-    world.pass_to(Finished, reasons::FINISHED);
+    world.pass_to(Finished, Reason::Finished);
 }
 
 #[test]
@@ -190,7 +190,7 @@ fn a_cancelled_one_that_evalai_ended_too_is_sent_once() {
     let mut world = World::evalai();
     world.submission().spec.cancel = true;
     assert_eq!(
-        evalai_updates(&world.pass_to(Cancelled, reasons::CANCELLED)),
+        evalai_updates(&world.pass_to(Cancelled, Reason::Cancelled)),
         [EvalaiUpdate::Cancelled]
     );
     world.in_evalai().end = Some(EvalaiEnd::Ended(Status::Cancelled));
@@ -198,7 +198,7 @@ fn a_cancelled_one_that_evalai_ended_too_is_sent_once() {
     world.recorded();
     world.pass();
     world.view.evalai = None;
-    assert_eq!(evalai_updates(&world.pass_to(Cancelled, reasons::CANCELLED)), []);
+    assert_eq!(evalai_updates(&world.pass_to(Cancelled, Reason::Cancelled)), []);
 }
 
 #[test]
@@ -208,8 +208,8 @@ fn a_refused_result_is_shown_once_and_does_not_hold_up_the_row() {
         message: "metric x is unknown".into(),
     });
     let plan = world.pass();
-    assert_eq!(condition(&plan, PUBLISHED), ("False".into(), reasons::REFUSED.into()));
-    assert_eq!(events(&plan), [reasons::REFUSED]);
+    assert_eq!(condition(&plan, PUBLISHED), ("False".into(), Reason::Refused.into()));
+    assert_eq!(events(&plan), [Reason::Refused]);
     assert!(has(&plan, |a| *a == Action::Record(TableUpdate::End)));
     assert!(world.pass().events.is_empty());
     world.recorded();
@@ -227,12 +227,12 @@ fn a_cancel_in_evalai_after_a_refusal_reaches_the_row_too() {
             world.pass();
         }
         world.in_evalai().end = Some(EvalaiEnd::Ended(Status::Cancelled));
-        let plan = world.pass_to(Cancelled, reasons::ENDED_IN_EVALAI);
+        let plan = world.pass_to(Cancelled, Reason::EndedInEvalAI);
         assert!(
             has(&plan, |a| *a == Action::Record(TableUpdate::End)),
             "the row said FINISHED"
         );
-        assert_eq!(condition(&plan, RECORDED), ("False".into(), reasons::WAITING.into()));
+        assert_eq!(condition(&plan, RECORDED), ("False".into(), Reason::Waiting.into()));
         assert!(!has(&plan, |a| *a == Action::Forget));
         // The row that was handed in is not the written one.
         world.view.record.as_mut().unwrap().end_written = false;
@@ -256,7 +256,7 @@ fn an_outage_is_shown_and_waited_for() {
     world.published();
     world.view.record.as_mut().unwrap().error = Some("AccessDenied".into());
     let plan = world.pass();
-    assert_eq!(condition(&plan, RECORDED), ("False".into(), reasons::REFUSED.into()));
+    assert_eq!(condition(&plan, RECORDED), ("False".into(), Reason::Refused.into()));
     assert_eq!(plan.status.state, Some(Finished));
     world.recorded();
     assert_eq!(condition(&world.pass(), RECORDED).0, "True");
@@ -268,9 +268,9 @@ fn what_is_not_wanted_is_not_waited_for() {
     world.view.record = None;
     world.complete();
     world.report(final_report());
-    let plan = world.pass_to(Finished, reasons::FINISHED);
-    assert_eq!(condition(&plan, PUBLISHED).1, reasons::NOT_REQUIRED);
-    assert_eq!(condition(&plan, RECORDED).1, reasons::NOT_REQUIRED);
+    let plan = world.pass_to(Finished, Reason::Finished);
+    assert_eq!(condition(&plan, PUBLISHED).1, Reason::NotRequired);
+    assert_eq!(condition(&plan, RECORDED).1, Reason::NotRequired);
     assert_eq!(plan.requeue, None);
 
     let mut world = World::local();
@@ -278,7 +278,7 @@ fn what_is_not_wanted_is_not_waited_for() {
     let mut world = world.running();
     world.complete();
     world.report(final_report());
-    let plan = world.pass_to(Finished, reasons::FINISHED);
+    let plan = world.pass_to(Finished, Reason::Finished);
     let shown = leaderboard_api::conditions::get(&plan.status.conditions, RECORDED).unwrap();
     assert!(shown.message.contains("spec.team.id"));
 }
@@ -292,7 +292,7 @@ fn a_leaderboard_that_is_gone_wants_what_it_wanted() {
     let plan = world.pass();
     assert_eq!(
         condition(&plan, PUBLISHED),
-        ("False".into(), reasons::LEADERBOARD_NOT_FOUND.into())
+        ("False".into(), Reason::LeaderboardNotFound.into())
     );
     assert!(plan.requeue.is_some() && evalai_updates(&plan).is_empty());
 
@@ -301,7 +301,7 @@ fn a_leaderboard_that_is_gone_wants_what_it_wanted() {
     world.view.leaderboard = None;
     world.pass();
     world.delete();
-    assert!(has(&world.pass_to(Cancelled, reasons::DELETED), |a| *a
+    assert!(has(&world.pass_to(Cancelled, Reason::Deleted), |a| *a
         == Action::SetFinalizer(false)));
 }
 
@@ -326,7 +326,7 @@ fn a_result_that_evalai_cancels_later_is_shown_as_cancelled_there_and_stays() {
     let plan = world.pass();
     assert_eq!(
         condition(&plan, PUBLISHED),
-        ("False".into(), reasons::CANCELLED_IN_EVALAI.into())
+        ("False".into(), Reason::CancelledInEvalAI.into())
     );
     assert_eq!(condition(&plan, RECORDED).0, "True");
     assert_eq!(
@@ -346,7 +346,7 @@ fn a_result_that_evalai_cancels_later_is_shown_as_cancelled_there_and_stays() {
     // The list of later shows it no more, or the controller has begun anew.
     world.view.evalai = None;
     let plan = world.pass();
-    assert_eq!(condition(&plan, PUBLISHED).1, reasons::CANCELLED_IN_EVALAI);
+    assert_eq!(condition(&plan, PUBLISHED).1, Reason::CancelledInEvalAI);
     assert_eq!(plan.actions, [Action::Forget], "nothing is sent again");
 }
 
@@ -369,7 +369,7 @@ fn an_end_shows_until_when_it_waits_for_the_controller_before() {
     world.in_evalai().writes_from = Some(until);
     let plan = world.pass();
     let shown = conditions::get(&plan.status.conditions, PUBLISHED).unwrap();
-    assert_eq!(shown.reason, reasons::WAITING_FOR_PREVIOUS_CONTROLLER);
+    assert_eq!(shown.reason, Reason::WaitingForPreviousController);
     let until = until.strftime("%H:%M:%S").to_string();
     assert!(
         shown.message.contains(&format!("before {until} UTC")),
@@ -385,7 +385,7 @@ fn an_end_shows_until_when_it_waits_for_the_controller_before() {
     world.in_evalai().writes_from = None;
     assert_eq!(
         condition(&world.pass(), PUBLISHED),
-        ("False".into(), reasons::WAITING.into())
+        ("False".into(), Reason::Waiting.into())
     );
 }
 
@@ -402,7 +402,7 @@ fn a_row_that_has_gone_to_another_team_is_shown_with_its_end() {
     world.published();
     world.recorded();
     let plan = world.pass();
-    assert_eq!(events(&plan), [reasons::TEAM_DIFFERS]);
+    assert_eq!(events(&plan), [Reason::TeamDiffers]);
     let shown = conditions::get(&plan.status.conditions, PUBLISHED).unwrap();
     assert!(
         shown.message.contains("team 43") && shown.message.contains("team 42"),

@@ -17,7 +17,8 @@ use crate::view::{
 use leaderboard_api::conditions;
 use leaderboard_api::evalai_status::Status;
 use leaderboard_api::{
-    Attempt, Leaderboard, LeaderboardSpec, Metric, State, Submission, SubmissionStatus, WorkerState, names, reasons,
+    Attempt, Leaderboard, LeaderboardSpec, Metric, Reason, ReasonName, State, Submission, SubmissionStatus,
+    WorkerState, names,
 };
 use leaderboard_contract::report::{Report, ReportWorker};
 use leaderboard_contract::run::Stop;
@@ -288,10 +289,10 @@ impl World {
     #[track_caller]
     pub fn gets_another_job(&mut self) {
         self.complete();
-        self.pass_to(State::Pending, reasons::REPLACING);
+        self.pass_to(State::Pending, Reason::Replacing);
         self.job_gone();
         self.wait(10);
-        self.pass_to(State::Pending, reasons::PREPARING);
+        self.pass_to(State::Pending, Reason::Preparing);
         self.see_job();
     }
 
@@ -305,10 +306,10 @@ impl World {
 
     /// One reconcile that has to show this state with this reason.
     #[track_caller]
-    pub fn pass_to(&mut self, state: State, reason: &str) -> Plan {
+    pub fn pass_to(&mut self, state: State, reason: Reason) -> Plan {
         let plan = self.pass();
-        let shown = (plan.status.state, plan.status.reason.as_deref());
-        assert_eq!(shown, (Some(state), Some(reason)), "{:?}", plan.status.message);
+        let shown = (plan.status.state, plan.status.reason.clone());
+        assert_eq!(shown, (Some(state), Some(reason.into())), "{:?}", plan.status.message);
         plan
     }
 }
@@ -449,13 +450,13 @@ pub fn creates(plan: &Plan) -> bool {
 }
 
 /// Status and reason of a condition.
-pub fn condition(plan: &Plan, type_: &str) -> (String, String) {
+pub fn condition(plan: &Plan, type_: &str) -> (String, ReasonName) {
     let found = conditions::get(&plan.status.conditions, type_);
-    found.map_or_else(Default::default, |c| (c.status.to_string(), c.reason.to_string()))
+    found.map_or_else(Default::default, |c| (c.status.to_string(), c.reason.clone()))
 }
 
-pub fn events(plan: &Plan) -> Vec<&str> {
-    plan.events.iter().map(|e| e.reason.as_str()).collect()
+pub fn events(plan: &Plan) -> Vec<ReasonName> {
+    plan.events.iter().map(|e| e.reason.clone()).collect()
 }
 
 /// The stop that the Pod is asked for.

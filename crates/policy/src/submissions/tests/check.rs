@@ -5,7 +5,7 @@ use crate::slots::turns::InLine;
 use crate::submissions::Action;
 use crate::view::Turn;
 use leaderboard_api::State::{Failed, Pending};
-use leaderboard_api::{CheckImage, ImagePattern, RouteSlice, reasons};
+use leaderboard_api::{CheckImage, ImagePattern, Reason, RouteSlice};
 
 fn check() -> World {
     let mut world = World::local();
@@ -18,7 +18,7 @@ fn check() -> World {
 
 #[test]
 fn it_runs_one_route_with_one_pair_and_has_no_row() {
-    let plan = check().pass_to(Pending, reasons::PREPARING);
+    let plan = check().pass_to(Pending, Reason::Preparing);
     let run = plan.status.plan.as_ref().unwrap();
     assert_eq!(run.carla.slices, [RouteSlice { first: 0, last: 0 }]);
     assert_eq!(
@@ -54,11 +54,11 @@ fn the_first_fault_of_the_infrastructure_ends_it() {
         "ErrImagePull",
         "failed to pull and unpack image \"r/x:1\": not found",
     ));
-    world.pass_to(Pending, reasons::IMAGE_PULL);
+    world.pass_to(Pending, Reason::ImagePull);
     world.go_to(1900);
-    world.pass_to(Pending, reasons::STOPPING);
+    world.pass_to(Pending, Reason::Stopping);
     world.job_gone();
-    world.pass_to(Failed, reasons::IMAGE_PULL);
+    world.pass_to(Failed, Reason::ImagePull);
 }
 
 #[test]
@@ -72,12 +72,12 @@ fn its_image_is_the_one_that_the_leaderboard_names_for_it() {
         });
         world
     };
-    world("hosts/contents-of-another:1").pass_to(Failed, reasons::IMAGE_NOT_ALLOWED);
+    world("hosts/contents-of-another:1").pass_to(Failed, Reason::ImageNotAllowed);
     let mut baseline = world("hosts/baseline:2");
     assert!(creates(&baseline.pass()));
     let mut private = world("contents:1");
     private.leaderboard().check = Some(CheckImage {
         image: "contents:1".into(),
     });
-    private.pass_to(Failed, reasons::IMAGE_NOT_ALLOWED);
+    private.pass_to(Failed, Reason::ImageNotAllowed);
 }

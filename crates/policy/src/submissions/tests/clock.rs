@@ -2,8 +2,8 @@
 
 use super::builders::*;
 use crate::view::PodView;
+use leaderboard_api::Reason;
 use leaderboard_api::State::{Pending, Running};
-use leaderboard_api::reasons;
 
 /// When the first Pod is lost. Its agents had begun at second 10.
 const LOST: i64 = 72_000;
@@ -56,17 +56,17 @@ fn gets_agents(world: &mut World, second: i64) {
     world.see_agents();
     world.pod().agent_started = Some(at(second));
     world.go_to(second + 5);
-    world.pass_to(Running, reasons::RUNNING);
+    world.pass_to(Running, Reason::Running);
 }
 
 /// Its time is over at this second, and not before.
 #[track_caller]
 fn has_time_until(world: &mut World, end: i64) {
     world.go_to(end - 1);
-    world.pass_to(Running, reasons::RUNNING);
+    world.pass_to(Running, Reason::Running);
     world.go_to(end);
-    let failure = world.pass_to(Running, reasons::STOPPING).status.failure.unwrap();
-    assert_eq!(failure.reason, reasons::TIME_LIMIT);
+    let failure = world.pass_to(Running, Reason::Stopping).status.failure.unwrap();
+    assert_eq!(failure.reason, Reason::TimeLimit);
 }
 
 #[test]
@@ -76,22 +76,22 @@ fn the_wait_of_a_new_pod_for_its_node_costs_no_time() {
         world.view.pod = Some(next_pod(LOST));
         if is_watched {
             world.go_to(LOST);
-            world.pass_to(Running, reasons::REPLACING);
+            world.pass_to(Running, Reason::Replacing);
             world.go_to(86_500);
-            world.pass_to(Running, reasons::REPLACING);
+            world.pass_to(Running, Reason::Replacing);
         }
         gets_node(&mut world, BACK);
         world.go_to(BACK + 60);
-        let plan = world.pass_to(Running, reasons::RUNNING);
+        let plan = world.pass_to(Running, Reason::Running);
         assert_eq!(plan.status.ran_seconds, RAN, "watched: {is_watched}");
-        world.pass_to(Running, reasons::RUNNING);
+        world.pass_to(Running, Reason::Running);
         let end = BACK + 86_400 - RAN;
         world.go_to(end - 1);
-        let plan = world.pass_to(Running, reasons::RUNNING);
+        let plan = world.pass_to(Running, Reason::Running);
         assert!(plan.requeue.unwrap() <= std::time::Duration::from_millis(1050));
         world.go_to(end);
-        let failure = world.pass_to(Running, reasons::STOPPING).status.failure.unwrap();
-        assert_eq!(failure.reason, reasons::TIME_LIMIT);
+        let failure = world.pass_to(Running, Reason::Stopping).status.failure.unwrap();
+        assert_eq!(failure.reason, Reason::TimeLimit);
     }
 }
 
@@ -101,14 +101,14 @@ fn the_time_without_any_pod_costs_none_either() {
     world.go_to(LOST);
     world.view.pod = None;
     world.job().failed_create = Some("pods is forbidden: exceeded quota".into());
-    world.pass_to(Running, reasons::REPLACING);
+    world.pass_to(Running, Reason::Replacing);
     world.go_to(86_500);
-    world.pass_to(Running, reasons::REPLACING);
+    world.pass_to(Running, Reason::Replacing);
     world.job().failed_create = None;
     world.view.pod = Some(next_pod(BACK - 5));
     gets_node(&mut world, BACK);
     world.go_to(BACK);
-    assert_eq!(world.pass_to(Running, reasons::RUNNING).status.ran_seconds, RAN);
+    assert_eq!(world.pass_to(Running, Reason::Running).status.ran_seconds, RAN);
 }
 
 #[test]
@@ -117,7 +117,7 @@ fn a_pod_whose_scheduling_is_dated_anew_is_no_other() {
     world.pod().created = Some(at(-5));
     world.pod().scheduled = Some(at(500));
     world.go_to(500);
-    let plan = world.pass_to(Running, reasons::RUNNING);
+    let plan = world.pass_to(Running, Reason::Running);
     assert_eq!(
         (plan.status.ran_seconds, plan.status.times.scheduled.unwrap().0),
         (0, at(0))
@@ -131,12 +131,12 @@ fn an_agent_wins_no_time_by_having_its_pod_evicted() {
         world.go_to(lost);
         world.view.pod = Some(next_pod(lost));
         gets_node(&mut world, lost);
-        world.pass_to(Running, reasons::RUNNING);
+        world.pass_to(Running, Reason::Running);
     }
     world.go_to(10 + 86_400 - 1);
-    world.pass_to(Running, reasons::RUNNING);
+    world.pass_to(Running, Reason::Running);
     world.go_to(10 + 86_400);
-    world.pass_to(Running, reasons::STOPPING);
+    world.pass_to(Running, Reason::Stopping);
 }
 
 #[test]
@@ -145,10 +145,10 @@ fn another_job_has_the_whole_time_again() {
     world.go_to(LOST);
     world.view.pod = Some(next_pod(LOST));
     gets_node(&mut world, LOST + 5);
-    world.pass_to(Running, reasons::RUNNING);
+    world.pass_to(Running, Reason::Running);
     assert_eq!(world.status().ran_seconds, RAN);
     world.complete();
-    assert_eq!(world.pass_to(Pending, reasons::REPLACING).status.ran_seconds, 0);
+    assert_eq!(world.pass_to(Pending, Reason::Replacing).status.ran_seconds, 0);
 }
 
 #[test]
@@ -159,12 +159,12 @@ fn the_preparation_of_a_pod_that_takes_anothers_place_costs_no_time() {
     world.view.pod = Some(pulling_pod(GONE));
     for second in [GONE, GONE + LIMIT, GONE + PULLS] {
         world.go_to(second);
-        let status = world.pass_to(Running, reasons::REPLACING).status;
+        let status = world.pass_to(Running, Reason::Replacing).status;
         assert_eq!((status.ran_seconds, status.times.agent_started), (GONE - 10, None));
     }
     let mut used_up = world.clone();
     used_up.leaderboard().deadlines.run_seconds = Some(GONE - 10);
-    used_up.pass_to(Running, reasons::STOPPING);
+    used_up.pass_to(Running, Reason::Stopping);
 
     gets_agents(&mut world, GONE + PULLS);
     // Its agents are started again, and nothing shows their first start any more.
@@ -179,13 +179,13 @@ fn the_preparation_of_an_earlier_pod_is_no_time_that_it_has_run() {
     for lost in [GONE, third] {
         world.go_to(lost);
         world.view.pod = Some(pulling_pod(lost));
-        world.pass_to(Running, reasons::REPLACING);
+        world.pass_to(Running, Reason::Replacing);
     }
     assert_eq!(world.status().ran_seconds, GONE - 10, "no agent of the second has run");
     gets_agents(&mut world, fourth - 200);
     world.go_to(fourth);
     world.view.pod = Some(pulling_pod(fourth));
-    world.pass_to(Running, reasons::REPLACING);
+    world.pass_to(Running, Reason::Replacing);
     assert_eq!(world.status().ran_seconds, GONE - 10 + 200);
 }
 
@@ -198,7 +198,7 @@ fn another_job_has_the_whole_time_from_its_own_first_agent() {
     world.view.pod = Some(pulling_pod(scheduled));
     for second in [scheduled, scheduled + LIMIT, scheduled + PULLS] {
         world.go_to(second);
-        world.pass_to(Pending, reasons::PREPARING);
+        world.pass_to(Pending, Reason::Preparing);
     }
     gets_agents(&mut world, scheduled + PULLS);
     has_time_until(&mut world, scheduled + PULLS + LIMIT);
@@ -222,7 +222,7 @@ fn a_run_that_an_older_operator_has_begun_keeps_its_limit() {
     let mut second = limited();
     second.go_to(GONE);
     second.view.pod = Some(pulling_pod(GONE));
-    second.pass_to(Running, reasons::REPLACING);
+    second.pass_to(Running, Reason::Replacing);
     gets_agents(&mut second, GONE + 60);
     forget(&mut second);
     has_time_until(&mut second, GONE + 60 + LIMIT - (GONE - 10));

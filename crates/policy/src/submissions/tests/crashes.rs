@@ -4,8 +4,8 @@ use super::builders::*;
 use crate::submissions::{Action, end};
 use crate::view::{JobEnd, ObservedReport};
 use leaderboard_api::FailureClass::{Infrastructure, Participant};
+use leaderboard_api::Reason;
 use leaderboard_api::State::{Failed, Finished, Pending, Running};
-use leaderboard_api::reasons;
 use leaderboard_api::{FailedNode, Failure, MAX_FAILED_NODES};
 use leaderboard_contract::run::Stop;
 
@@ -18,7 +18,7 @@ fn used_up(agent: &str, simulator: &str) -> Failure {
         }
     }
     world.go_to(221);
-    let plan = world.pass_to(Running, reasons::STOPPING);
+    let plan = world.pass_to(Running, Reason::Stopping);
     assert_eq!(annotated(&plan), Some(Stop::Retries), "{agent} {simulator}");
     assert_eq!(
         plan.status.workers[0].crashes, 4,
@@ -30,16 +30,16 @@ fn used_up(agent: &str, simulator: &str) -> Failure {
 #[test]
 fn a_pair_whose_agent_always_fails_ends_the_run_at_the_participants_cost() {
     for (agent, simulator, reason) in [
-        ("exited", "peerCrashed", reasons::AGENT_CRASHED),
-        ("silentDeath", "", reasons::AGENT_CRASHED),
-        ("incomplete", "peerCrashed", reasons::INVALID_RESULTS),
-        ("idle", "peerCrashed", reasons::IDLE),
-        ("cannotStart", "peerCrashed", reasons::CANNOT_START),
+        ("exited", "peerCrashed", Reason::AgentCrashed),
+        ("silentDeath", "", Reason::AgentCrashed),
+        ("incomplete", "peerCrashed", Reason::InvalidResults),
+        ("idle", "peerCrashed", Reason::Idle),
+        ("cannotStart", "peerCrashed", Reason::CannotStart),
         // It claims that its peer crashed, and runs on.
-        ("peerCrashed", "peerCrashed", reasons::AGENT_CRASHED),
+        ("peerCrashed", "peerCrashed", Reason::AgentCrashed),
     ] {
         let failure = used_up(agent, simulator);
-        let found = (failure.reason.as_str(), failure.class);
+        let found = (failure.reason.known().unwrap(), failure.class);
         assert_eq!(found, (reason, Participant), "{agent} {simulator}");
     }
 }
@@ -54,10 +54,10 @@ fn a_pair_whose_simulator_always_fails_ends_the_run_at_nobodys_cost() {
         ("notReady", "notReady"),
     ] {
         let failure = used_up(agent, simulator);
-        let found = (failure.reason.as_str(), failure.class);
+        let found = (failure.reason.known().unwrap(), failure.class);
         assert_eq!(
             found,
-            (reasons::SIMULATION_CRASHED, Infrastructure),
+            (Reason::SimulationCrashed, Infrastructure),
             "{agent} {simulator}"
         );
     }
@@ -67,12 +67,12 @@ fn a_pair_whose_simulator_always_fails_ends_the_run_at_nobodys_cost() {
 fn fewer_crashes_than_allowed_are_forgiven() {
     let mut world = World::local().running();
     world.see(ended("agent-1", 2, "exited", 1, 100));
-    let plan = world.pass_to(Running, reasons::RUNNING);
+    let plan = world.pass_to(Running, Reason::Running);
     assert_eq!(plan.status.workers[0].crashes, 3);
     world.report(final_report());
     world.complete();
     world.report(final_report());
-    world.pass_to(Finished, reasons::FINISHED);
+    world.pass_to(Finished, Reason::Finished);
 }
 
 #[test]
@@ -83,11 +83,11 @@ fn memory_is_the_cause_only_of_the_agents_own_end() {
         container
     };
     let cases = [
-        ("agent-1", "", reasons::OUT_OF_MEMORY),
-        ("agent-1", "silentDeath", reasons::OUT_OF_MEMORY),
-        ("agent-1", "killed", reasons::OUT_OF_MEMORY),
-        ("agent-1", "idle", reasons::IDLE),
-        ("simulator-1", "killed", reasons::SIMULATION_CRASHED),
+        ("agent-1", "", Reason::OutOfMemory),
+        ("agent-1", "silentDeath", Reason::OutOfMemory),
+        ("agent-1", "killed", Reason::OutOfMemory),
+        ("agent-1", "idle", Reason::Idle),
+        ("simulator-1", "killed", Reason::SimulationCrashed),
     ];
     for (name, what, reason) in cases {
         let mut world = World::local().running();
@@ -104,7 +104,7 @@ fn the_last_round_decides_whose_crash_it_was() {
     world.see_alone(restarted("agent-1", 2, "exited", 1, 100));
     world.see_alone(ended("simulator-1", 3, "exited", 1, 900));
     let failure = world.pass().status.failure.unwrap();
-    assert_eq!(failure.reason, reasons::SIMULATION_CRASHED);
+    assert_eq!(failure.reason, Reason::SimulationCrashed);
 }
 
 #[test]
@@ -116,10 +116,10 @@ fn a_simulators_crash_of_an_earlier_round_does_not_excuse_the_agent() {
     agent.last.as_mut().unwrap().began = Some(at(60));
     world.see_alone(agent);
     world.go_to(9001);
-    world.pass_to(Running, reasons::RUNNING);
+    world.pass_to(Running, Reason::Running);
     world.go_to(9120);
-    let failure = world.pass_to(Running, reasons::STOPPING).status.failure.unwrap();
-    assert_eq!(failure.reason, reasons::AGENT_CRASHED);
+    let failure = world.pass_to(Running, Reason::Stopping).status.failure.unwrap();
+    assert_eq!(failure.reason, Reason::AgentCrashed);
 }
 
 /// Whatever an agent leaves as its verdict, and whenever its simulator hears of it.
@@ -129,7 +129,7 @@ fn an_agent_that_blames_its_simulator_is_charged() {
         let mut world = World::local().running();
         world.see_alone(ended("agent-1", 3, word, 1, 100));
         world.go_to(101);
-        let plan = world.pass_to(Running, reasons::RUNNING);
+        let plan = world.pass_to(Running, Reason::Running);
         assert_eq!(
             (plan.status.workers[0].crashes, plan.status.failure),
             (4, None),
@@ -140,9 +140,9 @@ fn an_agent_that_blames_its_simulator_is_charged() {
         alone.go_to(220);
         world.see_alone(ended("simulator-1", 3, "peerCrashed", 1, 101));
         for mut world in [world, alone] {
-            let failure = world.pass_to(Running, reasons::STOPPING).status.failure.unwrap();
-            let found = (failure.reason.as_str(), failure.class);
-            assert_eq!(found, (reasons::AGENT_CRASHED, Participant), "{word}");
+            let failure = world.pass_to(Running, Reason::Stopping).status.failure.unwrap();
+            let found = (failure.reason.known().unwrap(), failure.class);
+            assert_eq!(found, (Reason::AgentCrashed, Participant), "{word}");
             assert!(
                 failure.message.contains("blamed its simulator, which had not failed"),
                 "{word}"
@@ -155,7 +155,7 @@ fn an_agent_that_blames_its_simulator_is_charged() {
 fn a_port_that_an_agent_has_taken_is_the_participants() {
     let mut world = World::local().running();
     world.see_alone(ended("simulator-2", 3, "portTaken", 1, 100));
-    let failure = world.pass_to(Running, reasons::STOPPING).status.failure.unwrap();
+    let failure = world.pass_to(Running, Reason::Stopping).status.failure.unwrap();
     assert_eq!((failure.class, failure.worker), (Participant, Some(2)));
     assert_eq!(
         failure.message,
@@ -172,8 +172,8 @@ fn a_simulator_that_was_killed_without_a_word_long_before_its_agent_noticed_is_t
     let mut agent = ended("agent-1", 3, "peerCrashed", 1, 400);
     agent.last.as_mut().unwrap().began = Some(at(60));
     world.see_alone(agent);
-    let failure = world.pass_to(Running, reasons::STOPPING).status.failure.unwrap();
-    assert_eq!(failure.reason, reasons::SIMULATION_CRASHED);
+    let failure = world.pass_to(Running, Reason::Stopping).status.failure.unwrap();
+    assert_eq!(failure.reason, Reason::SimulationCrashed);
 }
 
 #[test]
@@ -182,11 +182,11 @@ fn an_end_of_an_earlier_round_is_not_the_verdict_that_is_waited_for() {
     world.see_alone(restarted("agent-1", 3, "peerCrashed", 1, 100));
     world.see_alone(ended("simulator-1", 3, "peerCrashed", 1, 400));
     world.go_to(401);
-    let plan = world.pass_to(Running, reasons::RUNNING);
+    let plan = world.pass_to(Running, Reason::Running);
     assert_eq!((plan.status.workers[0].crashes, plan.status.failure), (4, None));
     world.see_alone(ended("agent-1", 3, "idle", 1, 401));
-    let failure = world.pass_to(Running, reasons::STOPPING).status.failure.unwrap();
-    assert_eq!(failure.reason, reasons::IDLE);
+    let failure = world.pass_to(Running, Reason::Stopping).status.failure.unwrap();
+    assert_eq!(failure.reason, Reason::Idle);
 }
 
 #[test]
@@ -194,8 +194,8 @@ fn a_simulator_that_is_ended_from_outside_each_time_is_the_cause() {
     let mut world = World::local().running();
     world.see_alone(ended("simulator-1", 3, "stopped", 143, 100));
     world.see_alone(ended("agent-1", 3, "peerCrashed", 1, 100));
-    let failure = world.pass_to(Running, reasons::STOPPING).status.failure.unwrap();
-    assert_eq!(failure.reason, reasons::SIMULATION_CRASHED);
+    let failure = world.pass_to(Running, Reason::Stopping).status.failure.unwrap();
+    assert_eq!(failure.reason, Reason::SimulationCrashed);
 }
 
 #[test]
@@ -203,11 +203,11 @@ fn an_agent_that_followed_its_simulator_waits_for_the_simulators_own_verdict() {
     let mut world = World::local().running();
     world.see_alone(restarted("simulator-1", 3, "peerCrashed", 1, 40));
     world.see_alone(ended("agent-1", 3, "peerCrashed", 1, 100));
-    let plan = world.pass_to(Running, reasons::RUNNING);
+    let plan = world.pass_to(Running, Reason::Running);
     assert_eq!((plan.status.workers[0].crashes, plan.status.failure), (4, None));
     world.see_alone(ended("simulator-1", 3, "exited", 1, 100));
-    let failure = world.pass_to(Running, reasons::STOPPING).status.failure.unwrap();
-    assert_eq!(failure.reason, reasons::SIMULATION_CRASHED);
+    let failure = world.pass_to(Running, Reason::Stopping).status.failure.unwrap();
+    assert_eq!(failure.reason, Reason::SimulationCrashed);
 }
 
 #[test]
@@ -216,21 +216,21 @@ fn a_count_without_a_cause_waits_for_it() {
     let mut told = report(1);
     told.workers[0].crashes = 4;
     world.report(told);
-    assert_eq!(world.pass_to(Running, reasons::RUNNING).status.failure, None);
+    assert_eq!(world.pass_to(Running, Reason::Running).status.failure, None);
     world.see(ended("agent-1", 3, "exited", 1, 100));
-    world.pass_to(Running, reasons::STOPPING);
+    world.pass_to(Running, Reason::Stopping);
 }
 
 #[test]
 fn a_crash_that_only_the_simulator_has_reported_waits_for_the_agents_own_report() {
     let mut world = World::local().running();
     world.see_alone(ended("simulator-1", 3, "peerCrashed", 1, 100));
-    let plan = world.pass_to(Running, reasons::RUNNING);
+    let plan = world.pass_to(Running, Reason::Running);
     assert_eq!((plan.status.workers[0].crashes, plan.status.failure), (4, None));
     let mut late = world.clone();
     world.see_alone(ended("agent-1", 3, "idle", 1, 100));
-    let plan = world.pass_to(Running, reasons::STOPPING);
-    assert_eq!(plan.status.failure.unwrap().reason, reasons::IDLE);
+    let plan = world.pass_to(Running, Reason::Stopping);
+    assert_eq!(plan.status.failure.unwrap().reason, Reason::Idle);
 
     // The Pod is gone with it: that it crashed is all that will ever be known.
     late.view.pod = None;
@@ -240,7 +240,7 @@ fn a_crash_that_only_the_simulator_has_reported_waits_for_the_agents_own_report(
         message: "no more".into(),
     });
     late.view.report.stored = ObservedReport::Absent;
-    let failure = late.pass_to(Failed, reasons::AGENT_CRASHED).status.failure;
+    let failure = late.pass_to(Failed, Reason::AgentCrashed).status.failure;
     assert_eq!(failure.unwrap().class, Participant);
 }
 
@@ -252,16 +252,16 @@ fn an_agent_that_claims_to_have_been_stopped_is_charged_and_ends_with_one_job() 
         world.see_alone(restarted("simulator-1", round + 1, "peerCrashed", 1, second));
         world.see_alone(restarted("agent-1", round + 1, "stopped", 143, second));
         world.go_to(second);
-        world.pass_to(Running, reasons::RUNNING);
+        world.pass_to(Running, Reason::Running);
     }
     world.see_alone(ended("simulator-1", 3, "peerCrashed", 1, 80));
     world.see_alone(ended("agent-1", 3, "stopped", 143, 80));
     world.go_to(81);
-    world.pass_to(Running, reasons::STOPPING);
+    world.pass_to(Running, Reason::Stopping);
     // The stop itself ends the simulator from outside.
     world.see_alone(ended("simulator-1", 4, "stopped", 143, 90));
     world.complete();
-    let status = world.pass_to(Failed, reasons::AGENT_CRASHED).status;
+    let status = world.pass_to(Failed, Reason::AgentCrashed).status;
     let failure = status.failure.unwrap();
     assert_eq!((failure.class, status.retry), (Participant, 0));
 }
@@ -271,11 +271,11 @@ fn an_agent_puts_its_end_off_no_longer_by_failing_again_before_its_simulators_wo
     let mut world = World::local().running();
     world.see_alone(ended("agent-1", 3, "silentDeath", 137, 100));
     world.go_to(101);
-    world.pass_to(Running, reasons::RUNNING);
+    world.pass_to(Running, Reason::Running);
     world.see_alone(ended("agent-1", 4, "silentDeath", 137, 150));
     world.go_to(151);
-    let failure = world.pass_to(Running, reasons::STOPPING).status.failure.unwrap();
-    assert_eq!(failure.reason, reasons::AGENT_CRASHED);
+    let failure = world.pass_to(Running, Reason::Stopping).status.failure.unwrap();
+    assert_eq!(failure.reason, Reason::AgentCrashed);
 }
 
 #[test]
@@ -284,7 +284,7 @@ fn ends_on_command_are_no_crashes() {
     world.report(report(1));
     for what in ["stopped", "cancelled"] {
         world.see(ended("agent-1", 0, what, 143, 100));
-        let plan = world.pass_to(Running, reasons::RUNNING);
+        let plan = world.pass_to(Running, Reason::Running);
         assert_eq!(plan.status.workers.len(), 2);
         assert!(plan.status.workers.iter().all(|p| p.crashes == 0 && p.last.is_none()));
     }
@@ -303,18 +303,18 @@ fn a_simulator_without_a_gpu_ends_its_job_at_once_and_its_node_is_remembered() {
     let mut world = World::local().with_job();
     see_without_graphics(&mut world, "noGpu");
     for jobs in [1, 2] {
-        let plan = world.pass_to(Pending, reasons::STOPPING);
+        let plan = world.pass_to(Pending, Reason::Stopping);
         assert!(has(&plan, |a| matches!(a, Action::DeleteJob { .. })));
         let failure = plan.status.failure.unwrap();
         assert_eq!(
-            (failure.reason.as_str(), failure.class),
-            (reasons::NO_GPU, Infrastructure)
+            (failure.reason.known().unwrap(), failure.class),
+            (Reason::NoGPU, Infrastructure)
         );
         let begin = "Pair 1 lacks a GPU on node node-a, although the Leaderboard gives it one: ";
         assert!(failure.message.starts_with(begin), "{}", failure.message);
         assert_eq!(failure.worker, Some(1));
         world.complete();
-        let plan = world.pass_to(Pending, reasons::REPLACING);
+        let plan = world.pass_to(Pending, Reason::Replacing);
         let node_name = "node-a".into();
         assert_eq!(plan.status.failed_nodes, [FailedNode { node_name, jobs }]);
         world.job_gone();
@@ -324,9 +324,9 @@ fn a_simulator_without_a_gpu_ends_its_job_at_once_and_its_node_is_remembered() {
         world.view.report.stored = ObservedReport::NotRead;
         see_without_graphics(&mut world, "noGpu");
     }
-    world.pass_to(Pending, reasons::STOPPING);
+    world.pass_to(Pending, Reason::Stopping);
     world.complete();
-    let failure = world.pass_to(Failed, reasons::NO_GPU).status.failure.unwrap();
+    let failure = world.pass_to(Failed, Reason::NoGPU).status.failure.unwrap();
     assert!(
         failure.class == Infrastructure && failure.message.contains("Look at the node"),
         "{}",
@@ -339,10 +339,10 @@ fn a_simulator_without_a_gpu_ends_its_job_at_once_and_its_node_is_remembered() {
 fn a_node_whose_driver_cannot_draw_is_no_reason_for_another_job() {
     let mut world = World::local().with_job();
     see_without_graphics(&mut world, "graphicsDriverMissing");
-    world.pass_to(Pending, reasons::STOPPING);
+    world.pass_to(Pending, Reason::Stopping);
     world.complete();
     let failure = world
-        .pass_to(Failed, reasons::GRAPHICS_DRIVER_MISSING)
+        .pass_to(Failed, Reason::GraphicsDriverMissing)
         .status
         .failure
         .unwrap();
@@ -377,11 +377,11 @@ fn an_agent_that_its_node_cannot_start_is_tried_again_there_and_then_by_another_
     let mut world = World::local().running();
     let why = "runc create failed: pipe2: too many open files in system: unknown";
     see_start_error(&mut world, 2, why);
-    world.pass_to(Running, reasons::NODE_CANNOT_START);
+    world.pass_to(Running, Reason::NodeCannotStart);
     see_start_error(&mut world, 3, why);
-    world.pass_to(Running, reasons::STOPPING);
+    world.pass_to(Running, Reason::Stopping);
     world.complete();
-    let plan = world.pass_to(Pending, reasons::REPLACING);
+    let plan = world.pass_to(Pending, Reason::Replacing);
     let begin = "The container of agent 1 could not be started 4 times on node node-a;";
     assert!(plan.status.message.unwrap().starts_with(begin));
     let node_name = "node-a".into();
@@ -396,9 +396,9 @@ fn an_agent_whose_image_lacks_its_program_fails_at_once() {
         0,
         "unable to start container process: exec: \"/nope\": stat /nope: no such file or directory: unknown",
     );
-    let failure = world.pass_to(Running, reasons::STOPPING).status.failure.unwrap();
+    let failure = world.pass_to(Running, Reason::Stopping).status.failure.unwrap();
     assert_eq!(
-        (failure.reason.as_str(), failure.class),
-        (reasons::CANNOT_START, Participant)
+        (failure.reason.known().unwrap(), failure.class),
+        (Reason::CannotStart, Participant)
     );
 }

@@ -5,7 +5,7 @@ use serde_json::json;
 use super::builders::*;
 use leaderboard_api::FailureClass::{Infrastructure, Participant};
 use leaderboard_api::State::{Failed, Running};
-use leaderboard_api::{FailureClass, reasons};
+use leaderboard_api::{FailureClass, Reason};
 use leaderboard_contract::report::Report;
 
 /// A run whose Pod was evicted with these words, in a Leaderboard without another Job.
@@ -49,9 +49,9 @@ fn an_eviction_for_the_agents_disk_is_the_participants_and_stops_the_job() {
     ];
     for (words, class) in cases {
         let mut world = evicted(&words);
-        world.pass_to(Running, reasons::STOPPING);
+        world.pass_to(Running, Reason::Stopping);
         world.job_gone();
-        let status = world.pass_to(Failed, reasons::DISK_FULL).status;
+        let status = world.pass_to(Failed, Reason::DiskFull).status;
         let failure = status.failure.unwrap();
         assert_eq!(failure.class, class, "{words}");
     }
@@ -71,10 +71,10 @@ fn a_full_volume_of_logs_is_the_agents_where_logcopy_has_measured_it_in_this_pod
             pod_uid: pod_uid.into(),
             ..report(1)
         });
-        let failure = world.pass_to(Running, reasons::STOPPING).status.failure.unwrap();
+        let failure = world.pass_to(Running, Reason::Stopping).status.failure.unwrap();
         assert_eq!(
-            (failure.reason.as_str(), failure.class),
-            (reasons::DISK_FULL, class),
+            (failure.reason.known().unwrap(), failure.class),
+            (Reason::DiskFull, class),
             "{pod_uid}"
         );
     }
@@ -86,7 +86,7 @@ fn a_node_that_has_too_little_for_all_its_pods_is_nobodys_failure() {
         "The node was low on resource: ephemeral-storage. Container agent-1 was using 1Gi.",
         "The node was low on resource: memory.",
     ] {
-        let plan = evicted(words).pass_to(Running, reasons::REPLACING);
+        let plan = evicted(words).pass_to(Running, Reason::Replacing);
         assert_eq!(plan.status.failure, None, "{words}");
         let message = plan.status.message.unwrap();
         assert!(

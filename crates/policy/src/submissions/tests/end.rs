@@ -6,9 +6,9 @@ use super::builders::*;
 use crate::submissions::{Action, Plan};
 use crate::view::{JobEnd, ObservedReport};
 use leaderboard_api::FailureClass::{Infrastructure, Participant};
+use leaderboard_api::Reason;
 use leaderboard_api::State::{Cancelled, Failed, Finished, Pending, Running};
 use leaderboard_api::conditions::{ARCHIVED, FINISHED, RUNNING, STALLED};
-use leaderboard_api::reasons;
 use leaderboard_api::{Attempt, Failure, JobNumber};
 use leaderboard_contract::report::Report;
 
@@ -19,7 +19,7 @@ fn complete_results_that_count_finish() {
     world.complete();
     world.report(final_report());
     world.go_to(510);
-    let plan = world.pass_to(Finished, reasons::FINISHED);
+    let plan = world.pass_to(Finished, Reason::Finished);
     assert_eq!(
         plan.status.score.as_ref().map(|score| score.text.as_str()),
         Some("43.13")
@@ -33,8 +33,8 @@ fn complete_results_that_count_finish() {
         at(500),
         "the Job's time, not ours"
     );
-    assert_eq!(condition(&plan, FINISHED), ("True".into(), reasons::FINISHED.into()));
-    assert_eq!(condition(&plan, ARCHIVED), ("True".into(), reasons::STORED.into()));
+    assert_eq!(condition(&plan, FINISHED), ("True".into(), Reason::Finished.into()));
+    assert_eq!(condition(&plan, ARCHIVED), ("True".into(), Reason::Stored.into()));
     assert_eq!(condition(&plan, RUNNING).0, "False");
 }
 
@@ -49,15 +49,15 @@ fn a_complete_run_waits_neither_for_logcopys_farewell_nor_for_its_job() {
     let mut world = World::local().running();
     run_ends(&mut world, 500);
     world.report(final_report());
-    let plan = world.pass_to(Finished, reasons::FINISHED);
+    let plan = world.pass_to(Finished, Reason::Finished);
     assert_eq!(plan.status.times.finished.clone().unwrap().0, at(500));
-    assert_eq!(condition(&plan, ARCHIVED), ("True".into(), reasons::STORED.into()));
+    assert_eq!(condition(&plan, ARCHIVED), ("True".into(), Reason::Stored.into()));
     assert!(
         !has(&plan, |a| matches!(a, Action::DeleteJob { .. })),
         "it ends by itself"
     );
     world.complete();
-    world.pass_to(Finished, reasons::FINISHED);
+    world.pass_to(Finished, Reason::Finished);
 }
 
 #[test]
@@ -65,7 +65,7 @@ fn a_farewell_that_never_ends_does_not_keep_the_job() {
     let mut world = World::local().running();
     run_ends(&mut world, 500);
     world.report(final_report());
-    world.pass_to(Finished, reasons::FINISHED);
+    world.pass_to(Finished, Reason::Finished);
     let deletes = |plan: &Plan| has(plan, |a| matches!(a, Action::DeleteJob { .. }));
     world.recorded();
     world.go_to(620);
@@ -102,12 +102,12 @@ fn every_other_end_of_a_run_waits_for_its_job() {
         let mut world = World::local().running();
         run_ends(&mut world, 500);
         world.report(told);
-        world.pass_to(Running, reasons::RUNNING);
+        world.pass_to(Running, Reason::Running);
     }
     let mut world = World::local().running();
     run_ends(&mut world, 500);
     world.view.report.stored = ObservedReport::Unreadable("away".into());
-    world.pass_to(Running, reasons::RUNNING);
+    world.pass_to(Running, Reason::Running);
 }
 
 #[test]
@@ -116,11 +116,11 @@ fn results_that_are_complete_win_over_a_cancel_that_comes_with_them() {
     world.submission().spec.cancel = true;
     run_ends(&mut world, 500);
     world.report(final_report());
-    world.pass_to(Finished, reasons::FINISHED);
+    world.pass_to(Finished, Reason::Finished);
 }
 
 /// The Job is complete with this report, and no retry is left.
-fn completes_with(report: Option<Report>, reason: &str) -> Failure {
+fn completes_with(report: Option<Report>, reason: Reason) -> Failure {
     let mut world = World::local().running();
     world.leaderboard().retries.infrastructure = 0;
     world.complete();
@@ -145,18 +145,18 @@ fn each_end_without_that_has_its_class_and_reason() {
         ..report(3)
     };
     for (report, reason) in [
-        (ineligible("Rejected"), reasons::NOT_ELIGIBLE),
-        (ineligible("Invalid"), reasons::NOT_ELIGIBLE),
-        (refused(true), reasons::INVALID_RESULTS),
+        (ineligible("Rejected"), Reason::NotEligible),
+        (ineligible("Invalid"), Reason::NotEligible),
+        (refused(true), Reason::InvalidResults),
     ] {
         let failure = completes_with(Some(report), reason);
         assert_eq!(failure.class, Participant, "{reason}");
     }
     for (report, reason) in [
-        (Some(refused(false)), reasons::RESULTS_NOT_STORED),
+        (Some(refused(false)), Reason::ResultsNotStored),
         // Routes are missing.
-        (Some(report(3)), reasons::RESULTS_NOT_STORED),
-        (None, reasons::RESULTS_NOT_STORED),
+        (Some(report(3)), Reason::ResultsNotStored),
+        (None, Reason::ResultsNotStored),
     ] {
         let failure = completes_with(report, reason);
         assert_eq!(failure.class, Infrastructure, "{reason}");
@@ -176,7 +176,7 @@ fn names_a_crash() -> Report {
 
 #[test]
 fn results_that_name_a_crash_that_no_simulator_had_are_the_participants() {
-    let failure = completes_with(Some(names_a_crash()), reasons::INVALID_RESULTS);
+    let failure = completes_with(Some(names_a_crash()), Reason::InvalidResults);
     assert_eq!((failure.class, failure.worker), (Participant, Some(2)));
     assert_eq!(
         failure.message,
@@ -199,7 +199,7 @@ fn results_that_name_a_crash_that_no_simulator_had_are_the_participants() {
         world.pass();
         world.complete();
         world.report(names_a_crash());
-        let failure = world.pass_to(Failed, reasons::INVALID_RESULTS).status.failure.unwrap();
+        let failure = world.pass_to(Failed, Reason::InvalidResults).status.failure.unwrap();
         assert_eq!(failure.class, Participant, "{failure:?}");
     }
 }
@@ -220,11 +220,7 @@ fn results_that_name_a_crash_that_the_simulator_had_are_nobodys_fault() {
         world.pass();
         world.complete();
         world.report(names_a_crash());
-        let failure = world
-            .pass_to(Failed, reasons::SIMULATION_CRASHED)
-            .status
-            .failure
-            .unwrap();
+        let failure = world.pass_to(Failed, Reason::SimulationCrashed).status.failure.unwrap();
         assert_eq!((failure.class, failure.worker), (Infrastructure, Some(2)), "{what}");
     }
 }
@@ -234,19 +230,15 @@ fn a_crash_of_an_earlier_job_whose_record_is_kept_is_nobodys_fault() {
     let mut world = World::local().running();
     world.leaderboard().retries.infrastructure = 1;
     world.see_alone(ended("simulator-2", 3, "exited", 1, 100));
-    world.pass_to(Running, reasons::STOPPING);
+    world.pass_to(Running, Reason::Stopping);
     world.gets_another_job();
     world.view.pod = Some(pod(200));
     world.see_agents();
     world.view.report.stored = ObservedReport::NotRead;
-    world.pass_to(Running, reasons::RUNNING);
+    world.pass_to(Running, Reason::Running);
     world.complete();
     world.report(names_a_crash());
-    let failure = world
-        .pass_to(Failed, reasons::SIMULATION_CRASHED)
-        .status
-        .failure
-        .unwrap();
+    let failure = world.pass_to(Failed, Reason::SimulationCrashed).status.failure.unwrap();
     assert_eq!(failure.class, Infrastructure, "{failure:?}");
 }
 
@@ -257,7 +249,7 @@ fn an_older_pod_that_names_no_pair_of_a_crash_is_believed() {
         entry_status: "Crashed".into(),
         ..final_report()
     };
-    let failure = completes_with(Some(told), reasons::SIMULATION_CRASHED);
+    let failure = completes_with(Some(told), Reason::SimulationCrashed);
     assert_eq!(failure.class, Infrastructure);
 }
 
@@ -269,18 +261,18 @@ fn an_agent_that_ends_by_itself_with_a_refused_checkpoint_gets_what_is_wrong_wit
         ..report(3)
     };
     for (word, told, reason) in [
-        ("exited", Some(refused.clone()), reasons::INVALID_RESULTS),
-        ("incomplete", Some(refused.clone()), reasons::INVALID_RESULTS),
-        ("incomplete", None, reasons::INVALID_RESULTS),
+        ("exited", Some(refused.clone()), Reason::InvalidResults),
+        ("incomplete", Some(refused.clone()), Reason::InvalidResults),
+        ("incomplete", None, Reason::InvalidResults),
         // A crash in the middle of a write leaves half a file; the crash is the cause then.
-        ("killed", Some(refused), reasons::AGENT_CRASHED),
-        ("exited", Some(report(3)), reasons::AGENT_CRASHED),
-        ("exited", None, reasons::AGENT_CRASHED),
+        ("killed", Some(refused), Reason::AgentCrashed),
+        ("exited", Some(report(3)), Reason::AgentCrashed),
+        ("exited", None, Reason::AgentCrashed),
     ] {
         let mut world = World::local().running();
         world.leaderboard().retries.per_worker = 0;
         world.see(ended("agent-1", 0, word, 1, 20));
-        world.pass_to(Running, reasons::STOPPING);
+        world.pass_to(Running, Reason::Stopping);
         world.complete();
         if let Some(told) = told {
             world.report(told);
@@ -296,7 +288,7 @@ fn a_foreign_report_counts_for_nothing() {
     world.leaderboard().retries.infrastructure = 0;
     world.complete();
     world.view.report.stored = ObservedReport::Foreign;
-    world.pass_to(Failed, reasons::RESULTS_NOT_STORED);
+    world.pass_to(Failed, Reason::ResultsNotStored);
 }
 
 #[test]
@@ -315,21 +307,21 @@ fn a_failed_job_is_blamed_on_its_worst_pair_or_on_nobody() {
     world.leaderboard().retries.infrastructure = 0;
     let mut crashed = world.clone();
     fail(&mut world, "BackoffLimitExceeded");
-    let plan = world.pass_to(Failed, reasons::JOB_FAILED);
+    let plan = world.pass_to(Failed, Reason::JobFailed);
     assert!(plan.status.message.unwrap().contains("BackoffLimitExceeded: no more."));
 
     crashed.see(ended("agent-2", 1, "idle", 1, 50));
     crashed.pass();
     let mut late = crashed.clone();
     fail(&mut crashed, "BackoffLimitExceeded");
-    crashed.pass_to(Failed, reasons::IDLE);
+    crashed.pass_to(Failed, Reason::Idle);
     let mut unlimited = late.clone();
     fail(&mut late, "DeadlineExceeded");
-    late.pass_to(Failed, reasons::TIME_LIMIT);
+    late.pass_to(Failed, Reason::TimeLimit);
     // The Pod's deadline was not ours: what its pair reported counts.
     unlimited.leaderboard().deadlines.run_seconds = None;
     fail(&mut unlimited, "DeadlineExceeded");
-    unlimited.pass_to(Failed, reasons::IDLE);
+    unlimited.pass_to(Failed, Reason::Idle);
 }
 
 #[test]
@@ -338,8 +330,8 @@ fn infrastructure_failures_are_tried_again_then_fail() {
     for (n, routes, pause) in [(1, 1, 10), (2, 2, 20)] {
         world.complete();
         world.report(report(routes));
-        let plan = world.pass_to(Pending, reasons::REPLACING);
-        assert_eq!(events(&plan), [reasons::REPLACING]);
+        let plan = world.pass_to(Pending, Reason::Replacing);
+        assert_eq!(events(&plan), [Reason::Replacing]);
         assert_eq!(evalai_updates(&plan), [], "EvalAI keeps saying running");
         assert_eq!((plan.status.retry, plan.status.attempt), (n, Some(Attempt(1))));
         assert_eq!(
@@ -369,14 +361,10 @@ fn infrastructure_failures_are_tried_again_then_fail() {
             ..pod(0)
         });
         world.see_agents();
-        world.pass_to(Running, reasons::RUNNING);
+        world.pass_to(Running, Reason::Running);
     }
     world.complete();
-    let failure = world
-        .pass_to(Failed, reasons::RESULTS_NOT_STORED)
-        .status
-        .failure
-        .unwrap();
+    let failure = world.pass_to(Failed, Reason::ResultsNotStored).status.failure.unwrap();
     assert!(failure.class == Infrastructure && failure.message.contains("resume the submission"));
 }
 
@@ -384,15 +372,15 @@ fn infrastructure_failures_are_tried_again_then_fail() {
 fn a_retry_stands_in_line_and_needs_the_leaderboard_like_anyone() {
     let mut world = World::local().running();
     world.complete();
-    world.pass_to(Pending, reasons::REPLACING);
+    world.pass_to(Pending, Reason::Replacing);
     world.job_gone();
     let leaderboard = world.view.leaderboard.take();
-    world.pass_to(Pending, reasons::LEADERBOARD_NOT_FOUND);
+    world.pass_to(Pending, Reason::LeaderboardNotFound);
     world.view.leaderboard = leaderboard;
-    world.pass_to(Pending, reasons::REPLACING);
+    world.pass_to(Pending, Reason::Replacing);
     world.wait(10);
     world.view.turn = crate::view::Turn::Wait { position: 1, eta: None };
-    world.pass_to(Pending, reasons::WAITING_FOR_SLOT);
+    world.pass_to(Pending, Reason::WaitingForSlot);
 }
 
 #[test]
@@ -405,12 +393,12 @@ fn what_is_stored_of_the_first_job_is_no_verdict_on_the_second() {
     };
     world.complete();
     world.report(crashed);
-    world.pass_to(Pending, reasons::REPLACING);
+    world.pass_to(Pending, Reason::Replacing);
     world.view.job = crate::view::ObservedJob::Absent { refused: None };
     world.view.pod = None;
     world.wait(10);
     assert!(creates(&world.pass()));
-    let plan = world.pass_to(Pending, reasons::PREPARING);
+    let plan = world.pass_to(Pending, Reason::Preparing);
     assert_eq!(plan.status.retry, 1, "the second Job is not to be seen yet");
 }
 
@@ -419,20 +407,20 @@ fn a_bucket_that_does_not_answer_is_waited_for() {
     let mut world = World::local().running();
     world.complete();
     world.view.report.stored = ObservedReport::Unreadable("request 1 timed out".into());
-    let plan = world.pass_to(Running, reasons::NOT_STORED);
+    let plan = world.pass_to(Running, Reason::NotStored);
     assert_eq!(condition(&plan, STALLED).0, "True");
     let before = world.status();
     world.view.report.stored = ObservedReport::Unreadable("request 2 timed out".into());
     assert_eq!(world.pass().status, before, "another request id is not another write");
     let mut for_good = world.clone();
     world.wait(3600);
-    world.pass_to(Running, reasons::NOT_STORED);
+    world.pass_to(Running, Reason::NotStored);
     world.report(final_report());
-    world.pass_to(Finished, reasons::FINISHED);
+    world.pass_to(Finished, Reason::Finished);
 
     for_good.leaderboard().retries.infrastructure = 0;
     for_good.wait(86_400);
-    for_good.pass_to(Failed, reasons::RESULTS_NOT_STORED);
+    for_good.pass_to(Failed, Reason::ResultsNotStored);
 }
 
 #[test]
@@ -443,11 +431,11 @@ fn the_wait_for_a_bucket_ends_though_the_clock_is_set_back() {
     world.complete();
     world.submission().spec.cancel = true;
     world.view.report.stored = ObservedReport::Unreadable("away".into());
-    world.pass_to(Running, reasons::NOT_STORED);
+    world.pass_to(Running, Reason::NotStored);
     world.go_to(100);
-    world.pass_to(Running, reasons::NOT_STORED);
+    world.pass_to(Running, Reason::NotStored);
     world.wait(120);
-    world.pass_to(Cancelled, reasons::CANCELLED);
+    world.pass_to(Cancelled, Reason::Cancelled);
 }
 
 #[test]
@@ -467,8 +455,8 @@ fn a_report_that_was_not_read_is_read_first() {
 fn complete_results_count_though_the_run_was_being_stopped() {
     let mut world = World::local().running();
     world.see(ended("agent-1", 3, "exited", 1, 100));
-    world.pass_to(Running, reasons::STOPPING);
+    world.pass_to(Running, Reason::Stopping);
     world.complete();
     world.report(final_report());
-    assert_eq!(world.pass_to(Finished, reasons::FINISHED).status.failure, None);
+    assert_eq!(world.pass_to(Finished, Reason::Finished).status.failure, None);
 }

@@ -4,15 +4,15 @@ use super::builders::*;
 use crate::submissions::failure::for_both;
 use crate::submissions::failure::{at_the_end, infrastructure, invalid_results, participant};
 use leaderboard_api::text::sentence;
-use leaderboard_api::{Failure, FailureClass, reasons};
+use leaderboard_api::{Failure, FailureClass, Reason};
 
 #[test]
 fn a_next_step_is_added_at_the_end() {
     for reason in [
-        reasons::NODE_LOST,
-        reasons::SIMULATION_CRASHED,
-        reasons::JOB_FAILED,
-        reasons::IMAGE_PULL,
+        Reason::NodeLost,
+        Reason::SimulationCrashed,
+        Reason::JobFailed,
+        Reason::ImagePull,
     ] {
         let failure = infrastructure(reason, "It broke.");
         assert_eq!(failure.message, "It broke.");
@@ -22,7 +22,7 @@ fn a_next_step_is_added_at_the_end() {
             "{reason}: {ended}"
         );
     }
-    let slow = participant(reasons::IDLE, "Slow.", &for_both("Hurry."));
+    let slow = participant(Reason::Idle, "Slow.", &for_both("Hurry."));
     assert_eq!(at_the_end(slow).message, "Slow. Hurry.");
 }
 
@@ -48,16 +48,16 @@ fn failure_of(what: &str, reason: &str) -> Failure {
 #[test]
 fn a_participant_is_sent_to_nothing_that_only_hosts_can_read() {
     let infrastructure = [
-        reasons::IMAGE_PULL,
-        reasons::CONTAINER_CONFIG,
-        reasons::NODE_LOST,
-        reasons::RESULTS_NOT_STORED,
-        reasons::SIMULATION_CRASHED,
-        reasons::START_DEADLINE,
-        reasons::SCHEDULE_DEADLINE,
-        reasons::JOB_DELETED,
-        reasons::JOB_FAILED,
-        reasons::CANNOT_START,
+        Reason::ImagePull,
+        Reason::ContainerConfig,
+        Reason::NodeLost,
+        Reason::ResultsNotStored,
+        Reason::SimulationCrashed,
+        Reason::StartDeadline,
+        Reason::ScheduleDeadline,
+        Reason::JobDeleted,
+        Reason::JobFailed,
+        Reason::CannotStart,
     ]
     .map(|reason| {
         infrastructure(

@@ -11,7 +11,7 @@ use crate::view::{EvalaiInfo, JobEnd, Standing};
 use leaderboard_api::State::{Cancelled, Pending};
 use leaderboard_api::conditions::{ACCEPTED, PUBLISHED, RECORDED, STALLED};
 use leaderboard_api::evalai_status::Status;
-use leaderboard_api::{Attempt, SubmissionStatus, names, reasons};
+use leaderboard_api::{Attempt, Reason, SubmissionStatus, names};
 
 /// The question of an attempt.
 fn question(attempt: i64) -> Row {
@@ -105,11 +105,11 @@ fn the_row_is_read_before_the_first_write_and_an_answer_within_five_seconds_cost
         (&SubmissionStatus::default(), true)
     );
     world.view.row.waited = Some(Duration::from_secs(5));
-    let plan = world.pass_to(Pending, reasons::FOREIGN);
+    let plan = world.pass_to(Pending, Reason::Foreign);
     assert_eq!(condition(&plan, ACCEPTED).0, "Unknown");
     assert!(writes_nothing(&plan));
     world.view.row = free(1);
-    assert!(creates(&world.pass_to(Pending, reasons::PREPARING)));
+    assert!(creates(&world.pass_to(Pending, Reason::Preparing)));
     // With its Job, and between two of them, nobody reads it.
     world.view.row = Lookup::default();
     assert_eq!(asked(&world.pass()), None);
@@ -133,7 +133,7 @@ fn only_evalai_hands_a_submission_to_two_programs_and_only_a_table_shows_it() {
     without_table.leaderboard().table = None;
     for mut world in [World::local(), without_table] {
         world.view.row = Lookup::default();
-        let plan = world.pass_to(Pending, reasons::PREPARING);
+        let plan = world.pass_to(Pending, Reason::Preparing);
         assert!(creates(&plan) && asked(&plan).is_none());
     }
 }
@@ -148,11 +148,11 @@ fn what_another_program_runs_waits_and_nothing_is_written_of_it() {
     moved.in_evalai().info.as_mut().unwrap().phase = Some(999);
     for mut world in [refused, moved] {
         for _ in 0..3 {
-            let plan = world.pass_to(Pending, reasons::FOREIGN);
+            let plan = world.pass_to(Pending, Reason::Foreign);
             assert!(writes_nothing(&plan) && !has(&plan, |a| *a == Action::SetFinalizer(true)));
             assert_eq!((asked(&plan), plan.slot()), (Some(&question(1)), SlotUse::Leaves));
             assert!(plan.status.plan.is_none() && plan.requeue.is_some());
-            assert_eq!(condition(&plan, ACCEPTED), ("False".into(), reasons::FOREIGN.into()));
+            assert_eq!(condition(&plan, ACCEPTED), ("False".into(), Reason::Foreign.into()));
             let message = plan.status.message.unwrap();
             for part in [
                 "RUNNING since 2026-11-20 10:00:00 UTC",
@@ -170,7 +170,7 @@ fn what_another_program_runs_waits_and_nothing_is_written_of_it() {
 fn when_the_other_run_has_ended_evalai_decides_what_follows() {
     let ended = || {
         let mut world = held();
-        world.pass_to(Pending, reasons::FOREIGN);
+        world.pass_to(Pending, Reason::Foreign);
         world.go_to(40);
         world.view.row = found(10, Ok(None));
         world.in_evalai().read_at = Some(at(29));
@@ -178,13 +178,13 @@ fn when_the_other_run_has_ended_evalai_decides_what_follows() {
     };
     // What EvalAI answered before the row was read may be older than the end: it is asked anew.
     let mut world = ended();
-    let plan = world.pass_to(Pending, reasons::FOREIGN);
+    let plan = world.pass_to(Pending, Reason::Foreign);
     assert!(writes_nothing(&plan) && has(&plan, |a| *a == Action::Ask(Question::EvalaiAnew)));
     // Resumed there: what is stored is taken up.
     let mut world = ended();
     world.in_evalai().info.as_mut().unwrap().standing = Standing::Resumed;
     world.in_evalai().read_at = Some(at(30));
-    assert!(creates(&world.pass_to(Pending, reasons::PREPARING)));
+    assert!(creates(&world.pass_to(Pending, Reason::Preparing)));
     assert!(world.status().plan.unwrap().resume);
     // Ended there: nothing is run, and the other program's row and results stay.
     let mut world = ended();
@@ -193,23 +193,23 @@ fn when_the_other_run_has_ended_evalai_decides_what_follows() {
         status: Status::Finished,
         ..info()
     });
-    let plan = world.pass_to(Cancelled, reasons::ENDED_IN_EVALAI);
+    let plan = world.pass_to(Cancelled, Reason::EndedInEvalAI);
     assert!(writes_nothing(&plan) && plan.status.plan.is_none());
     // The same while the row is not ended yet.
     let mut world = ended();
     world.view.row = runs();
     world.in_evalai().cancelled = true;
-    assert!(!creates(&world.pass_to(Cancelled, reasons::ENDED_IN_EVALAI)));
+    assert!(!creates(&world.pass_to(Cancelled, Reason::EndedInEvalAI)));
 }
 
 #[test]
 fn a_person_hands_over_what_nothing_runs_any_more_and_it_takes_up_what_is_stored() {
     let mut world = held();
-    world.pass_to(Pending, reasons::FOREIGN);
+    world.pass_to(Pending, Reason::Foreign);
     adopt(&mut world, "false");
-    world.pass_to(Pending, reasons::FOREIGN);
+    world.pass_to(Pending, Reason::Foreign);
     adopt(&mut world, "true");
-    let plan = world.pass_to(Pending, reasons::PREPARING);
+    let plan = world.pass_to(Pending, Reason::Preparing);
     assert!(creates(&plan) && asked(&plan).is_none());
     assert!(world.status().plan.unwrap().resume);
 }
@@ -220,7 +220,7 @@ fn nothing_starts_while_it_is_not_known_and_a_refusal_is_a_persons_to_fix() {
         let why = "table rows: GetItem is not allowed".to_owned();
         let mut world = World::evalai();
         world.view.row = found(0, Err(Failure { is_refused, why }));
-        let plan = world.pass_to(Pending, reasons::FOREIGN);
+        let plan = world.pass_to(Pending, Reason::Foreign);
         assert!(writes_nothing(&plan));
         assert_eq!(condition(&plan, STALLED).0, stalled);
         let message = plan.status.message.unwrap();
@@ -235,10 +235,10 @@ fn nothing_starts_while_it_is_not_known_and_a_refusal_is_a_persons_to_fix() {
 fn a_prefix_in_use_is_a_hold_and_no_end() {
     for world in [World::local(), World::evalai()] {
         let mut world = with_prefix_in_use(world.with_pod());
-        let plan = world.pass_to(Pending, reasons::FOREIGN);
+        let plan = world.pass_to(Pending, Reason::Foreign);
         assert!(writes_nothing(&plan) && has(&plan, |a| matches!(a, Action::DeleteJob { .. })));
         assert_eq!((plan.status.retry, plan.slot()), (0, SlotUse::Leaves));
-        assert_eq!(condition(&plan, ACCEPTED), ("False".into(), reasons::FOREIGN.into()));
+        assert_eq!(condition(&plan, ACCEPTED), ("False".into(), Reason::Foreign.into()));
         assert_eq!(condition(&plan, STALLED).0, "True");
         assert!(plan.status.failure.is_none() && plan.status.job_name.is_none());
         assert!(plan.status.message.unwrap().contains(names::ANNOTATION_ADOPT));
@@ -248,12 +248,12 @@ fn a_prefix_in_use_is_a_hold_and_no_end() {
         for _ in 0..3 {
             world.wait(86_400);
             let before = world.status();
-            let plan = world.pass_to(Pending, reasons::FOREIGN);
+            let plan = world.pass_to(Pending, Reason::Foreign);
             assert!(writes_nothing(&plan) && plan.slot() == SlotUse::Leaves);
             assert_eq!(plan.status, before, "nothing is new");
         }
         adopt(&mut world, "true");
-        let plan = world.pass_to(Pending, reasons::PREPARING);
+        let plan = world.pass_to(Pending, Reason::Preparing);
         assert!(creates(&plan) && plan.status.plan.unwrap().resume);
         assert_eq!(condition(&world.pass(), ACCEPTED).0, "True");
     }
@@ -269,28 +269,28 @@ fn a_job_that_has_failed_by_a_prefix_in_use_is_held_back_too_and_a_higher_retry_
     });
     world.submission().status.as_mut().unwrap().retry = 1;
     world.job().name = "sub-1-r1".into();
-    let plan = world.pass_to(Pending, reasons::FOREIGN);
+    let plan = world.pass_to(Pending, Reason::Foreign);
     assert!(has(&plan, |a| matches!(a, Action::DeleteJob { .. })));
     // It is handed over before the Job is gone, whose name the next one has.
     adopt(&mut world, "true");
-    assert!(!creates(&world.pass_to(Pending, reasons::FOREIGN)));
+    assert!(!creates(&world.pass_to(Pending, Reason::Foreign)));
     world.job_gone();
-    assert!(creates(&world.pass_to(Pending, reasons::PREPARING)));
+    assert!(creates(&world.pass_to(Pending, Reason::Preparing)));
     let status = world.status();
     assert_eq!((status.retry, status.plan.unwrap().resume), (1, true));
 }
 
 #[test]
 fn who_cancels_what_is_held_back_ends_it_and_nothing_is_written_of_it() {
-    for reason in [reasons::CANCELLED, reasons::DELETED, reasons::ENDED_IN_EVALAI] {
+    for reason in [Reason::Cancelled, Reason::Deleted, Reason::EndedInEvalAI] {
         let mut held_by_prefix = with_prefix_in_use(World::evalai().with_pod());
-        held_by_prefix.pass_to(Pending, reasons::FOREIGN);
+        held_by_prefix.pass_to(Pending, Reason::Foreign);
         held_by_prefix.job_gone();
         for mut world in [held(), held_by_prefix] {
-            world.pass_to(Pending, reasons::FOREIGN);
-            world.submission().spec.cancel = reason == reasons::CANCELLED;
-            world.in_evalai().cancelled = reason == reasons::ENDED_IN_EVALAI;
-            if reason == reasons::DELETED {
+            world.pass_to(Pending, Reason::Foreign);
+            world.submission().spec.cancel = reason == Reason::Cancelled;
+            world.in_evalai().cancelled = reason == Reason::EndedInEvalAI;
+            if reason == Reason::Deleted {
                 world.delete();
             }
             let plans = [world.pass_to(Cancelled, reason), world.pass()];
@@ -299,11 +299,7 @@ fn who_cancels_what_is_held_back_ends_it_and_nothing_is_written_of_it() {
             }
             for type_ in [PUBLISHED, RECORDED] {
                 let shown = condition(&plans[1], type_);
-                assert_eq!(
-                    shown,
-                    ("False".into(), reasons::NOT_REQUIRED.into()),
-                    "{reason} {type_}"
-                );
+                assert_eq!(shown, ("False".into(), Reason::NotRequired.into()), "{reason} {type_}");
             }
         }
     }

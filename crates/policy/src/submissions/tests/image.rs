@@ -4,7 +4,7 @@ use super::builders::*;
 use crate::submissions::{Plan, StatusWrite, pinned};
 use leaderboard_api::State::{Failed, Pending, Running};
 use leaderboard_api::conditions::ACCEPTED;
-use leaderboard_api::{Attempt, FailureClass, ImagePattern, PinnedImage, Team, reasons};
+use leaderboard_api::{Attempt, FailureClass, ImagePattern, PinnedImage, Reason, Team};
 
 const ECR: &str = "123456789012.dkr.ecr.us-east-1.amazonaws.com";
 
@@ -49,7 +49,7 @@ fn an_image_of_another_team_or_of_the_host_fails_at_once() {
         "team/agent:1".into(),
     ] {
         let mut world = evalai(&image);
-        let plan = world.pass_to(Failed, reasons::IMAGE_NOT_ALLOWED);
+        let plan = world.pass_to(Failed, Reason::ImageNotAllowed);
         assert!(!creates(&plan), "{image}");
         assert_eq!(condition(&plan, ACCEPTED).0, "False");
         let failure = plan.status.failure.unwrap();
@@ -58,7 +58,7 @@ fn an_image_of_another_team_or_of_the_host_fails_at_once() {
         assert!(!shown.contains("amazonaws") && !shown.contains("8080"), "{shown}");
     }
     let mut own = evalai(&format!("{ECR}/carla-participant-team-42:one"));
-    assert!(creates(&own.pass_to(Pending, reasons::PREPARING)));
+    assert!(creates(&own.pass_to(Pending, Reason::Preparing)));
 }
 
 #[test]
@@ -71,7 +71,7 @@ fn the_images_of_contents_and_simulator_are_nobodys_agent_whatever_the_patterns_
         let mut world = World::evalai();
         world.leaderboard().agent.images = Some(patterns);
         world.submission().spec.image = Some(image.into());
-        world.pass_to(Failed, reasons::IMAGE_NOT_ALLOWED);
+        world.pass_to(Failed, Reason::ImageNotAllowed);
     }
 }
 
@@ -79,7 +79,7 @@ fn the_images_of_contents_and_simulator_are_nobodys_agent_whatever_the_patterns_
 fn any_image_of_a_local_submission_runs_unless_patterns_are_set() {
     let mut world = World::local();
     world.leaderboard().agent.images = None;
-    assert!(creates(&world.pass_to(Pending, reasons::PREPARING)));
+    assert!(creates(&world.pass_to(Pending, Reason::Preparing)));
     let of_team = |id: Option<&str>| {
         let mut world = World::local();
         world.leaderboard().agent.images = Some(vec![ImagePattern("docker.io/team-{team}/*".into())]);
@@ -88,9 +88,9 @@ fn any_image_of_a_local_submission_runs_unless_patterns_are_set() {
         world.submission().spec.team = Some(Team { id, name: None });
         world
     };
-    assert!(creates(&of_team(Some("7")).pass_to(Pending, reasons::PREPARING)));
+    assert!(creates(&of_team(Some("7")).pass_to(Pending, Reason::Preparing)));
     for other in [Some("17"), Some("*"), None] {
-        of_team(other).pass_to(Failed, reasons::IMAGE_NOT_ALLOWED);
+        of_team(other).pass_to(Failed, Reason::ImageNotAllowed);
     }
 }
 
@@ -98,11 +98,11 @@ fn any_image_of_a_local_submission_runs_unless_patterns_are_set() {
 fn the_digest_comes_with_the_write_that_shows_the_run_and_with_none_of_its_own() {
     let image = format!("docker.io/team/agent@{}", digest('a'));
     let mut world = World::local().with_pod();
-    assert_eq!(world.pass_to(Pending, reasons::PREPARING).status.image, None);
+    assert_eq!(world.pass_to(Pending, Reason::Preparing).status.image, None);
     world.see_agents();
     runs(&mut world, "agent-1", &image);
     world.go_to(10);
-    let plan = world.pass_to(Running, reasons::RUNNING);
+    let plan = world.pass_to(Running, Reason::Running);
     assert_eq!(
         (plan.write, plan.status.image),
         (StatusWrite::Now, Some(PinnedImage { digest: digest('a') }))
@@ -134,7 +134,7 @@ fn only_a_digest_of_the_submitted_repository_is_pinned() {
         (format!("team/agent@sha512:{}", "a".repeat(128)), String::new(), None),
     ] {
         let (_, plan) = running_with([&one, &other]);
-        assert_eq!(plan.status.reason.as_deref(), Some(reasons::RUNNING));
+        assert!(plan.status.shows(Reason::Running), "{:?}", plan.status.reason);
         let found = plan.status.image.map(|image| image.digest);
         assert_eq!(found, wanted.map(digest), "{one} {other}");
     }
@@ -163,9 +163,9 @@ fn the_digest_stays_through_retries_and_attempts() {
 fn agents_of_one_pod_with_different_images_are_stopped_at_once_and_it_is_the_participants() {
     let of = |letter: char| format!("team/agent@{}", digest(letter));
     let (mut world, plan) = running_with([&of('a'), &of('b')]);
-    assert_eq!(plan.status.reason.as_deref(), Some(reasons::STOPPING));
+    assert!(plan.status.shows(Reason::Stopping), "{:?}", plan.status.reason);
     world.job_gone();
-    let failure = world.pass_to(Failed, reasons::IMAGE_CHANGED).status.failure.unwrap();
+    let failure = world.pass_to(Failed, Reason::ImageChanged).status.failure.unwrap();
     assert_eq!(failure.class, FailureClass::Participant);
     let (_, plan) = running_with([&of('a'), &format!("docker.io/other/agent@{}", digest('b'))]);
     assert_eq!(plan.status.failure, None, "another name of the content proves nothing");
@@ -177,12 +177,12 @@ fn a_new_attempt_pulls_the_tag_again_where_no_agent_has_run() {
     world.see(waiting("agent-1", "ErrImagePull", "manifest unknown"));
     world.pass();
     world.go_to(1800);
-    world.pass_to(Pending, reasons::STOPPING);
+    world.pass_to(Pending, Reason::Stopping);
     world.job_gone();
-    world.pass_to(Failed, reasons::IMAGE_NOT_FOUND);
+    world.pass_to(Failed, Reason::ImageNotFound);
     world.submission().spec.attempt = Attempt(2);
     world.pass();
-    assert!(creates(&world.pass_to(Pending, reasons::PREPARING)));
+    assert!(creates(&world.pass_to(Pending, Reason::Preparing)));
     assert_eq!(world.status().image, None);
 }
 

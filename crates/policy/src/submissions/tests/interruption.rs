@@ -4,7 +4,7 @@ use super::builders::*;
 use crate::submissions::Action;
 use crate::view::{JobEnd, ObservedNode, PodView};
 use leaderboard_api::State::{Finished, Pending, Running};
-use leaderboard_api::{Attempt, Interruptions, JobNumber, conditions, reasons};
+use leaderboard_api::{Attempt, Interruptions, JobNumber, Reason, conditions};
 use leaderboard_contract::report::Report;
 use leaderboard_contract::run::Stop;
 
@@ -31,16 +31,16 @@ fn on(world: &mut World, node: &str) {
         ..pod(world.view.now.as_second() - at(0).as_second())
     });
     world.see_agents();
-    world.pass_to(Running, reasons::RUNNING);
+    world.pass_to(Running, Reason::Running);
 }
 
 /// The Pod of an interrupted run has stored all and ended.
 fn ends(world: &mut World) -> Option<Interruptions> {
-    world.pass_to(Running, reasons::REPLACING);
+    world.pass_to(Running, Reason::Replacing);
     world.wait(20);
     world.complete();
     world
-        .pass_to(Pending, reasons::REPLACING)
+        .pass_to(Pending, Reason::Replacing)
         .status
         .interruptions
         .map(|known| *known)
@@ -49,7 +49,7 @@ fn ends(world: &mut World) -> Option<Interruptions> {
 #[test]
 fn a_node_that_is_about_to_go_is_left_with_all_that_was_reached() {
     let mut world = leaving();
-    let plan = world.pass_to(Running, reasons::REPLACING);
+    let plan = world.pass_to(Running, Reason::Replacing);
     assert_eq!(annotated(&plan), Some(Stop::Interruption));
     assert!(
         !has(&plan, |a| matches!(a, Action::DeleteJob { .. })),
@@ -62,7 +62,7 @@ fn a_node_that_is_about_to_go_is_left_with_all_that_was_reached() {
     world.pod().stop = Some(Stop::Interruption);
     world.go_to(120);
     world.complete();
-    let plan = world.pass_to(Pending, reasons::REPLACING);
+    let plan = world.pass_to(Pending, Reason::Replacing);
     assert!(
         plan.status
             .message
@@ -92,7 +92,7 @@ fn a_pod_that_does_not_end_in_time_is_ended_before_its_node_is() {
     world.pod().stop = Some(Stop::Interruption);
     for (second, grace) in [(189, None), (190, Some(5)), (209, Some(5)), (210, Some(0))] {
         world.go_to(second);
-        let plan = world.pass_to(Running, reasons::REPLACING);
+        let plan = world.pass_to(Running, Reason::Replacing);
         let deletion = plan.actions.iter().find_map(|action| match action {
             Action::DeleteJob { grace_seconds, .. } => Some(*grace_seconds),
             _ => None,
@@ -101,7 +101,7 @@ fn a_pod_that_does_not_end_in_time_is_ended_before_its_node_is() {
         assert_eq!(has(&plan, |a| *a == Action::TakeOwnership), second == 210, "{second}");
     }
     world.job_gone();
-    let status = world.pass_to(Pending, reasons::REPLACING).status;
+    let status = world.pass_to(Pending, Reason::Replacing).status;
     assert_eq!(status.interruptions.unwrap().number, 1);
 }
 
@@ -122,9 +122,9 @@ fn who_takes_a_pod_away_decides_whether_it_is_an_interruption() {
         world.view.node.state = node;
         let pod = world.pod();
         (pod.disruption, pod.deleted, pod.delete_by) = (Some(who.into()), Some(at(100)), Some(at(700)));
-        let plan = world.pass_to(Running, reasons::REPLACING);
-        let failure = plan.status.failure.as_ref().map(|failure| failure.reason.as_str());
-        assert_eq!(failure, is_one.then_some(reasons::NODE_INTERRUPTED), "{who}");
+        let plan = world.pass_to(Running, Reason::Replacing);
+        let failure = plan.status.failure.as_ref().and_then(|failure| failure.reason.known());
+        assert_eq!(failure, is_one.then_some(Reason::NodeInterrupted), "{who}");
         // The Job makes no other Pod, and the Pod has the time that there is.
         let is_ended = has(&plan, |a| matches!(a, Action::DeleteJob { grace_seconds: 90, .. }));
         assert_eq!(is_ended, is_one, "{who}");
@@ -135,7 +135,7 @@ fn who_takes_a_pod_away_decides_whether_it_is_an_interruption() {
 fn a_pod_that_has_not_begun_leaves_at_once() {
     let mut world = World::local().with_pod();
     world.view.node.leaving = Some(TAINT.into());
-    let plan = world.pass_to(Pending, reasons::REPLACING);
+    let plan = world.pass_to(Pending, Reason::Replacing);
     assert!(has(&plan, |a| matches!(a, Action::DeleteJob { grace_seconds: 5, .. })));
     assert_eq!(annotated(&plan), None);
 }
@@ -146,7 +146,7 @@ fn a_pod_that_tolerates_the_taint_is_not_moved_in_circles() {
     assert_eq!(ends(&mut world).unwrap().number, 1);
     on(&mut world, "node-a");
     world.view.node.leaving = Some(TAINT.into());
-    assert_eq!(world.pass_to(Running, reasons::RUNNING).status.failure, None);
+    assert_eq!(world.pass_to(Running, Reason::Running).status.failure, None);
     // Another node is another matter.
     world.view.node.leaving = None;
     world.pod().node = Some("node-b".into());
@@ -169,7 +169,7 @@ fn a_cluster_that_takes_every_node_away_comes_to_an_end() {
         on(&mut world, &format!("node-{number}"));
         world.view.node.leaving = Some(TAINT.into());
     }
-    let status = world.pass_to(Running, reasons::RUNNING).status;
+    let status = world.pass_to(Running, Reason::Running).status;
     assert_eq!((status.failure, status.retry), (None, 20));
 }
 
@@ -181,7 +181,7 @@ fn interruptions_use_up_no_retry_and_put_no_other_off() {
     on(&mut world, "node-b");
     world.view.report.stored = super::super::super::view::ObservedReport::Absent;
     world.complete();
-    let plan = world.pass_to(Pending, reasons::REPLACING);
+    let plan = world.pass_to(Pending, Reason::Replacing);
     assert!(
         plan.status
             .message
@@ -198,13 +198,13 @@ fn a_cancel_and_a_complete_result_come_before_an_interruption() {
     let mut world = leaving();
     world.pass();
     world.submission().spec.cancel = true;
-    world.pass_to(Running, reasons::STOPPING);
+    world.pass_to(Running, Reason::Stopping);
 
     let mut world = leaving();
     world.pass();
     world.complete();
     world.report(final_report());
-    let status = world.pass_to(Finished, reasons::FINISHED).status;
+    let status = world.pass_to(Finished, Reason::Finished).status;
     assert_eq!((status.retry, status.interruptions), (0, None));
 }
 
@@ -220,7 +220,7 @@ fn followed(mut world: World, stop: Stop) -> World {
         stopped: Some(stop),
         ..report(2)
     });
-    world.pass_to(Pending, reasons::REPLACING);
+    world.pass_to(Pending, Reason::Replacing);
     world.view.node.leaving = None;
     world.job_gone();
     // One that has failed waits before it is tried again.
@@ -245,12 +245,12 @@ fn what_a_stopped_run_has_stored_is_no_verdict_on_the_job_that_follows() {
         deleted.job_gone();
         let plan = deleted.pass();
         assert!(creates(&plan), "{stop:?}: {:?}", plan.status.failure);
-        assert!(events(&plan).contains(&reasons::JOB_RECREATED), "{stop:?}");
+        assert!(events(&plan).contains(&Reason::JobRecreated.into()), "{stop:?}");
 
         let now = ended.view.now;
         ended.job().end = Some(JobEnd::Complete { at: Some(now) });
         let plan = ended.pass();
         let running = conditions::get(&plan.status.conditions, conditions::RUNNING).unwrap();
-        assert_eq!(running.reason, reasons::RESULTS_NOT_STORED, "{stop:?}");
+        assert_eq!(running.reason, Reason::ResultsNotStored, "{stop:?}");
     }
 }

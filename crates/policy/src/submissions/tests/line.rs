@@ -5,14 +5,14 @@ use crate::slots::turns::{InLine, Turn};
 use crate::submissions::{Action, EvalaiUpdate, SlotUse};
 use crate::view::ObservedJob;
 use leaderboard_api::State::{Cancelled, Pending};
-use leaderboard_api::{Eta, SubmissionStatus, Waiting, reasons};
+use leaderboard_api::{Eta, Reason, SubmissionStatus, Waiting};
 
 #[test]
 fn who_waits_sees_place_and_time() {
     let mut world = World::local();
     let eta = Some(Eta::between(20 * 60, 35 * 60));
     world.view.turn = Turn::Wait { position: 3, eta };
-    let plan = world.pass_to(Pending, reasons::WAITING_FOR_SLOT);
+    let plan = world.pass_to(Pending, Reason::WaitingForSlot);
     assert_eq!(plan.status.waiting.as_deref(), Some(&Waiting::new(3, eta)));
     assert!(!creates(&plan));
 
@@ -30,8 +30,8 @@ fn who_waits_sees_place_and_time() {
     assert!(plan.events.is_empty(), "a step forward is no transition");
 
     world.view.turn = Turn::Paused { position: 2 };
-    let plan = world.pass_to(Pending, reasons::PAUSED);
-    assert_eq!(events(&plan), [reasons::PAUSED]);
+    let plan = world.pass_to(Pending, Reason::Paused);
+    assert_eq!(events(&plan), [Reason::Paused]);
     let place = Waiting::new(2, None);
     assert_eq!(
         plan.status.waiting.as_deref(),
@@ -40,7 +40,7 @@ fn who_waits_sees_place_and_time() {
     );
 
     world.view.turn = Turn::Go;
-    let plan = world.pass_to(Pending, reasons::PREPARING);
+    let plan = world.pass_to(Pending, Reason::Preparing);
     assert!(creates(&plan));
     assert_eq!(plan.status.waiting, None);
 }
@@ -70,7 +70,7 @@ fn joining_the_line_shows_nothing_and_starts_nothing() {
         assert_eq!(plan.actions, [Action::JoinLine(place.clone())]);
 
         world.view.turn = Turn::Wait { position: 1, eta: None };
-        let plan = world.pass_to(Pending, reasons::WAITING_FOR_SLOT);
+        let plan = world.pass_to(Pending, Reason::WaitingForSlot);
         assert!(
             plan.actions.contains(&Action::JoinLine(place.clone())),
             "it stays in line"
@@ -88,7 +88,7 @@ fn joining_the_line_shows_nothing_and_starts_nothing() {
         world.view.turn = Turn::NotInLine;
         assert_eq!(world.pass().status, before);
         world.view.turn = Turn::Go;
-        assert!(creates(&world.pass_to(Pending, reasons::PREPARING)));
+        assert!(creates(&world.pass_to(Pending, Reason::Preparing)));
     }
 }
 
@@ -110,7 +110,7 @@ fn a_slot_is_held_from_the_job_to_the_end_and_by_nobody_who_waits_for_something_
     world.submission().spec.cancel = true;
     assert_eq!(world.pass().slot(), SlotUse::Holds, "its Pod stops");
     world.job_gone();
-    world.pass_to(Cancelled, reasons::CANCELLED);
+    world.pass_to(Cancelled, Reason::Cancelled);
     assert_eq!(world.pass().slot(), SlotUse::Leaves, "it has ended");
 }
 
@@ -137,7 +137,7 @@ fn who_waits_is_queued_in_evalai_so_that_a_cancel_there_is_heard() {
         world.view.turn = turn;
         assert_eq!(evalai_updates(&world.pass()), [EvalaiUpdate::Queued]);
         world.in_evalai().cancelled = true;
-        world.pass_to(Cancelled, reasons::ENDED_IN_EVALAI);
+        world.pass_to(Cancelled, Reason::EndedInEvalAI);
     }
 }
 
@@ -159,16 +159,16 @@ fn images_follow_the_leaderboard_until_the_job_is_made_and_the_rest_is_pinned() 
 fn a_job_of_an_older_object_is_waited_for_and_never_taken() {
     let mut world = World::local();
     world.view.job = ObservedJob::Foreign;
-    let plan = world.pass_to(Pending, reasons::JOB_NAME_TAKEN);
+    let plan = world.pass_to(Pending, Reason::JobNameTaken);
     assert!(!creates(&plan));
     world.view.job = ObservedJob::Absent { refused: None };
-    assert!(creates(&world.pass_to(Pending, reasons::PREPARING)));
+    assert!(creates(&world.pass_to(Pending, Reason::Preparing)));
 
     // Also when it was only seen after ours had been asked for: it is no deletion of ours then.
     world.view.job = ObservedJob::Foreign;
-    world.pass_to(Pending, reasons::JOB_NAME_TAKEN);
+    world.pass_to(Pending, Reason::JobNameTaken);
     world.view.job = ObservedJob::Absent { refused: None };
-    let plan = world.pass_to(Pending, reasons::PREPARING);
+    let plan = world.pass_to(Pending, Reason::Preparing);
     assert!(creates(&plan));
     assert_eq!(plan.status.recreated, 0);
 }
@@ -181,7 +181,7 @@ fn a_cancel_ends_the_wait_at_once() {
         world.view.turn = turn;
         world.pass();
         world.submission().spec.cancel = true;
-        let plan = world.pass_to(Cancelled, reasons::CANCELLED);
+        let plan = world.pass_to(Cancelled, Reason::Cancelled);
         assert_eq!(plan.status.waiting, None);
         assert!(!creates(&plan));
     }
@@ -189,14 +189,14 @@ fn a_cancel_ends_the_wait_at_once() {
     world.view.job = ObservedJob::Foreign;
     world.pass();
     world.submission().spec.cancel = true;
-    world.pass_to(Cancelled, reasons::CANCELLED);
+    world.pass_to(Cancelled, Reason::Cancelled);
 }
 
 #[test]
 fn a_job_that_is_slow_to_show_is_asked_for_again_without_counting() {
     let mut world = World::local();
     for _ in 0..10 {
-        let plan = world.pass_to(Pending, reasons::PREPARING);
+        let plan = world.pass_to(Pending, Reason::Preparing);
         assert!(creates(&plan));
         assert_eq!(plan.status.recreated, 0);
     }

@@ -3,8 +3,8 @@
 use super::builders::*;
 use crate::submissions::{Action, EvalaiUpdate, Plan};
 use crate::view::{JobEnd, LogAt, LogPlace, ObservedReport};
+use leaderboard_api::Reason;
 use leaderboard_api::State::{Cancelled, Failed, Pending, Running};
-use leaderboard_api::reasons;
 use leaderboard_contract::report::Report;
 
 /// The places of a request, in short: `node agent-1`, `last simulator-1` for the run before, `s3 agent/agent1/leaderboard.log`.
@@ -41,13 +41,13 @@ fn end_without_pod(world: &mut World) -> Plan {
 #[test]
 fn an_agents_failure_is_explained_by_its_own_log_from_s3() {
     for (word, reason) in [
-        ("exited", reasons::AGENT_CRASHED),
-        ("idle", reasons::IDLE),
-        ("cannotStart", reasons::CANNOT_START),
+        ("exited", Reason::AgentCrashed),
+        ("idle", Reason::Idle),
+        ("cannotStart", Reason::CannotStart),
     ] {
         let mut world = World::local().running();
         world.see(ended("agent-2", 3, word, 1, 100));
-        let plan = world.pass_to(Running, reasons::STOPPING);
+        let plan = world.pass_to(Running, Reason::Stopping);
         assert_eq!(plan.status.failure.as_ref().unwrap().worker, Some(2));
         assert_eq!(places(&plan), Vec::<String>::new(), "logcopy stores it yet");
         let mut with_pod = world.clone();
@@ -68,7 +68,7 @@ fn a_failure_of_the_whole_run_is_explained_by_a_pair_that_was_not_done() {
     world.report(report(2));
     world.pass();
     world.go_to(90_000);
-    world.pass_to(Running, reasons::STOPPING);
+    world.pass_to(Running, Reason::Stopping);
     world.view.report.stored = ObservedReport::Absent;
     assert_eq!(
         places(&end_without_pod(&mut world)),
@@ -84,7 +84,7 @@ fn a_failure_of_the_whole_run_is_explained_by_a_pair_that_was_not_done() {
     let mut world = World::local().running();
     world.complete();
     world.report(refused.clone());
-    let plan = world.pass_to(Failed, reasons::INVALID_RESULTS);
+    let plan = world.pass_to(Failed, Reason::InvalidResults);
     assert_eq!(plan.status.failure.as_ref().unwrap().worker, Some(2));
     assert_eq!(places(&plan)[0], "s3 agent/agent2/leaderboard.log", "the refused one");
     for why in [
@@ -107,7 +107,7 @@ fn a_failure_of_the_whole_run_is_explained_by_a_pair_that_was_not_done() {
     let mut world = World::local().running();
     world.complete();
     world.report(ineligible);
-    let plan = world.pass_to(Failed, reasons::NOT_ELIGIBLE);
+    let plan = world.pass_to(Failed, Reason::NotEligible);
     assert_eq!(places(&plan)[0], "s3 agent/agent1/leaderboard.log", "all were done");
 }
 
@@ -115,7 +115,7 @@ fn a_failure_of_the_whole_run_is_explained_by_a_pair_that_was_not_done() {
 fn a_simulators_log_is_kept_while_its_pod_lives() {
     let mut world = World::local().running();
     world.see(ended("simulator-1", 3, "exited", 1, 100));
-    let plan = world.pass_to(Running, reasons::STOPPING);
+    let plan = world.pass_to(Running, Reason::Stopping);
     assert_eq!(places(&plan), ["node simulator-1"]);
     let mut again = ended("simulator-1", 4, "exited", 1, 100);
     again.running = true;
@@ -136,7 +136,7 @@ fn a_preparation_that_fails_is_explained_by_its_container_before_the_job_is_dele
         world.see(ended(name, 5, "", 3, 1700));
         world.pass();
         world.go_to(1800);
-        let plan = world.pass_to(Pending, reasons::STOPPING);
+        let plan = world.pass_to(Pending, Reason::Stopping);
         assert_eq!(places(&plan), [format!("node {name}")]);
         let kinds = plan.actions.iter().map(|a| matches!(a, Action::DeleteJob { .. }));
         assert_eq!(kinds.collect::<Vec<_>>(), [false, true], "the log first");
@@ -154,7 +154,7 @@ fn results_that_were_not_stored_are_reported_by_logcopy() {
     world.leaderboard().retries.infrastructure = 0;
     world.complete();
     let mut failed = world.clone();
-    let plan = world.pass_to(Failed, reasons::RESULTS_NOT_STORED);
+    let plan = world.pass_to(Failed, Reason::ResultsNotStored);
     assert_eq!(places(&plan), ["node logcopy", "s3 logcopy/logcopy.log"]);
 
     failed.job().end = Some(JobEnd::Failed {
@@ -164,7 +164,7 @@ fn results_that_were_not_stored_are_reported_by_logcopy() {
     });
     failed.view.pod = None;
     assert_eq!(
-        places(&failed.pass_to(Failed, reasons::JOB_FAILED)),
+        places(&failed.pass_to(Failed, Reason::JobFailed)),
         ["s3 logcopy/logcopy.log"]
     );
 }
@@ -172,14 +172,14 @@ fn results_that_were_not_stored_are_reported_by_logcopy() {
 #[test]
 fn what_never_ran_has_no_log() {
     for (word, reason) in [
-        ("ImagePullBackOff", reasons::IMAGE_PULL),
-        ("CreateContainerConfigError", reasons::CONTAINER_CONFIG),
+        ("ImagePullBackOff", Reason::ImagePull),
+        ("CreateContainerConfigError", Reason::ContainerConfig),
     ] {
         let mut world = World::local().with_pod();
         world.see(waiting("agent-1", word, "it is missing"));
         world.pass();
         world.go_to(1800);
-        let plan = world.pass_to(Pending, reasons::STOPPING);
+        let plan = world.pass_to(Pending, Reason::Stopping);
         assert_eq!(plan.status.failure.as_ref().unwrap().reason, reason);
         assert_eq!(places(&plan), Vec::<String>::new());
         assert_eq!(places(&end_without_pod(&mut world)), Vec::<String>::new());
@@ -192,7 +192,7 @@ fn a_log_is_requested_until_evalai_has_the_end_and_not_after() {
     world.see(ended("agent-1", 3, "exited", 1, 100));
     world.pass();
     world.complete();
-    let plan = world.pass_to(Failed, reasons::AGENT_CRASHED);
+    let plan = world.pass_to(Failed, Reason::AgentCrashed);
     assert_eq!(
         (places(&plan).len(), evalai_updates(&plan)),
         (2, vec![]),
@@ -213,7 +213,7 @@ fn a_log_is_requested_until_evalai_has_the_end_and_not_after() {
     world.see(ended("agent-1", 3, "exited", 1, 100));
     world.pass();
     world.complete();
-    assert_eq!(places(&world.pass_to(Failed, reasons::AGENT_CRASHED)).len(), 2);
+    assert_eq!(places(&world.pass_to(Failed, Reason::AgentCrashed)).len(), 2);
     assert_eq!(places(&world.pass()), Vec::<String>::new(), "nobody waits for it");
 }
 
@@ -225,7 +225,7 @@ fn a_cancelled_or_finished_run_has_no_failure_to_explain() {
     assert_eq!(places(&world.pass()), Vec::<String>::new());
     world.complete();
     assert_eq!(
-        places(&world.pass_to(Cancelled, reasons::CANCELLED)),
+        places(&world.pass_to(Cancelled, Reason::Cancelled)),
         Vec::<String>::new()
     );
 

@@ -6,7 +6,7 @@ use crate::submissions::{Action, EvalaiUpdate, Question};
 use leaderboard_api::State::{Failed, Finished, Pending};
 use leaderboard_api::conditions::PUBLISHED;
 use leaderboard_api::evalai_status::Status;
-use leaderboard_api::{EvalaiMode, reasons};
+use leaderboard_api::{EvalaiMode, Reason};
 
 /// A submission of a Leaderboard that only observes.
 fn observed() -> World {
@@ -53,7 +53,7 @@ fn no_end_is_sent_to_evalai() {
         }
         assert_eq!(
             condition(&plan, PUBLISHED),
-            ("False".into(), reasons::NOT_REQUIRED.into())
+            ("False".into(), Reason::NotRequired.into())
         );
         assert!(has(&plan, |a| *a == Action::Forget), "nothing more is asked");
     }
@@ -63,6 +63,6 @@ fn no_end_is_sent_to_evalai() {
 fn nobody_looks_whether_another_program_runs_what_is_only_observed() {
     let mut world = observed();
     world.view.row = Lookup::default();
-    let plan = world.pass_to(Pending, reasons::PREPARING);
+    let plan = world.pass_to(Pending, Reason::Preparing);
     assert!(creates(&plan) && !has(&plan, |a| matches!(a, Action::Ask(Question::Row(_)))));
 }

@@ -6,29 +6,29 @@ use crate::submissions::failure::for_both;
 use crate::submissions::failure::{infrastructure, participant};
 use leaderboard_api::FailureClass::Infrastructure;
 use leaderboard_api::State::{Failed, Pending, Running};
-use leaderboard_api::{Attempt, FailedNode, Failure, reasons};
+use leaderboard_api::{Attempt, FailedNode, Failure, Reason};
 
 /// Its simulator fails as often as it may with this many routes stored, and its Job ends.
 fn simulator_fails(world: &mut World, routes: u32) {
     world.see_alone(ended("simulator-1", 3, "exited", 1, 100));
-    world.pass_to(Running, reasons::STOPPING);
+    world.pass_to(Running, Reason::Stopping);
     world.complete();
     world.report(report(routes));
 }
 
 /// It is tried again, and the next Job runs.
 fn runs_again(world: &mut World) {
-    world.pass_to(Pending, reasons::REPLACING);
+    world.pass_to(Pending, Reason::Replacing);
     world.job_gone();
     world.go_to(world.view.now.as_second() - at(0).as_second() + 60);
-    world.pass_to(Pending, reasons::PREPARING);
+    world.pass_to(Pending, Reason::Preparing);
     world.see_job();
     world.view.pod = Some(pod(0));
     world.see_agents();
-    world.pass_to(Running, reasons::RUNNING);
+    world.pass_to(Running, Reason::Running);
 }
 
-fn of_pair(reason: &str) -> Failure {
+fn of_pair(reason: Reason) -> Failure {
     Failure {
         worker: Some(1),
         ..infrastructure(reason, "It failed.")
@@ -45,43 +45,35 @@ fn the_first_is_tried_again_and_a_further_one_only_after_a_route() {
         ("with less than before", Some(3), 2, false),
         ("a last route after many", Some(3), 4, true),
     ] {
-        let found = of_pair(reasons::SIMULATION_CRASHED);
+        let found = of_pair(Reason::SimulationCrashed);
         assert_eq!(may_go_on(&found, before, stored), goes_on, "{what}");
     }
 }
 
 #[test]
 fn only_what_an_agent_can_provoke_has_to_be_earned() {
-    let of_hosts = |reason: &str| infrastructure(reason, "It failed.");
-    let agents = participant(reasons::CANNOT_START, "It failed.", &for_both("Fix it."));
+    let of_hosts = |reason: Reason| infrastructure(reason, "It failed.");
+    let agents = participant(Reason::CannotStart, "It failed.", &for_both("Fix it."));
     for (what, found, goes_on) in [
         (
             "results that are kept from S3",
-            of_hosts(reasons::RESULTS_NOT_STORED),
+            of_hosts(Reason::ResultsNotStored),
             false,
         ),
-        ("a Job that nothing explains", of_hosts(reasons::JOB_FAILED), false),
-        (
-            "a simulator that does not start",
-            of_hosts(reasons::CANNOT_START),
-            false,
-        ),
+        ("a Job that nothing explains", of_hosts(Reason::JobFailed), false),
+        ("a simulator that does not start", of_hosts(Reason::CannotStart), false),
         (
             "a node that starts nothing more",
-            of_pair(reasons::NODE_CANNOT_START),
+            of_pair(Reason::NodeCannotStart),
             false,
         ),
-        ("a node that falls silent", of_hosts(reasons::NODE_LOST), false),
-        ("a disk that is full", of_hosts(reasons::DISK_FULL), false),
-        (
-            "an agent's image that is not pulled",
-            of_pair(reasons::IMAGE_PULL),
-            false,
-        ),
-        ("a host's image that is not pulled", of_hosts(reasons::IMAGE_PULL), true),
-        ("a node without a GPU", of_pair(reasons::NO_GPU), true),
-        ("a node that is taken away", of_hosts(reasons::NODE_INTERRUPTED), true),
-        ("a start that takes too long", of_hosts(reasons::START_DEADLINE), true),
+        ("a node that falls silent", of_hosts(Reason::NodeLost), false),
+        ("a disk that is full", of_hosts(Reason::DiskFull), false),
+        ("an agent's image that is not pulled", of_pair(Reason::ImagePull), false),
+        ("a host's image that is not pulled", of_hosts(Reason::ImagePull), true),
+        ("a node without a GPU", of_pair(Reason::NoGPU), true),
+        ("a node that is taken away", of_hosts(Reason::NodeInterrupted), true),
+        ("a start that takes too long", of_hosts(Reason::StartDeadline), true),
         ("the agent's own", agents, true),
     ] {
         assert_eq!(may_go_on(&found, Some(0), 0), goes_on, "{what}");
@@ -109,7 +101,7 @@ fn an_agent_that_crashes_its_simulator_gets_a_second_job_and_a_third_only_if_it_
     assert_eq!((world.status().retry, world.status().done_before), (2, Some(2)));
 
     simulator_fails(&mut world, 2);
-    let status = world.pass_to(Failed, reasons::SIMULATION_CRASHED).status;
+    let status = world.pass_to(Failed, Reason::SimulationCrashed).status;
     let failure = status.failure.unwrap();
     assert_eq!((failure.class, status.retry), (Infrastructure, 2));
     assert_eq!(
@@ -120,7 +112,7 @@ fn an_agent_that_crashes_its_simulator_gets_a_second_job_and_a_third_only_if_it_
     assert!(!failure.participant_message.unwrap().contains("such an end"));
 
     world.submission().spec.attempt = Attempt(2);
-    let status = world.pass_to(Pending, reasons::PREPARING).status;
+    let status = world.pass_to(Pending, Reason::Preparing).status;
     assert_eq!(status.done_before, None, "another attempt begins anew");
 }
 
@@ -131,7 +123,7 @@ fn results_that_an_agent_keeps_from_being_stored_get_one_more_job() {
     world.complete();
     runs_again(&mut world);
     world.complete();
-    let status = world.pass_to(Failed, reasons::RESULTS_NOT_STORED).status;
+    let status = world.pass_to(Failed, Reason::ResultsNotStored).status;
     assert_eq!((status.failure.unwrap().class, status.retry), (Infrastructure, 1));
 }
 
@@ -142,14 +134,14 @@ fn an_interruption_between_two_failures_counts_the_routes_of_its_own_job_alone()
     simulator_fails(&mut world, 1);
     runs_again(&mut world);
     world.view.node.leaving = Some("karpenter.sh/disrupted".into());
-    world.pass_to(Running, reasons::REPLACING);
+    world.pass_to(Running, Reason::Replacing);
     world.complete();
     world.report(report(2));
     world.view.node.leaving = None;
     runs_again(&mut world);
     assert_eq!(world.status().done_before, Some(2));
     simulator_fails(&mut world, 2);
-    world.pass_to(Failed, reasons::SIMULATION_CRASHED);
+    world.pass_to(Failed, Reason::SimulationCrashed);
 }
 
 #[test]
@@ -159,6 +151,6 @@ fn no_more_jobs_follow_than_the_leaderboard_allows() {
     simulator_fails(&mut world, 1);
     runs_again(&mut world);
     simulator_fails(&mut world, 2);
-    let failure = world.pass_to(Failed, reasons::SIMULATION_CRASHED).status.failure;
+    let failure = world.pass_to(Failed, Reason::SimulationCrashed).status.failure;
     assert!(!failure.unwrap().message.contains("such an end"));
 }

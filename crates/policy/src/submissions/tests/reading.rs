@@ -8,9 +8,9 @@ use jiff::{SignedDuration, Timestamp};
 use super::builders::*;
 use crate::submissions::{Action, EvalaiUpdate, Plan, TableUpdate, patience};
 use crate::view::{ObservedFence, ObservedLog, ObservedNode, ObservedReport, Stage};
+use leaderboard_api::Reason;
 use leaderboard_api::State::{Cancelled, Failed, Finished, Pending, Running};
 use leaderboard_api::conditions::{self, PUBLISHED, RECORDED};
-use leaderboard_api::reasons;
 use leaderboard_contract::report::Patience;
 
 const SECOND: Duration = Duration::from_secs(1);
@@ -51,7 +51,7 @@ fn each_moment_of_a_life_needs_its_own_report() {
     assert_eq!(demanded(&world.pass()), Some((Stage::JobEnded, None)));
     world.view.report.stage = Some(Stage::JobEnded);
     world.report(final_report());
-    let end = world.pass_to(Finished, reasons::FINISHED);
+    let end = world.pass_to(Finished, Reason::Finished);
     assert_eq!(demanded(&end), Some((Stage::JobEnded, None)), "it is to be published");
     world.published();
     assert_eq!(demanded(&world.pass()), Some((Stage::JobEnded, None)), "and recorded");
@@ -81,13 +81,13 @@ fn an_end_is_decided_only_on_a_report_that_was_asked_for_after_it() {
             world.view.report.stored = early;
             world.view.report.stage = stage;
             world.view.report.waited = 2 * SECOND;
-            let plan = world.pass_to(Running, reasons::RUNNING);
+            let plan = world.pass_to(Running, Reason::Running);
             assert_eq!(plan.requeue, Some(13 * SECOND), "the answer wakes it before");
             world.view.report.waited = 15 * SECOND;
-            world.pass_to(Running, reasons::NOT_STORED);
+            world.pass_to(Running, Reason::NotStored);
             world.view.report.stage = Some(Stage::JobEnded);
             world.report(final_report());
-            world.pass_to(Finished, reasons::FINISHED);
+            world.pass_to(Finished, Reason::Finished);
         }
     }
 }
@@ -120,7 +120,7 @@ fn a_job_that_is_gone_is_made_again_only_when_it_is_known_what_its_run_has_store
     let mut complete = world.clone();
     assert!(creates(&world.pass()));
     complete.report(final_report());
-    complete.pass_to(Finished, reasons::FINISHED);
+    complete.pass_to(Finished, Reason::Finished);
     silent.view.report.waited = 15 * SECOND;
     assert!(creates(&silent.pass()), "a bucket that is away does not keep it");
 }
@@ -149,7 +149,7 @@ fn a_lost_pod_is_given_up_with_the_fence_held_or_a_minute_after_it_was_requested
     ] {
         let mut world = lost();
         world.view.fence = fence;
-        let plan = world.pass_to(Running, reasons::REPLACING);
+        let plan = world.pass_to(Running, Reason::Replacing);
         assert!(has(&plan, |a| *a == Action::TakeOwnership), "{fence:?}");
         assert_eq!(deletes(&plan), expected.is_ok(), "{fence:?}");
         if let Err(left) = expected {
@@ -196,7 +196,7 @@ fn a_job_is_deleted_after_a_failure_when_its_log_is_kept_or_was_waited_for() {
         world.pass();
         world.go_to(1800);
         world.view.log = log;
-        let plan = world.pass_to(Pending, reasons::STOPPING);
+        let plan = world.pass_to(Pending, Reason::Stopping);
         assert!(has(&plan, |a| matches!(a, Action::KeepLog { .. })));
         assert_eq!(deletes(&plan), expected.is_ok(), "{log:?}");
         if let Err(left) = expected {
@@ -216,7 +216,7 @@ fn evalai_has_a_failure_with_its_log_or_after_that_was_waited_for() {
     world.see(ended("agent-1", 3, "exited", 1, 100));
     world.pass();
     world.complete();
-    let plan = world.pass_to(Failed, reasons::AGENT_CRASHED);
+    let plan = world.pass_to(Failed, Reason::AgentCrashed);
     assert_eq!(
         (evalai_updates(&plan), plan.requeue),
         (vec![], Some(15 * SECOND)),
@@ -242,7 +242,7 @@ fn nothing_is_forgotten_before_the_log_is_stored() {
     world.recorded();
     world.view.log = ObservedLog::NotRequested;
     let forgets = |plan: &Plan| has(plan, |a| *a == Action::Forget);
-    let plan = world.pass_to(Failed, reasons::AGENT_CRASHED);
+    let plan = world.pass_to(Failed, Reason::AgentCrashed);
     assert!(has(&plan, |a| matches!(a, Action::KeepLog { .. })) && !forgets(&plan));
     world.view.log = ObservedLog::Pending(SECOND);
     assert!(!forgets(&world.pass()));
@@ -255,7 +255,7 @@ fn finished() -> World {
     let mut world = World::evalai().running();
     world.complete();
     world.report(final_report());
-    world.pass_to(Finished, reasons::FINISHED);
+    world.pass_to(Finished, Reason::Finished);
     world
 }
 
@@ -307,7 +307,7 @@ fn what_is_finished_is_nothing_without_its_numbers_and_everything_else_goes_with
     world.submission().spec.cancel = true;
     world.pass();
     world.complete();
-    world.pass_to(Cancelled, reasons::CANCELLED);
+    world.pass_to(Cancelled, Reason::Cancelled);
     world.view.report.stored = unreadable;
     assert_eq!(evalai_updates(&world.pass()), []);
     world.wait(86_400);
@@ -320,7 +320,7 @@ fn the_end_of_a_deleted_one_does_not_wait_until_the_finalizer_gives_up() {
     world.delete();
     world.pass();
     world.complete();
-    world.pass_to(Cancelled, reasons::DELETED);
+    world.pass_to(Cancelled, Reason::Deleted);
     world.view.report.stored = ObservedReport::Unreadable("torn".into());
     world.wait(900 - 121);
     assert_eq!(evalai_updates(&world.pass()), []);
@@ -334,7 +334,7 @@ fn the_row_of_a_finished_submission_waits_for_its_report_but_not_permanently() {
     let mut world = World::local().running();
     world.complete();
     world.report(final_report());
-    assert!(records(&world.pass_to(Finished, reasons::FINISHED)));
+    assert!(records(&world.pass_to(Finished, Reason::Finished)));
     world.view.report.stored = ObservedReport::Unreadable("torn".into());
     let plan = world.pass();
     assert!(!records(&plan) && waits_with(&plan, RECORDED).contains("torn"));
@@ -348,7 +348,7 @@ fn the_row_of_a_finished_submission_waits_for_its_report_but_not_permanently() {
     world.submission().spec.cancel = true;
     world.pass();
     world.complete();
-    world.pass_to(Cancelled, reasons::CANCELLED);
+    world.pass_to(Cancelled, Reason::Cancelled);
     world.view.report.stage = None;
     assert!(records(&world.pass()), "a row without metrics waits for no report");
 }
@@ -359,7 +359,7 @@ fn an_end_that_never_had_a_plan_waits_for_nothing() {
     world.in_evalai().info = None;
     world.view.report.stage = None;
     world.submission().spec.cancel = true;
-    let plan = world.pass_to(Cancelled, reasons::CANCELLED);
+    let plan = world.pass_to(Cancelled, Reason::Cancelled);
     assert_eq!(
         (evalai_updates(&plan), demanded(&plan)),
         (vec![EvalaiUpdate::Cancelled], None)

@@ -3,17 +3,17 @@
 use super::builders::*;
 use crate::submissions::{Action, EvalaiUpdate, Plan, TableUpdate};
 use crate::view::{EvalaiEnd, EvalaiView, RecordView};
+use leaderboard_api::Reason;
 use leaderboard_api::State::{Cancelled, Finished};
 use leaderboard_api::conditions::{self, RECORDED};
 use leaderboard_api::evalai_status::Status;
-use leaderboard_api::reasons;
 
 /// A run of EvalAI's that has finished, and of which no system has the end.
 pub(super) fn finished() -> World {
     let mut world = World::evalai().running();
     world.complete();
     world.report(final_report());
-    world.pass_to(Finished, reasons::FINISHED);
+    world.pass_to(Finished, Reason::Finished);
     world
 }
 
@@ -45,11 +45,11 @@ fn an_end_that_the_table_does_not_take_is_settled_and_not_written_again() {
     world.published();
     assert!(records(&world.pass()));
     supersede(&mut world);
-    let plan = world.pass_to(Finished, reasons::FINISHED);
+    let plan = world.pass_to(Finished, Reason::Finished);
     let shown = conditions::get(&plan.status.conditions, RECORDED).unwrap();
     assert_eq!(
-        (shown.status.as_str(), shown.reason.as_str()),
-        ("False", reasons::NOT_REQUIRED)
+        (shown.status.as_str(), shown.reason.known().unwrap()),
+        ("False", Reason::NotRequired)
     );
     for part in ["of attempt 3", "Raise spec.attempt to 4", "Correct the row by hand"] {
         assert!(shown.message.contains(part), "{}", shown.message);
@@ -72,15 +72,15 @@ fn a_cancel_in_evalai_after_a_refusal_is_written_over_the_end_that_the_table_kep
         assert!(records(&world.pass()));
         supersede(&mut world);
         let plan = world.pass();
-        assert_eq!(condition(&plan, RECORDED).1, reasons::NOT_REQUIRED);
+        assert_eq!(condition(&plan, RECORDED).1, Reason::NotRequired);
         assert!(!records(&plan) && !has(&plan, |a| *a == Action::Forget));
         if is_restarted {
             world.view.record = Some(RecordView::default());
         }
         world.in_evalai().end = Some(EvalaiEnd::Ended(Status::Cancelled));
-        let plan = world.pass_to(Cancelled, reasons::ENDED_IN_EVALAI);
+        let plan = world.pass_to(Cancelled, Reason::EndedInEvalAI);
         assert!(records(&plan));
-        assert_eq!(condition(&plan, RECORDED), ("False".into(), reasons::WAITING.into()));
+        assert_eq!(condition(&plan, RECORDED), ("False".into(), Reason::Waiting.into()));
         // The recorder has the new row.
         world.view.record = Some(RecordView::default());
         assert!(records(&world.pass()));
@@ -123,19 +123,15 @@ fn a_cancel_before_evalais_row_is_known_keeps_what_had_finished_there() {
         } else {
             world.submission().spec.cancel = true;
         }
-        let reason = if is_deleted {
-            reasons::DELETED
-        } else {
-            reasons::CANCELLED
-        };
+        let reason = if is_deleted { Reason::Deleted } else { Reason::Cancelled };
         let plan = world.pass_to(Cancelled, reason);
         let asked = has(&plan, |a| *a == Action::UpdateEvalai(EvalaiUpdate::Cancelled));
         assert!(asked, "the row is read before anything is written");
         world.in_evalai().end = Some(EvalaiEnd::Ended(Status::Finished));
-        let plan = world.pass_to(Cancelled, reasons::ENDED_IN_EVALAI);
+        let plan = world.pass_to(Cancelled, Reason::EndedInEvalAI);
         assert!(!has(&plan, |a| matches!(a, Action::UpdateEvalai(_))));
         let published = condition(&plan, conditions::PUBLISHED);
-        assert_eq!(published, ("False".into(), reasons::NOT_REQUIRED.into()));
+        assert_eq!(published, ("False".into(), Reason::NotRequired.into()));
         assert_eq!(has(&plan, |a| *a == Action::SetFinalizer(false)), is_deleted);
         assert_eq!(world.pass().status, plan.status, "once");
     }

@@ -5,7 +5,7 @@ use crate::submissions::{Action, EvalaiUpdate};
 use crate::view::{JobEnd, ObservedNode, ObservedReport, Standing, Turn};
 use leaderboard_api::State::{Cancelled, Finished, Pending, Resumed, Running};
 use leaderboard_api::conditions::{FINISHED, PUBLISHED, RECORDED};
-use leaderboard_api::{Attempt, JobNumber, reasons};
+use leaderboard_api::{Attempt, JobNumber, Reason};
 use leaderboard_contract::report::Report;
 use leaderboard_contract::run::Stop;
 
@@ -21,7 +21,7 @@ fn restarted() -> World {
 /// The second attempt has begun, and no system has heard of an end.
 #[track_caller]
 fn assert_begins(world: &mut World) {
-    let plan = world.pass_to(Pending, reasons::REPLACING);
+    let plan = world.pass_to(Pending, Reason::Replacing);
     assert_eq!((plan.status.attempt, plan.status.retry), (Some(Attempt(2)), 0));
     assert_eq!((&plan.status.failure, &plan.status.interruptions), (&None, &None));
     assert_eq!(
@@ -41,7 +41,7 @@ fn assert_begins(world: &mut World) {
 fn a_run_stops_with_all_that_was_reached_and_waits_for_its_turn_in_the_higher_attempt() {
     let mut world = restarted();
     world.report(report(2));
-    let plan = world.pass_to(Running, reasons::REPLACING);
+    let plan = world.pass_to(Running, Reason::Replacing);
     assert_eq!(annotated(&plan), Some(Stop::Interruption));
     assert!(
         !has(&plan, |a| matches!(a, Action::DeleteJob { .. })),
@@ -61,7 +61,7 @@ fn a_run_stops_with_all_that_was_reached_and_waits_for_its_turn_in_the_higher_at
     world.job_gone();
     world.view.report.stored = ObservedReport::NotRead;
     world.view.turn = Turn::Paused { position: 1 };
-    let plan = world.pass_to(Pending, reasons::PAUSED);
+    let plan = world.pass_to(Pending, Reason::Paused);
     assert!(!creates(&plan), "a host who upgrades nodes pauses the Leaderboard");
     assert_eq!(evalai_updates(&plan), [EvalaiUpdate::Queued]);
     world.view.turn = Turn::Go;
@@ -71,7 +71,7 @@ fn a_run_stops_with_all_that_was_reached_and_waits_for_its_turn_in_the_higher_at
     world.see_job();
     world.view.pod = Some(pod(200));
     world.see_agents();
-    world.pass_to(Resumed, reasons::RESUMED);
+    world.pass_to(Resumed, Reason::Resumed);
 }
 
 #[test]
@@ -82,7 +82,7 @@ fn a_pod_that_does_not_stop_has_the_time_of_a_cancel() {
     let seconds = world.leaderboard().deadlines.cancel_seconds;
     for (second, is_deleted) in [(100 + seconds, false), (100 + seconds + 15, true)] {
         world.go_to(second);
-        let plan = world.pass_to(Running, reasons::REPLACING);
+        let plan = world.pass_to(Running, Reason::Replacing);
         assert_eq!(
             has(&plan, |a| matches!(a, Action::DeleteJob { .. })),
             is_deleted,
@@ -101,11 +101,11 @@ fn what_else_ends_a_run_meanwhile_is_forgiven() {
     // The failure was there before the request.
     let mut crashed = World::evalai().running();
     crashed.see(ended("agent-1", 3, "exited", 1, 100));
-    crashed.pass_to(Running, reasons::STOPPING);
+    crashed.pass_to(Running, Reason::Stopping);
     crashed.submission().spec.attempt = Attempt(2);
     let mut cancelled = World::evalai().running();
     cancelled.submission().spec.cancel = true;
-    cancelled.pass_to(Running, reasons::STOPPING);
+    cancelled.pass_to(Running, Reason::Stopping);
     cancelled.submission().spec.cancel = false;
     cancelled.submission().spec.attempt = Attempt(2);
     for mut world in [crashes, crashed, cancelled] {
@@ -135,10 +135,10 @@ fn a_run_that_comes_to_its_results_is_finished_for_good() {
     world.pass();
     world.complete();
     world.report(final_report());
-    let plan = world.pass_to(Finished, reasons::FINISHED);
+    let plan = world.pass_to(Finished, Reason::Finished);
     assert_eq!((plan.status.attempt, plan.status.retry), (Some(Attempt(1)), 0));
     assert_eq!(evalai_updates(&world.pass()), [EvalaiUpdate::Finished]);
-    world.pass_to(Finished, reasons::FINISHED);
+    world.pass_to(Finished, Reason::Finished);
 
     // It had ended by itself, and only its Job is still there.
     let mut world = restarted();
@@ -147,7 +147,7 @@ fn a_run_that_comes_to_its_results_is_finished_for_good() {
     assert_eq!(annotated(&world.pass()), None);
     world.view.report.stage = Some(crate::view::Stage::RunEnded);
     world.report(final_report());
-    world.pass_to(Finished, reasons::FINISHED);
+    world.pass_to(Finished, Reason::Finished);
 }
 
 #[test]
@@ -169,15 +169,15 @@ fn a_run_that_fails_by_itself_goes_on_in_the_higher_attempt() {
 #[test]
 fn a_cancel_meanwhile_is_that_of_the_higher_attempt() {
     let asked: [(fn(&mut World), _); 3] = [
-        (|world| world.submission().spec.cancel = true, reasons::CANCELLED),
-        (World::delete, reasons::DELETED),
-        (|world| world.in_evalai().cancelled = true, reasons::ENDED_IN_EVALAI),
+        (|world| world.submission().spec.cancel = true, Reason::Cancelled),
+        (World::delete, Reason::Deleted),
+        (|world| world.in_evalai().cancelled = true, Reason::EndedInEvalAI),
     ];
     for (ask, reason) in asked {
         let mut world = restarted();
         world.pass();
         ask(&mut world);
-        world.pass_to(Running, reasons::STOPPING);
+        world.pass_to(Running, Reason::Stopping);
         world.complete();
         assert_begins(&mut world);
         world.job_gone();
@@ -197,14 +197,14 @@ fn a_cancel_meanwhile_is_that_of_the_higher_attempt() {
 fn what_has_no_job_begins_at_once() {
     let mut waits = World::local();
     waits.view.turn = Turn::Paused { position: 1 };
-    waits.pass_to(Pending, reasons::PAUSED);
+    waits.pass_to(Pending, Reason::Paused);
     // It would be tried again in some seconds.
     let mut tried = World::local().running();
     tried.leaderboard().retries.infrastructure = 1;
     tried.complete();
     assert!(
         tried
-            .pass_to(Pending, reasons::REPLACING)
+            .pass_to(Pending, Reason::Replacing)
             .status
             .next_retry_time
             .is_some()
@@ -213,7 +213,7 @@ fn what_has_no_job_begins_at_once() {
     assert!(!creates(&tried.pass()));
     for mut world in [waits, tried] {
         world.submission().spec.attempt = Attempt(2);
-        let plan = world.pass_to(Pending, reasons::PREPARING);
+        let plan = world.pass_to(Pending, Reason::Preparing);
         assert_eq!((plan.status.attempt, plan.status.retry), (Some(Attempt(2)), 0));
         assert!(!plan.status.is_restart(), "nothing ran that goes on");
         world.view.turn = Turn::Go;
@@ -230,6 +230,6 @@ fn what_evalai_has_ended_before_the_higher_attempt_is_known_stays_ended() {
     assert_begins(&mut world);
     world.job_gone();
     world.in_evalai().info.as_mut().unwrap().standing = Standing::Ended;
-    let plan = world.pass_to(Cancelled, reasons::ENDED_IN_EVALAI);
+    let plan = world.pass_to(Cancelled, Reason::EndedInEvalAI);
     assert!(!creates(&plan) && evalai_updates(&plan).is_empty());
 }

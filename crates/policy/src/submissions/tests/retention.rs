@@ -8,7 +8,7 @@ use crate::submissions::{Action, Plan};
 use crate::view::EvalaiEnd;
 use leaderboard_api::State::{Failed, Finished};
 use leaderboard_api::conditions::{FINISHED, PUBLISHED, RECORDED};
-use leaderboard_api::{Attempt, reasons};
+use leaderboard_api::{Attempt, Reason};
 
 /// What a host keeps, in seconds.
 const KEPT: i64 = 3600;
@@ -20,7 +20,7 @@ fn ended_well() -> World {
     world.submission().metadata.resource_version = Some("7".into());
     world.complete();
     world.report(final_report());
-    world.pass_to(Finished, reasons::FINISHED);
+    world.pass_to(Finished, Reason::Finished);
     let end = world.view.now;
     world.job().end = Some(crate::view::JobEnd::Complete { at: Some(end) });
     world
@@ -87,7 +87,7 @@ fn nothing_else_is_ever_deleted() {
         ("another attempt is requested", |w| {
             let conditions = &mut w.submission().status.as_mut().unwrap().conditions;
             let end = conditions.iter_mut().find(|c| c.type_ == FINISHED).unwrap();
-            end.reason = reasons::CANCELLED.into();
+            end.reason = Reason::Cancelled.into();
             w.submission().spec.attempt = Attempt(2);
         }),
     ];
@@ -137,7 +137,7 @@ fn a_failed_one_goes_with_its_end_published_and_its_log_kept() {
     world.see(ended("agent-1", 3, "exited", 1, 100));
     world.pass();
     world.complete();
-    world.pass_to(Failed, reasons::AGENT_CRASHED);
+    world.pass_to(Failed, Reason::AgentCrashed);
     world.wait(KEPT);
     assert!(!deletes(&world.pass()), "EvalAI has no end yet");
     world.published();

@@ -8,7 +8,7 @@ use crate::view::ContainerView;
 use leaderboard_api::FailureClass::{self, Infrastructure, Participant};
 use leaderboard_api::State::{Failed, Pending, Running};
 use leaderboard_api::conditions::{RUNNING, STALLED};
-use leaderboard_api::{FailedNode, reasons};
+use leaderboard_api::{FailedNode, Reason};
 use leaderboard_contract::run::Stop;
 
 const NOT_FOUND: &str = "rpc error: code = NotFound desc = failed to pull and unpack image \"r/x:1\": failed to resolve reference \
@@ -24,7 +24,7 @@ fn back_off() -> String {
 #[test]
 fn a_healthy_start_costs_one_write_and_no_event_until_its_agents_run() {
     let mut world = World::evalai().with_pod();
-    let plan = world.pass_to(Pending, reasons::PREPARING);
+    let plan = world.pass_to(Pending, Reason::Preparing);
     assert!(plan.events.is_empty());
     assert_eq!(plan.status.node_name.as_deref(), Some("node-a"));
     assert_eq!(evalai_updates(&plan), [EvalaiUpdate::Queued]);
@@ -36,7 +36,7 @@ fn a_healthy_start_costs_one_write_and_no_event_until_its_agents_run() {
     }
     world.go_to(50);
     world.see_agents();
-    let plan = world.pass_to(Running, reasons::RUNNING);
+    let plan = world.pass_to(Running, Reason::Running);
     assert!(events(&plan).is_empty(), "the status shows it");
     assert_eq!(condition(&plan, RUNNING).0, "True");
     assert_eq!(evalai_updates(&plan), [EvalaiUpdate::Running]);
@@ -47,7 +47,7 @@ fn a_silent_node_is_reported_in_steps() {
     let mut world = World::local().with_pod();
     let said = |world: &mut World, second| {
         world.go_to(second);
-        world.pass_to(Pending, reasons::PREPARING).status.message.unwrap()
+        world.pass_to(Pending, Reason::Preparing).status.message.unwrap()
     };
     assert!(said(&mut world, 61).contains("on node-a: the operator's image is pulled and the workspace is filled."));
     assert!(said(&mut world, 130).contains("for over 2 min."));
@@ -58,7 +58,7 @@ fn a_silent_node_is_reported_in_steps() {
 
 /// A container that keeps its Pod from starting is shown at once, and fails it after `startSeconds`.
 #[track_caller]
-fn is_shown_then_fails(container: ContainerView, reason: &str, class: FailureClass, fails_as: &str) {
+fn is_shown_then_fails(container: ContainerView, reason: Reason, class: FailureClass, fails_as: Reason) {
     let mut world = World::local().with_pod();
     world.leaderboard().retries.infrastructure = 0;
     world.see(container);
@@ -69,7 +69,7 @@ fn is_shown_then_fails(container: ContainerView, reason: &str, class: FailureCla
     world.go_to(1799);
     world.pass_to(Pending, reason);
     world.go_to(1800);
-    let plan = world.pass_to(Pending, reasons::STOPPING);
+    let plan = world.pass_to(Pending, Reason::Stopping);
     assert!(has(&plan, |a| matches!(a, Action::DeleteJob { .. })));
     world.job_gone();
     let plan = world.pass_to(Failed, fails_as);
@@ -80,39 +80,34 @@ fn is_shown_then_fails(container: ContainerView, reason: &str, class: FailureCla
 fn an_image_that_cannot_be_pulled_is_its_owners_failure_only_where_its_registry_has_none_that_fits() {
     let status = |status: &str| format!("failed with status code [manifests 1]: {status}");
     let cases = [
-        ("agent-1", NOT_FOUND.to_owned(), Participant, reasons::IMAGE_NOT_FOUND),
-        ("agent-1", back_off(), Participant, reasons::IMAGE_NOT_FOUND),
+        ("agent-1", NOT_FOUND.to_owned(), Participant, Reason::ImageNotFound),
+        ("agent-1", back_off(), Participant, Reason::ImageNotFound),
         (
             "agent-1",
             "no match for platform in manifest: not found".into(),
             Participant,
-            reasons::IMAGE_PLATFORM,
+            Reason::ImagePlatform,
         ),
         (
             "agent-1",
             "unsupported media type application/x".into(),
             Participant,
-            reasons::IMAGE_INVALID,
+            Reason::ImageInvalid,
         ),
-        (
-            "agent-1",
-            status("401 Unauthorized"),
-            Infrastructure,
-            reasons::IMAGE_PULL,
-        ),
+        ("agent-1", status("401 Unauthorized"), Infrastructure, Reason::ImagePull),
         (
             "agent-1",
             "dial tcp 10.0.0.1:443: connect: connection refused".into(),
             Infrastructure,
-            reasons::IMAGE_PULL,
+            Reason::ImagePull,
         ),
-        ("agent-1", "unheard of".into(), Infrastructure, reasons::IMAGE_PULL),
-        ("simulator-1", NOT_FOUND.to_owned(), Infrastructure, reasons::IMAGE_PULL),
-        ("contents", NOT_FOUND.to_owned(), Infrastructure, reasons::IMAGE_PULL),
+        ("agent-1", "unheard of".into(), Infrastructure, Reason::ImagePull),
+        ("simulator-1", NOT_FOUND.to_owned(), Infrastructure, Reason::ImagePull),
+        ("contents", NOT_FOUND.to_owned(), Infrastructure, Reason::ImagePull),
     ];
     for (name, words, class, fails_as) in cases {
         let container = waiting(name, "ImagePullBackOff", &words);
-        is_shown_then_fails(container, reasons::IMAGE_PULL, class, fails_as);
+        is_shown_then_fails(container, Reason::ImagePull, class, fails_as);
     }
 }
 
@@ -124,56 +119,56 @@ fn a_container_that_cannot_be_set_up_or_started_shows_why_and_only_a_proof_charg
             "agent-1",
             config,
             "secret \"s\" not found",
-            reasons::CONTAINER_CONFIG,
+            Reason::ContainerConfig,
             Infrastructure,
         ),
         (
             "agent-1",
             "CreateContainerError",
             "no users found",
-            reasons::CANNOT_START,
+            Reason::CannotStart,
             Participant,
         ),
         (
             "agent-1",
             "RunContainerError",
             NO_PROGRAM,
-            reasons::CANNOT_START,
+            Reason::CannotStart,
             Participant,
         ),
         (
             "agent-1",
             "CreateContainerError",
             CDI,
-            reasons::NODE_CANNOT_START,
+            Reason::NodeCannotStart,
             Infrastructure,
         ),
         (
             "agent-1",
             "RunContainerError",
             "unheard of",
-            reasons::NODE_CANNOT_START,
+            Reason::NodeCannotStart,
             Infrastructure,
         ),
         (
             "simulator-1",
             "RunContainerError",
             NO_PROGRAM,
-            reasons::CANNOT_START,
+            Reason::CannotStart,
             Infrastructure,
         ),
         (
             "simulator-1",
             "CreateContainerError",
             CDI,
-            reasons::NODE_CANNOT_START,
+            Reason::NodeCannotStart,
             Infrastructure,
         ),
         (
             "simulator-1",
             config,
             "container has runAsNonRoot and image will run as root",
-            reasons::CONTAINER_CONFIG,
+            Reason::ContainerConfig,
             Infrastructure,
         ),
     ];
@@ -190,10 +185,10 @@ fn an_image_whose_user_the_pod_forbids_is_refused_at_once_at_the_participants_co
     ] {
         let mut world = World::local().with_pod();
         world.see(waiting("agent-1", "CreateContainerConfigError", words));
-        let plan = world.pass_to(Pending, reasons::STOPPING);
+        let plan = world.pass_to(Pending, Reason::Stopping);
         assert!(has(&plan, |a| matches!(a, Action::DeleteJob { .. })));
         world.job_gone();
-        let status = world.pass_to(Failed, reasons::IMAGE_INVALID).status;
+        let status = world.pass_to(Failed, Reason::ImageInvalid).status;
         let failure = status.failure.unwrap();
         assert_eq!((failure.class, failure.worker, status.retry), (Participant, Some(1), 0));
         assert!(failure.message.contains(words), "{}", failure.message);
@@ -212,16 +207,12 @@ fn the_hosts_containers_are_looked_at_before_the_agents() {
     // As the kubelet sorts them.
     world.see_alone(waiting("agent-1", "CreateContainerError", "no users found"));
     world.see_alone(waiting("simulator-1", "CreateContainerError", CDI));
-    let plan = world.pass_to(Pending, reasons::NODE_CANNOT_START);
+    let plan = world.pass_to(Pending, Reason::NodeCannotStart);
     assert!(plan.status.message.unwrap().contains("simulator-1"));
     world.go_to(1800);
-    world.pass_to(Pending, reasons::STOPPING);
+    world.pass_to(Pending, Reason::Stopping);
     world.job_gone();
-    let failure = world
-        .pass_to(Failed, reasons::NODE_CANNOT_START)
-        .status
-        .failure
-        .unwrap();
+    let failure = world.pass_to(Failed, Reason::NodeCannotStart).status.failure.unwrap();
     assert_eq!((failure.class, failure.worker), (Infrastructure, None));
 }
 
@@ -229,11 +220,11 @@ fn the_hosts_containers_are_looked_at_before_the_agents() {
 fn a_node_that_cannot_start_a_container_is_named_and_remembered() {
     let mut world = World::local().with_pod();
     world.see(waiting("agent-2", "CreateContainerError", CDI));
-    world.pass_to(Pending, reasons::NODE_CANNOT_START);
+    world.pass_to(Pending, Reason::NodeCannotStart);
     world.go_to(1800);
-    world.pass_to(Pending, reasons::STOPPING);
+    world.pass_to(Pending, Reason::Stopping);
     world.job_gone();
-    let plan = world.pass_to(Pending, reasons::REPLACING);
+    let plan = world.pass_to(Pending, Reason::Replacing);
     let message = plan.status.message.unwrap();
     assert!(message.contains("It was tried for 1800 s on node node-a."), "{message}");
     let node_name = "node-a".into();
@@ -244,7 +235,7 @@ fn a_node_that_cannot_start_a_container_is_named_and_remembered() {
 fn a_failing_preparation_is_the_hosts() {
     for name in ["contents", "workspace", "logcopy"] {
         let container = ended(name, 1, "Storage", 3, 5);
-        is_shown_then_fails(container, reasons::PREPARING, Infrastructure, reasons::START_DEADLINE);
+        is_shown_then_fails(container, Reason::Preparing, Infrastructure, Reason::StartDeadline);
     }
 }
 
@@ -253,7 +244,7 @@ fn pulling_and_backing_off_are_one_message() {
     let mut world = World::local().with_pod();
     world.see(waiting("agent-1", "ErrImagePull", NOT_FOUND));
     let first = world.pass();
-    assert_eq!(events(&first), [reasons::IMAGE_PULL]);
+    assert_eq!(events(&first), [Reason::ImagePull]);
     world.see(waiting("agent-1", "ImagePullBackOff", &back_off()));
     let second = world.pass();
     assert_eq!(second.status, first.status);
@@ -268,10 +259,10 @@ fn a_cause_that_is_fixed_is_forgotten() {
         "CreateContainerConfigError",
         "secret \"s\" not found",
     ));
-    world.pass_to(Pending, reasons::CONTAINER_CONFIG);
+    world.pass_to(Pending, Reason::ContainerConfig);
     world.see(running("agent-1"));
     assert_eq!(
-        condition(&world.pass_to(Pending, reasons::PREPARING), STALLED).0,
+        condition(&world.pass_to(Pending, Reason::Preparing), STALLED).0,
         "False"
     );
 }
@@ -299,7 +290,7 @@ fn the_start_has_no_deadline_before_the_scheduler_has_spoken() {
     world.leaderboard().deadlines.start_seconds = 1;
     (world.pod().scheduled, world.pod().node) = (None, None);
     world.go_to(600);
-    let plan = world.pass_to(Pending, reasons::PREPARING);
+    let plan = world.pass_to(Pending, Reason::Preparing);
     assert!(
         plan.requeue.is_none_or(|pause| pause > Duration::ZERO),
         "{:?}",
@@ -309,7 +300,7 @@ fn the_start_has_no_deadline_before_the_scheduler_has_spoken() {
     world.go_to(602);
     world.leaderboard().retries.infrastructure = 0;
     world.pass();
-    assert_eq!(world.status().failure.unwrap().reason, reasons::START_DEADLINE);
+    assert_eq!(world.status().failure.unwrap().reason, Reason::StartDeadline);
 }
 
 #[test]
@@ -317,9 +308,9 @@ fn a_silent_kubelet_fails_as_infrastructure_after_start_seconds() {
     let mut world = World::local().with_pod();
     world.leaderboard().retries.infrastructure = 0;
     world.go_to(1800);
-    world.pass_to(Pending, reasons::STOPPING);
+    world.pass_to(Pending, Reason::Stopping);
     world.job_gone();
-    let failure = world.pass_to(Failed, reasons::START_DEADLINE).status.failure.unwrap();
+    let failure = world.pass_to(Failed, Reason::StartDeadline).status.failure.unwrap();
     assert_eq!(failure.class, Infrastructure);
     assert!(failure.message.contains("node-a reports no reason"));
 }
@@ -337,18 +328,18 @@ fn slow_pulls_use_up_their_own_deadline_and_not_that_of_the_start() {
     // Two containers of 50 s have run meanwhile.
     for second in [1801, 5400, 5499] {
         world.go_to(second);
-        world.pass_to(Pending, reasons::PREPARING);
+        world.pass_to(Pending, Reason::Preparing);
     }
     world.leaderboard().tracks[0].deadlines = Some(leaderboard_api::TrackDeadlines {
         pull_seconds: Some(6000),
         ..Default::default()
     });
     world.go_to(5500);
-    world.pass_to(Pending, reasons::PREPARING);
+    world.pass_to(Pending, Reason::Preparing);
     world.leaderboard().tracks[0].deadlines = None;
-    world.pass_to(Pending, reasons::STOPPING);
+    world.pass_to(Pending, Reason::Stopping);
     world.job_gone();
-    let failure = world.pass_to(Failed, reasons::START_DEADLINE).status.failure.unwrap();
+    let failure = world.pass_to(Failed, Reason::StartDeadline).status.failure.unwrap();
     assert_eq!(failure.class, Infrastructure);
     let expected = "The images of the Pod were not pulled within 5400 s on node-a; these containers wait: simulator-1, simulator-2, \
                     agent-1, agent-2.";
@@ -361,14 +352,14 @@ fn a_pull_that_fails_late_is_shown_at_once_and_has_the_time_of_a_start() {
     world.leaderboard().retries.infrastructure = 0;
     world.see(waiting("contents", "PodInitializing", ""));
     world.go_to(4000);
-    world.pass_to(Pending, reasons::PREPARING);
+    world.pass_to(Pending, Reason::Preparing);
     world.see(waiting("contents", "ErrImagePull", "unexpected EOF"));
-    let plan = world.pass_to(Pending, reasons::IMAGE_PULL);
-    assert_eq!(events(&plan), [reasons::IMAGE_PULL]);
+    let plan = world.pass_to(Pending, Reason::ImagePull);
+    assert_eq!(events(&plan), [Reason::ImagePull]);
     world.go_to(5799);
-    world.pass_to(Pending, reasons::IMAGE_PULL);
+    world.pass_to(Pending, Reason::ImagePull);
     world.go_to(5800);
-    world.pass_to(Pending, reasons::STOPPING);
+    world.pass_to(Pending, Reason::Stopping);
 }
 
 #[test]
@@ -379,11 +370,11 @@ fn an_agent_that_waits_for_a_simulator_without_image_is_no_run() {
         world.see(waiting(name, "ErrImagePull", NOT_FOUND));
     }
     world.go_to(10);
-    let plan = world.pass_to(Pending, reasons::IMAGE_PULL);
+    let plan = world.pass_to(Pending, Reason::ImagePull);
     assert!(plan.status.message.as_ref().unwrap().contains("simulator-1"));
     assert_eq!(evalai_updates(&plan), [], "it has begun, and does not run");
     world.go_to(10 + 1800);
-    let plan = world.pass_to(Pending, reasons::STOPPING);
+    let plan = world.pass_to(Pending, Reason::Stopping);
     let stop = Stop::Retries;
     assert!(has(&plan, |a| *a
         == Action::StopPod {
@@ -400,7 +391,7 @@ fn a_pull_that_fails_in_mid_run_is_shown_and_does_not_end_it() {
     let mut agent = ended("agent-1", 1, "exited", 1, 39_000);
     agent.waiting = Some(("ErrImagePull".into(), "connection refused".into()));
     world.see(agent);
-    let plan = world.pass_to(Running, reasons::IMAGE_PULL);
+    let plan = world.pass_to(Running, Reason::ImagePull);
     assert_eq!(plan.status.failure, None);
 }
 
@@ -411,14 +402,14 @@ fn a_node_that_does_not_start_an_agent_again_in_mid_run_has_the_time_of_a_start(
     let mut agent = ended("agent-1", 1, "exited", 1, 39_000);
     agent.waiting = Some(("CreateContainerError".into(), CDI.into()));
     world.see(agent);
-    world.pass_to(Running, reasons::NODE_CANNOT_START);
+    world.pass_to(Running, Reason::NodeCannotStart);
     world.go_to(41_799);
-    world.pass_to(Running, reasons::NODE_CANNOT_START);
+    world.pass_to(Running, Reason::NodeCannotStart);
     world.go_to(41_800);
-    let failure = world.pass_to(Running, reasons::STOPPING).status.failure.unwrap();
+    let failure = world.pass_to(Running, Reason::Stopping).status.failure.unwrap();
     assert_eq!(
-        (failure.reason.as_str(), failure.class),
-        (reasons::NODE_CANNOT_START, Infrastructure)
+        (failure.reason.known().unwrap(), failure.class),
+        (Reason::NodeCannotStart, Infrastructure)
     );
 }
 
@@ -427,9 +418,9 @@ fn an_image_name_that_the_kubelet_refuses_fails_at_once() {
     let words = "Failed to apply default image tag \"team/Agent\": couldn't parse image name";
     let mut world = World::local().with_pod();
     world.see(waiting("agent-1", "InvalidImageName", words));
-    world.pass_to(Pending, reasons::STOPPING);
+    world.pass_to(Pending, Reason::Stopping);
     world.job_gone();
-    let failure = world.pass_to(Failed, reasons::IMAGE_INVALID).status.failure.unwrap();
+    let failure = world.pass_to(Failed, Reason::ImageInvalid).status.failure.unwrap();
     assert_eq!(failure.class, Participant);
     assert!(
         failure.message.contains("couldn't parse image name. Submit again"),
@@ -438,8 +429,8 @@ fn an_image_name_that_the_kubelet_refuses_fails_at_once() {
     );
     is_shown_then_fails(
         waiting("simulator-1", "InvalidImageName", words),
-        reasons::IMAGE_PULL,
+        Reason::ImagePull,
         Infrastructure,
-        reasons::IMAGE_PULL,
+        Reason::ImagePull,
     );
 }

@@ -5,17 +5,17 @@ use crate::submissions::{Action, EvalaiUpdate, TableUpdate};
 use crate::view::{EvalaiEnd, JobEnd, ObservedReport};
 use leaderboard_api::State::{Cancelled, Finished, Pending, Running};
 use leaderboard_api::evalai_status::Status;
-use leaderboard_api::{names, reasons};
+use leaderboard_api::{Reason, names};
 use leaderboard_contract::report::Report;
 use leaderboard_contract::run::Stop;
 
 type Request = fn(&mut World);
 
 /// Who requests the end, and which reason it gets.
-const REQUESTS: [(Request, &str); 3] = [
-    (|world| world.submission().spec.cancel = true, reasons::CANCELLED),
-    (World::delete, reasons::DELETED),
-    (|world| world.in_evalai().cancelled = true, reasons::ENDED_IN_EVALAI),
+const REQUESTS: [(Request, Reason); 3] = [
+    (|world| world.submission().spec.cancel = true, Reason::Cancelled),
+    (World::delete, Reason::Deleted),
+    (|world| world.in_evalai().cancelled = true, Reason::EndedInEvalAI),
 ];
 
 #[test]
@@ -34,10 +34,10 @@ fn before_its_pod_or_agents_the_job_is_deleted_at_once() {
         for stage in [World::with_job, World::with_pod] {
             let mut world = stage(World::evalai());
             request(&mut world);
-            let plan = world.pass_to(Pending, reasons::STOPPING);
+            let plan = world.pass_to(Pending, Reason::Stopping);
             assert!(has(&plan, |a| matches!(a, Action::DeleteJob { grace_seconds: 60, .. })));
             world.job().deleting = true;
-            world.pass_to(Pending, reasons::STOPPING);
+            world.pass_to(Pending, Reason::Stopping);
             world.job_gone();
             world.pass_to(Cancelled, reason);
         }
@@ -51,7 +51,7 @@ fn a_running_one_is_asked_to_stop_and_keeps_what_it_has() {
         world.report(report(2));
         world.pass();
         request(&mut world);
-        let plan = world.pass_to(Running, reasons::STOPPING);
+        let plan = world.pass_to(Running, Reason::Stopping);
         assert_eq!(
             plan.actions,
             [Action::StopPod {
@@ -59,7 +59,7 @@ fn a_running_one_is_asked_to_stop_and_keeps_what_it_has() {
                 stop: Stop::Cancel
             }]
         );
-        assert_eq!(events(&plan), [reasons::STOPPING]);
+        assert_eq!(events(&plan), [Reason::Stopping]);
         world.pod().stop = Some(Stop::Cancel);
         assert_eq!(world.pass().actions, []);
         world.complete();
@@ -82,12 +82,12 @@ fn between_two_tries_it_ends_at_once() {
     for (request, reason) in REQUESTS {
         let mut world = World::evalai().running();
         world.complete();
-        world.pass_to(Pending, reasons::REPLACING);
+        world.pass_to(Pending, Reason::Replacing);
         world.job_gone();
         request(&mut world);
         let plan = world.pass_to(Cancelled, reason);
         let message = plan.status.message.as_ref().unwrap();
-        assert_eq!(message.contains("EvalAI"), reason == reasons::ENDED_IN_EVALAI);
+        assert_eq!(message.contains("EvalAI"), reason == Reason::EndedInEvalAI);
         assert!(!has(&plan, |a| matches!(a, Action::CreateJob(_))));
     }
 }
@@ -202,24 +202,24 @@ fn a_cancel_after_the_end_changes_nothing() {
     let mut world = World::evalai().running();
     world.complete();
     world.report(final_report());
-    world.pass_to(Finished, reasons::FINISHED);
+    world.pass_to(Finished, Reason::Finished);
     world.submission().spec.cancel = true;
     assert_eq!(
-        evalai_updates(&world.pass_to(Finished, reasons::FINISHED)),
+        evalai_updates(&world.pass_to(Finished, Reason::Finished)),
         [EvalaiUpdate::Finished]
     );
     world.published();
-    world.pass_to(Finished, reasons::FINISHED);
+    world.pass_to(Finished, Reason::Finished);
 }
 
 #[test]
 fn a_cancel_that_comes_after_the_last_route_loses() {
     let mut world = World::evalai().running();
     world.submission().spec.cancel = true;
-    world.pass_to(Running, reasons::STOPPING);
+    world.pass_to(Running, Reason::Stopping);
     world.complete();
     world.report(final_report());
-    let plan = world.pass_to(Finished, reasons::FINISHED);
+    let plan = world.pass_to(Finished, Reason::Finished);
     assert_eq!(evalai_updates(&plan), [EvalaiUpdate::Finished]);
 
     // EvalAI's own cancel still wins, in all systems, until our result is answered.
@@ -228,9 +228,9 @@ fn a_cancel_that_comes_after_the_last_route_loses() {
     world.pass();
     world.complete();
     world.report(final_report());
-    world.pass_to(Finished, reasons::FINISHED);
+    world.pass_to(Finished, Reason::Finished);
     world.in_evalai().end = Some(EvalaiEnd::Ended(Status::Cancelled));
-    let plan = world.pass_to(Cancelled, reasons::ENDED_IN_EVALAI);
+    let plan = world.pass_to(Cancelled, Reason::EndedInEvalAI);
     assert!(has(&plan, |a| *a == Action::Record(TableUpdate::End)));
 }
 
@@ -239,7 +239,7 @@ fn a_pod_that_does_not_obey_is_deleted_then_removed() {
     let mut world = World::local().running();
     world.go_to(1000);
     world.submission().spec.cancel = true;
-    world.pass_to(Running, reasons::STOPPING);
+    world.pass_to(Running, Reason::Stopping);
     world.pod().stop = Some(Stop::Cancel);
     world.go_to(1134);
     assert_eq!(world.pass().actions, []);
@@ -264,7 +264,7 @@ fn a_pod_that_does_not_obey_is_deleted_then_removed() {
     assert_eq!(plan.actions[0], Action::TakeOwnership);
     assert!(has(&plan, |a| matches!(a, Action::DeleteJob { grace_seconds: 0, .. })));
     world.job_gone();
-    world.pass_to(Cancelled, reasons::CANCELLED);
+    world.pass_to(Cancelled, Reason::Cancelled);
 }
 
 #[test]
@@ -272,7 +272,7 @@ fn a_logcopy_that_is_being_restarted_may_still_store() {
     let mut world = World::local().running();
     world.pod().logcopy_running = false;
     world.submission().spec.cancel = true;
-    let plan = world.pass_to(Running, reasons::STOPPING);
+    let plan = world.pass_to(Running, Reason::Stopping);
     assert!(has(&plan, |a| matches!(a, Action::StopPod { .. })));
     assert!(!has(&plan, |a| matches!(a, Action::DeleteJob { .. })));
 }
@@ -282,16 +282,16 @@ fn a_stop_ends_though_the_clock_is_set_back() {
     let mut world = World::local().running();
     world.go_to(100_000);
     world.submission().spec.cancel = true;
-    world.pass_to(Running, reasons::STOPPING);
+    world.pass_to(Running, Reason::Stopping);
     world.go_to(50);
-    world.pass_to(Running, reasons::STOPPING);
+    world.pass_to(Running, Reason::Stopping);
     world.wait(135);
     assert!(has(&world.pass(), |a| matches!(a, Action::DeleteJob { .. })));
 
     let mut world = World::local().running();
     world.go_to(100_000);
     world.complete();
-    world.pass_to(Pending, reasons::REPLACING);
+    world.pass_to(Pending, Reason::Replacing);
     world.job_gone();
     world.go_to(50);
     assert!(creates(&world.pass()), "a wait of seconds stays one");
@@ -301,20 +301,20 @@ fn a_stop_ends_though_the_clock_is_set_back() {
 fn a_failing_run_that_is_cancelled_is_cancelled() {
     let mut world = World::local().running();
     world.see(ended("agent-1", 3, "exited", 1, 100));
-    world.pass_to(Running, reasons::STOPPING);
+    world.pass_to(Running, Reason::Stopping);
     world.submission().spec.cancel = true;
-    world.pass_to(Running, reasons::STOPPING);
+    world.pass_to(Running, Reason::Stopping);
     world.complete();
-    assert_eq!(world.pass_to(Cancelled, reasons::CANCELLED).status.failure, None);
+    assert_eq!(world.pass_to(Cancelled, Reason::Cancelled).status.failure, None);
 }
 
 #[test]
 fn a_deleted_one_is_released_when_all_know_its_end() {
     let mut world = World::evalai().running();
     world.delete();
-    world.pass_to(Running, reasons::STOPPING);
+    world.pass_to(Running, Reason::Stopping);
     world.complete();
-    let plan = world.pass_to(Cancelled, reasons::DELETED);
+    let plan = world.pass_to(Cancelled, Reason::Deleted);
     assert_eq!(evalai_updates(&plan), [EvalaiUpdate::Cancelled]);
     assert!(!has(&plan, |a| *a == Action::SetFinalizer(false)));
     world.published();
@@ -330,13 +330,13 @@ fn deletion_does_not_wait_without_end() {
     world.delete();
     world.pass();
     world.complete();
-    world.pass_to(Cancelled, reasons::DELETED);
+    world.pass_to(Cancelled, Reason::Deleted);
     world.go_to(999);
     assert!(!has(&world.pass(), |a| *a == Action::SetFinalizer(false)));
     world.go_to(1000);
     let plan = world.pass();
     assert!(has(&plan, |a| *a == Action::SetFinalizer(false)));
-    assert_eq!(events(&plan), [reasons::RELEASED_UNPUBLISHED]);
+    assert_eq!(events(&plan), [Reason::ReleasedUnpublished]);
     world.submission().metadata.finalizers = Some(vec![format!("{}-other", names::FINALIZER_SUBMISSION)]);
     assert!(!has(&world.pass(), |a| *a == Action::SetFinalizer(false)));
 }
@@ -350,11 +350,11 @@ fn a_cancelled_one_does_not_wait_long_for_a_bucket() {
     let at = Some(at(100));
     world.job().end = Some(JobEnd::Complete { at });
     world.view.report.stored = ObservedReport::Unreadable("no route to the bucket".into());
-    world.pass_to(Running, reasons::NOT_STORED);
+    world.pass_to(Running, Reason::NotStored);
     world.go_to(219);
-    world.pass_to(Running, reasons::NOT_STORED);
+    world.pass_to(Running, Reason::NotStored);
     world.go_to(220);
-    world.pass_to(Cancelled, reasons::DELETED);
+    world.pass_to(Cancelled, Reason::Deleted);
 }
 
 #[test]
@@ -363,8 +363,8 @@ fn a_job_that_shows_up_after_the_end_is_ended() {
     world.pass();
     world.submission().spec.cancel = true;
     world.view.report.stored = ObservedReport::Absent;
-    world.pass_to(Cancelled, reasons::CANCELLED);
+    world.pass_to(Cancelled, Reason::Cancelled);
     world.see_job();
-    let plan = world.pass_to(Cancelled, reasons::CANCELLED);
+    let plan = world.pass_to(Cancelled, Reason::Cancelled);
     assert!(has(&plan, |a| matches!(a, Action::DeleteJob { .. })));
 }

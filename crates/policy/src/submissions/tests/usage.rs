@@ -5,7 +5,7 @@ use serde_json::json;
 use super::builders::*;
 use crate::view::PodView;
 use leaderboard_api::State::{Cancelled, Finished, Pending, Running};
-use leaderboard_api::{Attempt, Use, reasons};
+use leaderboard_api::{Attempt, Reason, Use};
 
 /// A submission whose two pairs have a GPU each, before its Job.
 fn with_gpus() -> World {
@@ -26,10 +26,7 @@ fn a_job_counts_from_its_pods_scheduling_to_its_end_and_once() {
     world.go_to(1000);
     world.complete();
     world.report(final_report());
-    assert_eq!(
-        world.pass_to(Finished, reasons::FINISHED).status.usage,
-        Some(used(2000))
-    );
+    assert_eq!(world.pass_to(Finished, Reason::Finished).status.usage, Some(used(2000)));
     world.go_to(2000);
     world.recorded();
     assert_eq!(world.pass().status.usage, Some(used(2000)));
@@ -40,7 +37,7 @@ fn the_jobs_of_all_attempts_are_summed_up() {
     let mut world = with_gpus().running();
     world.go_to(100);
     world.complete();
-    assert_eq!(world.pass_to(Pending, reasons::REPLACING).status.usage, Some(used(200)));
+    assert_eq!(world.pass_to(Pending, Reason::Replacing).status.usage, Some(used(200)));
     world.job_gone();
     world.wait(10);
     assert!(creates(&world.pass()));
@@ -48,17 +45,17 @@ fn the_jobs_of_all_attempts_are_summed_up() {
     world.view.pod = Some(pod(150));
     world.see_agents();
     world.go_to(160);
-    world.pass_to(Running, reasons::RUNNING);
+    world.pass_to(Running, Reason::Running);
     world.submission().spec.cancel = true;
     world.go_to(250);
     world.complete();
-    let plan = world.pass_to(Cancelled, reasons::CANCELLED);
+    let plan = world.pass_to(Cancelled, Reason::Cancelled);
     assert_eq!(plan.status.usage, Some(used(200 + 200)));
     world.submission().spec.cancel = false;
     world.submission().spec.attempt = Attempt(2);
     world.job_gone();
     assert_eq!(
-        world.pass_to(Pending, reasons::PREPARING).status.usage,
+        world.pass_to(Pending, Reason::Preparing).status.usage,
         Some(used(400)),
         "a resume keeps it"
     );
@@ -71,13 +68,13 @@ fn what_never_had_a_node_or_a_gpu_has_used_none() {
     world.submission().spec.cancel = true;
     world.pass();
     world.job_gone();
-    assert_eq!(world.pass_to(Cancelled, reasons::CANCELLED).status.usage, Some(used(0)));
+    assert_eq!(world.pass_to(Cancelled, Reason::Cancelled).status.usage, Some(used(0)));
 
     let mut world = World::local().running();
     world.go_to(1000);
     world.complete();
     world.report(final_report());
-    assert_eq!(world.pass_to(Finished, reasons::FINISHED).status.usage, None);
+    assert_eq!(world.pass_to(Finished, Reason::Finished).status.usage, None);
 }
 
 #[test]
@@ -91,20 +88,20 @@ fn a_pod_that_waits_for_its_node_uses_none() {
         unschedulable: Some("0/1 nodes are available.".into()),
         ..pod(1000)
     });
-    world.pass_to(Running, reasons::REPLACING);
+    world.pass_to(Running, Reason::Replacing);
     let mut cancelled = world.clone();
     cancelled.submission().spec.cancel = true;
     cancelled.go_to(5000);
     cancelled.complete();
-    let plan = cancelled.pass_to(Cancelled, reasons::CANCELLED);
+    let plan = cancelled.pass_to(Cancelled, Reason::Cancelled);
     assert_eq!(plan.status.usage, Some(used(2000)));
 
     (world.pod().unschedulable, world.pod().scheduled) = (None, Some(at(5000)));
     world.see_agents();
     world.go_to(6000);
-    world.pass_to(Running, reasons::RUNNING);
+    world.pass_to(Running, Reason::Running);
     world.complete();
     world.report(final_report());
-    let plan = world.pass_to(Finished, reasons::FINISHED);
+    let plan = world.pass_to(Finished, Reason::Finished);
     assert_eq!(plan.status.usage, Some(used(2000 + 2000)));
 }

@@ -6,9 +6,9 @@ use super::builders::*;
 use crate::submissions::EvalaiUpdate;
 use crate::view::{ObservedJob, ScaleUp, Turn};
 use leaderboard_api::FailureClass::Infrastructure;
+use leaderboard_api::Reason;
 use leaderboard_api::State::{Failed, Pending};
 use leaderboard_api::conditions::STALLED;
-use leaderboard_api::reasons;
 
 /// Whole seconds.
 fn whole(requeue: Option<Duration>) -> Option<u64> {
@@ -24,27 +24,23 @@ fn without_a_node_it_waits_without_a_limit_and_shows_why() {
     pod.node = None;
     pod.unschedulable = Some(words.into());
     world.go_to(4);
-    let plan = world.pass_to(Pending, reasons::PREPARING);
+    let plan = world.pass_to(Pending, Reason::Preparing);
     assert!(
         plan.requeue.is_some_and(|wait| wait <= Duration::from_secs(2)),
         "the Pod before it may still be leaving"
     );
     world.go_to(5);
-    let plan = world.pass_to(Pending, reasons::UNSCHEDULABLE);
+    let plan = world.pass_to(Pending, Reason::Unschedulable);
     assert_eq!(plan.status.message.as_deref(), Some(words));
     world.go_to(1_000_000);
-    world.pass_to(Pending, reasons::UNSCHEDULABLE);
+    world.pass_to(Pending, Reason::Unschedulable);
 
     world.leaderboard().deadlines.schedule_seconds = Some(1_000_001);
-    world.pass_to(Pending, reasons::UNSCHEDULABLE);
+    world.pass_to(Pending, Reason::Unschedulable);
     world.go_to(1_000_001);
-    world.pass_to(Pending, reasons::STOPPING);
+    world.pass_to(Pending, Reason::Stopping);
     world.job_gone();
-    let failure = world
-        .pass_to(Failed, reasons::SCHEDULE_DEADLINE)
-        .status
-        .failure
-        .unwrap();
+    let failure = world.pass_to(Failed, Reason::ScheduleDeadline).status.failure.unwrap();
     assert_eq!(failure.class, Infrastructure);
     assert!(failure.message.contains(words));
 }
@@ -69,11 +65,11 @@ fn a_wait_for_a_node_is_a_stall_after_15_minutes_without_a_scale_up() {
     ] {
         world.pod().scale_up = scale_up;
         world.go_to(second);
-        let plan = world.pass_to(Pending, reasons::UNSCHEDULABLE);
+        let plan = world.pass_to(Pending, Reason::Unschedulable);
         let stalled = condition(&plan, STALLED);
         assert_eq!(
             stalled,
-            (expected.into(), reasons::UNSCHEDULABLE.into()),
+            (expected.into(), Reason::Unschedulable.into()),
             "after {second} s"
         );
         assert_eq!(plan.status.blocked_since.unwrap().time.0, at(10));
@@ -83,8 +79,8 @@ fn a_wait_for_a_node_is_a_stall_after_15_minutes_without_a_scale_up() {
 #[test]
 fn a_wait_for_a_slot_is_no_stall_and_names_its_reason() {
     for (turn, reason) in [
-        (Turn::Wait { position: 3, eta: None }, reasons::WAITING_FOR_SLOT),
-        (Turn::Paused { position: 3 }, reasons::PAUSED),
+        (Turn::Wait { position: 3, eta: None }, Reason::WaitingForSlot),
+        (Turn::Paused { position: 3 }, Reason::Paused),
     ] {
         let mut world = World::local();
         world.view.turn = turn;
@@ -114,7 +110,7 @@ fn a_wait_for_a_node_shows_whether_one_is_on_its_way() {
         (pod.scheduled, pod.node, pod.scale_up) = (None, None, said);
         pod.unschedulable = Some("0/1 nodes are available".into());
         world.go_to(30);
-        let plan = world.pass_to(Pending, reasons::UNSCHEDULABLE);
+        let plan = world.pass_to(Pending, Reason::Unschedulable);
         assert_eq!(plan.status.message.as_deref(), Some(expected));
     }
 }
@@ -124,18 +120,18 @@ fn a_quota_or_a_refusal_is_shown_and_the_run_goes_on_once_it_is_fixed() {
     let cases = [
         (
             "pods \"x\" is forbidden: exceeded quota: q, requested: cpu=2",
-            reasons::QUOTA_EXCEEDED,
+            Reason::QuotaExceeded,
         ),
         (
             "failed quota: q: must specify limits.memory for: m",
-            reasons::QUOTA_EXCEEDED,
+            Reason::QuotaExceeded,
         ),
-        ("violates PodSecurity \"restricted:v1.35\": x", reasons::POD_REFUSED),
+        ("violates PodSecurity \"restricted:v1.35\": x", Reason::PodRefused),
     ];
     for (words, reason) in cases {
         let mut world = World::local().with_job();
         world.job().failed_create = Some(words.into());
-        let plan = world.pass_to(Pending, reasons::PREPARING);
+        let plan = world.pass_to(Pending, Reason::Preparing);
         assert_eq!(whole(plan.requeue), Some(5), "the Pod before it may be leaving");
         world.go_to(5);
         let plan = world.pass_to(Pending, reason);
@@ -144,7 +140,7 @@ fn a_quota_or_a_refusal_is_shown_and_the_run_goes_on_once_it_is_fixed() {
         world.pass_to(Pending, reason);
         world.job().failed_create = None;
         world.view.pod = Some(pod(1_000_000));
-        world.pass_to(Pending, reasons::PREPARING);
+        world.pass_to(Pending, Reason::Preparing);
     }
 }
 
@@ -153,24 +149,24 @@ fn a_job_that_the_api_server_refuses_is_shown_and_tried_again() {
     let cases = [
         (
             "exceeded quota: q, requested: count/jobs.batch=1",
-            reasons::QUOTA_EXCEEDED,
+            Reason::QuotaExceeded,
         ),
-        ("denied by a policy", reasons::POD_REFUSED),
+        ("denied by a policy", Reason::PodRefused),
     ];
     for (words, reason) in cases {
         let mut world = World::evalai();
-        world.pass_to(Pending, reasons::PREPARING);
+        world.pass_to(Pending, Reason::Preparing);
         world.view.job = ObservedJob::Absent {
             refused: Some(words.into()),
         };
         let plan = world.pass_to(Pending, reason);
         assert!(creates(&plan));
         assert_eq!(evalai_updates(&plan), [EvalaiUpdate::Queued]);
-        assert_eq!(condition(&plan, STALLED), ("True".to_owned(), reason.to_owned()));
+        assert_eq!(condition(&plan, STALLED), ("True".to_owned(), reason.into()));
         assert!(plan.status.message.unwrap().contains(words));
         world.see_job();
         world.view.pod = Some(pod(0));
-        world.pass_to(Pending, reasons::PREPARING);
+        world.pass_to(Pending, Reason::Preparing);
     }
 }
 
@@ -182,7 +178,7 @@ fn a_job_without_a_pod_is_shown_when_it_lasts() {
     assert_eq!(condition(&plan, STALLED).0, "False");
     assert_eq!(whole(plan.requeue), Some(1));
     world.go_to(45);
-    let plan = world.pass_to(Pending, reasons::PREPARING);
+    let plan = world.pass_to(Pending, Reason::Preparing);
     assert_eq!(condition(&plan, STALLED).0, "True");
     assert!(plan.status.message.unwrap().contains("controller manager"));
 }
