@@ -344,5 +344,4 @@ pub(crate) fn leave(side: Side, conclusion: Conclusion, seen: &Seen, over: bool)
 }
 
 #[cfg(test)]
-#[path = "decide_tests.rs"]
 mod tests;

@@ -440,5 +440,4 @@ fn phases(entry: &Entry, found: &mut Found) -> BTreeMap<&'static str, Vec<Track>
 }
 
 #[cfg(test)]
-#[path = "entries_tests.rs"]
 mod tests;

@@ -182,5 +182,4 @@ fn quoted(text: &str) -> String {
 }
 
 #[cfg(test)]
-#[path = "manifests_tests.rs"]
 mod tests;

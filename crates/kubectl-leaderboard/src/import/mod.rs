@@ -6,8 +6,7 @@
 mod entries;
 mod manifests;
 #[cfg(test)]
-#[path = "samples_tests.rs"]
-mod samples;
+mod samples_tests;
 
 use std::fs::File;
 use std::io::{self, Read as _};

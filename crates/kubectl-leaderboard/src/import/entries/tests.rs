@@ -1,5 +1,5 @@
 use super::*;
-use crate::import::samples::{Texts, answer, board, entries, texts};
+use crate::import::samples_tests::{Texts, answer, board, entries, texts};
 use serde_json::json;
 
 fn parsed(texts: &Texts) -> Pipeline {

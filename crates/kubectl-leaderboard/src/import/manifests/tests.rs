@@ -3,7 +3,7 @@ use serde_json::json;
 
 use super::*;
 use crate::import::entries::{answers, parse};
-use crate::import::samples::{TOKEN, Texts, answer, board, entries, texts};
+use crate::import::samples_tests::{TOKEN, Texts, answer, board, entries, texts};
 use crate::tests::golden::assert_golden;
 
 const URL: &str = "https://sqs.us-west-2.amazonaws.com/123456789012/leaderboard";
@@ -48,7 +48,7 @@ fn the_documentation_shows_what_is_printed() {
     all.remove("leaderboard-10");
     let text = printed(&all);
     let (_, manifests) = text.split_once("---\n").unwrap();
-    let page = include_str!("../../../../docs/import.md");
+    let page = include_str!("../../../../../docs/import.md");
     let wanted = format!("```yaml\n{manifests}```\n");
     assert!(page.contains(&wanted), "docs/import.md does not show this:\n{wanted}");
 }
