@@ -42,7 +42,7 @@ async fn without_the_program_its_commands_are_printed() {
     );
     assert!(!text.contains("agent1"), "{text}");
     let text = terminal.run(&["logs", "mine", "--worker", "3"]).await.refused();
-    assert_has(&text, &["mine has no pair 3. It has 2, counted from 1"]);
+    assert_has(&text, &["mine has no worker 3"]);
 }
 
 #[tokio::test]
