@@ -113,68 +113,30 @@ fn an_image_that_cannot_be_pulled_is_its_owners_failure_only_where_its_registry_
 
 #[test]
 fn a_container_that_cannot_be_set_up_or_started_shows_why_and_only_a_proof_charges_the_participant() {
-    let config = "CreateContainerConfigError";
-    let cases = [
-        (
-            "agent-1",
-            config,
-            "secret \"s\" not found",
-            Reason::ContainerConfig,
-            Infrastructure,
-        ),
-        (
-            "agent-1",
-            "CreateContainerError",
-            "no users found",
-            Reason::CannotStart,
-            Participant,
-        ),
-        (
-            "agent-1",
-            "RunContainerError",
-            NO_PROGRAM,
-            Reason::CannotStart,
-            Participant,
-        ),
-        (
-            "agent-1",
-            "CreateContainerError",
-            CDI,
-            Reason::NodeCannotStart,
-            Infrastructure,
-        ),
-        (
-            "agent-1",
-            "RunContainerError",
-            "unheard of",
-            Reason::NodeCannotStart,
-            Infrastructure,
-        ),
-        (
-            "simulator-1",
-            "RunContainerError",
-            NO_PROGRAM,
-            Reason::CannotStart,
-            Infrastructure,
-        ),
-        (
-            "simulator-1",
-            "CreateContainerError",
-            CDI,
-            Reason::NodeCannotStart,
-            Infrastructure,
-        ),
-        (
-            "simulator-1",
-            config,
-            "container has runAsNonRoot and image will run as root",
-            Reason::ContainerConfig,
-            Infrastructure,
-        ),
-    ];
-    for (name, word, words, reason, class) in cases {
+    use Reason::{CannotStart, ContainerConfig, NodeCannotStart};
+    let (config, create, run) = (
+        "CreateContainerConfigError",
+        "CreateContainerError",
+        "RunContainerError",
+    );
+    let root = "container has runAsNonRoot and image will run as root";
+    let fails = |name, word, words, reason, class| {
         is_shown_then_fails(waiting(name, word, words), reason, class, reason);
-    }
+    };
+    fails(
+        "agent-1",
+        config,
+        "secret \"s\" not found",
+        ContainerConfig,
+        Infrastructure,
+    );
+    fails("agent-1", create, "no users found", CannotStart, Participant);
+    fails("agent-1", run, NO_PROGRAM, CannotStart, Participant);
+    fails("agent-1", create, CDI, NodeCannotStart, Infrastructure);
+    fails("agent-1", run, "unheard of", NodeCannotStart, Infrastructure);
+    fails("simulator-1", run, NO_PROGRAM, CannotStart, Infrastructure);
+    fails("simulator-1", create, CDI, NodeCannotStart, Infrastructure);
+    fails("simulator-1", config, root, ContainerConfig, Infrastructure);
 }
 
 #[test]
