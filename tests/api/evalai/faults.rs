@@ -6,6 +6,7 @@ use leaderboard_evalai::answer::{Answer, classify};
 use serde_json::Value;
 use tokio::io::{AsyncReadExt, AsyncWriteExt};
 
+use super::ends::Kept;
 use super::*;
 
 #[test]

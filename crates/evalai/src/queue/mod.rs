@@ -68,14 +68,12 @@ pub struct Timing {
     pub fresh: Duration,
     /// A message that has not come for so long is lost.
     pub lost: Duration,
-    /// A live submission is read again, in case it was ended in a way that no list shows. Above all its participant
-    /// may have deleted it: that leaves its status as it is, so the list of cancelled ones never holds it. With many live submissions
-    /// the time is longer: their reads take half of the requests at most.
+    /// A live submission is read again: its participant may have deleted it, which no list shows. With many live submissions the
+    /// time is longer: their reads take half of the requests at most.
     pub refresh: Duration,
     /// Between two checks of a challenge's leaderboards.
     pub check: Duration,
-    /// A submission that EvalAI does not have is asked for again after so long, before that counts: one answer may be of a server that is just
-    /// being replaced, and would end a run.
+    /// A submission that EvalAI does not have is asked for again after so long: one answer may be of a server that is being replaced.
     pub missing: Duration,
 }
 

@@ -9,6 +9,7 @@ mod outage;
 mod passing;
 mod payloads;
 mod simulation;
+mod sweep;
 
 use jiff::SignedDuration;
 
