@@ -11,7 +11,7 @@ use super::submission_status::SubmissionStatus;
 use super::team::{Team, TeamStatus};
 
 /// One participant's image on one track of a Leaderboard.
-#[derive(CustomResource, KubeSchema, Serialize, Deserialize, Clone, Debug, PartialEq)]
+#[derive(CustomResource, KubeSchema, Serialize, Deserialize, Clone, Debug, Default, PartialEq)]
 #[kube(
     group = "leaderboard.carla.org",
     version = "v1alpha1",
@@ -23,6 +23,7 @@ use super::team::{Team, TeamStatus};
     status = "SubmissionStatus",
     doc = "One participant's image on one track of a Leaderboard.",
     derive = "PartialEq",
+    derive = "Default",
     selectable = ".spec.leaderboardName",
     selectable = ".spec.evalai.submission",
     selectable = ".status.state",

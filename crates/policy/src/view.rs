@@ -15,8 +15,8 @@ use leaderboard_contract::run::Stop;
 use leaderboard_contract::verdict::WorkspaceReason;
 use leaderboard_protocol::verdict::Verdict;
 
-/// Everything a decision may depend on.
-#[derive(Clone, Debug)]
+/// Everything a decision may depend on. By default nothing has been seen yet.
+#[derive(Clone, Debug, Default)]
 pub struct View {
     pub now: Timestamp,
     pub submission: Arc<Submission>,
@@ -65,6 +65,12 @@ pub enum ObservedJob {
     /// It has the right name but another owner: an older object's, going away.
     Foreign,
     Ours(JobView),
+}
+
+impl Default for ObservedJob {
+    fn default() -> Self {
+        Self::Absent { refused: None }
+    }
 }
 
 impl ObservedJob {
@@ -305,8 +311,9 @@ impl ReportView {
 }
 
 /// Whether our own mark is in `logcopy/owner`, so that a lost Pod stores nothing more.
-#[derive(Clone, Copy, Debug, PartialEq, Eq)]
+#[derive(Clone, Copy, Debug, Default, PartialEq, Eq)]
 pub enum ObservedFence {
+    #[default]
     NotRequested,
     /// Requested this long ago.
     Pending(Duration),
@@ -316,8 +323,9 @@ pub enum ObservedFence {
 }
 
 /// What became of the log that explains a failure.
-#[derive(Clone, Copy, Debug, PartialEq, Eq)]
+#[derive(Clone, Copy, Debug, Default, PartialEq, Eq)]
 pub enum ObservedLog {
+    #[default]
     NotRequested,
     /// Requested this long ago.
     Pending(Duration),

@@ -17,8 +17,7 @@ use super::*;
 use crate::fixtures::{Cluster, Surroundings, leaderboard, surroundings, with_job};
 use leaderboard_api::conditions::{self, Truth};
 use leaderboard_api::{Attempt, Reason, State};
-use leaderboard_policy::ask::Lookup;
-use leaderboard_policy::view::{NodeView, ObservedFence, ObservedJob, ObservedLog, ObservedReport, ReportView, Turn};
+use leaderboard_policy::view::{ObservedReport, Turn};
 
 /// Longer than a write takes on a busy machine.
 const LIMIT: std::time::Duration = std::time::Duration::from_mins(1);
@@ -94,19 +93,9 @@ async fn bench(state: State) -> Bench {
         now,
         submission: Arc::new(submission),
         leaderboard: Some(Arc::new(board)),
-        not_allowed: None,
-        is_policy_in_place: true,
-        row: Lookup::default(),
         turn: Turn::Go,
-        job: ObservedJob::Absent { refused: None },
-        written_ago: None,
-        pod: None,
-        node: NodeView::default(),
-        report: ReportView::default(),
-        fence: ObservedFence::NotRequested,
-        log: ObservedLog::NotRequested,
-        evalai: None,
         record: Some(RecordView::default()),
+        ..View::default()
     };
     Bench {
         around: surroundings(Cluster::default(), &endpoint).await,

@@ -18,9 +18,10 @@ mod day_tests;
 pub const RUNS: usize = 20;
 
 /// Whether a submission may start.
-#[derive(Clone, Debug, PartialEq, Eq)]
+#[derive(Clone, Debug, Default, PartialEq, Eq)]
 pub enum Turn {
     /// It waits for no slot yet, as far as is known.
+    #[default]
     NotInLine,
     Go,
     Wait {

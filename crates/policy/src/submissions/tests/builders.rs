@@ -107,13 +107,10 @@ impl World {
                 now: at(0),
                 submission: Arc::new(submission(evalai)),
                 leaderboard: Some(Arc::new(leaderboard(evalai))),
-                not_allowed: None,
                 is_policy_in_place: true,
                 // Nobody else runs it; the tests of foreign runs set it otherwise.
                 row: foreign::free(1),
                 turn: Turn::Go,
-                job: ObservedJob::Absent { refused: None },
-                pod: None,
                 node: NodeView::default(),
                 // Whatever is asked for is there already; the tests of waiting set it otherwise.
                 report: ReportView {
@@ -123,8 +120,8 @@ impl World {
                 fence: ObservedFence::Held,
                 log: ObservedLog::Kept,
                 evalai: evalai.then_some(known),
-                written_ago: None,
                 record: Some(RecordView::default()),
+                ..View::default()
             },
         }
     }
