@@ -67,7 +67,7 @@ async fn a_minimal_leaderboard_reads_back_whole() {
     assert_eq!(
         read.data["spec"],
         json!({
-        "tracks": [{"name": "sensors", "carla": {"codename": "SENSORS"}}],
+        "tracks": [{"name": "sensors"}],
         "evaluation": {"carla": {
             "version": "V2", "contents": {"image": "contents:1"},
             "simulator": {"image": "simulator:1", "display": "Offscreen"}, "pairs": 4, "routes": 20,
@@ -311,7 +311,8 @@ async fn a_null_is_as_good_as_a_field_left_out() {
         }),
         json!({
             "tracks": [{
-                "name": "sensors", "carla": {"codename": "SENSORS", "pairs": null, "routeSubsets": null, "routesFile": null}, "phase": null,
+                "name": "sensors", "phase": null,
+                "carla": {"codename": null, "pairs": null, "routeSubsets": null, "routesFile": null},
             }],
             "storage": {"s3": {
                 "bucket": "results", "prefix": null, "region": null, "endpoint": null, "sizeLimit": null, "kmsKeyARN": null,
