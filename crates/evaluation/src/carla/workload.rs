@@ -63,7 +63,7 @@ pub(super) const RESERVED: Reserved = Reserved {
 
 /// Port of a pair's simulator.
 fn port(pair: Pair) -> usize {
-    2000 + 100 * pair.index()
+    pair.index().saturating_mul(100).saturating_add(2000)
 }
 
 /// The container with the private contents.
@@ -183,7 +183,7 @@ fn agent_env(asked: &Asked<'_>, pair: Pair) -> Vec<(&'static str, String)> {
     let resume = if asked.resume { "1" } else { "" };
     vec![
         ("CARLA_PORT", port(pair).to_string()),
-        ("CARLA_TM_PORT", (port(pair) + 10).to_string()),
+        ("CARLA_TM_PORT", port(pair).saturating_add(10).to_string()),
         ("CHALLENGE_TRACK_CODENAME", plan.carla.codename.to_string()),
         ("ROUTES", routes.to_owned()),
         ("ROUTES_SUBSET", slice.map(ToString::to_string).unwrap_or_default()),
