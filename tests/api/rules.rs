@@ -207,7 +207,10 @@ async fn try_case(api: &Api<kube::core::DynamicObject>, case: &Case, name: &str)
             if let Some(reason) = reason {
                 let end = json!({"type": "Finished", "status": "True", "reason": reason, "message": "",
                                  "lastTransitionTime": "2026-01-01T00:00:00Z"});
-                let status = Patch::Merge(json!({"status": {"conditions": [end]}}));
+                let truth = if *reason == "Finished" { "True" } else { "False" };
+                let mut succeeded = end.clone();
+                (succeeded["type"], succeeded["status"]) = (json!("Succeeded"), json!(truth));
+                let status = Patch::Merge(json!({"status": {"conditions": [end, succeeded]}}));
                 let set = api.patch_status(name, &params, &status).await;
                 set.map_err(|error| show("the end is refused", &error))?;
             }

@@ -27,6 +27,8 @@ pub const PLAUSIBLE: &str = "Plausible";
 pub const LOGGED: &str = "Logged";
 /// The submission has come to its end: True in Finished, Failed and Cancelled.
 pub const FINISHED: &str = "Finished";
+/// The submission has come to results that count: True in Finished, False in Failed and Cancelled, Unknown from its acceptance until then.
+pub const SUCCEEDED: &str = "Succeeded";
 /// A Leaderboard can run submissions.
 pub const READY: &str = "Ready";
 /// The Pods of a Leaderboard reach nothing that its policy forbids: measured, not assumed.

@@ -30,7 +30,7 @@ use super::team::{Team, TeamStatus};
     validation = Rule::new("size(self.metadata.name) <= 52").message("metadata.name may have at most 52 characters: Jobs and Pods add the attempt to it"),
     validation = Rule::new("!has(self.spec.check) || !self.spec.check || self.metadata.name.startsWith('check-')").message("the name of a check begins with check-: its results then have a prefix that is no submission's"),
     validation = Rule::new("!self.metadata.name.contains('.')").message("metadata.name may not contain a dot: it becomes the name of a Job and a label"),
-    validation = Rule::new("!has(oldSelf.status) || !has(oldSelf.status.conditions) || !oldSelf.status.conditions.exists(c, c.type == 'Finished' && c.status == 'True' && c.reason == 'Finished') || self.spec.attempt == oldSelf.spec.attempt").message("a finished submission is not resumed; submit it again"),
+    validation = Rule::new("!has(oldSelf.status) || !has(oldSelf.status.conditions) || !oldSelf.status.conditions.exists(c, c.type == 'Succeeded' && c.status == 'True') || self.spec.attempt == oldSelf.spec.attempt").message("a finished submission is not resumed; submit it again"),
     printcolumn = r#"{"name":"Team","type":"string","jsonPath":".status.team.displayName"}"#,
     printcolumn = r#"{"name":"Track","type":"string","jsonPath":".status.track"}"#,
     printcolumn = r#"{"name":"State","type":"string","jsonPath":".status.state"}"#,

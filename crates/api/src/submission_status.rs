@@ -161,7 +161,8 @@ pub struct SubmissionStatus {
     /// What its Jobs have used. A resume keeps it.
     #[serde(rename = "use", default, skip_serializing_if = "Option::is_none")]
     pub usage: Option<Use>,
-    /// `Accepted`, `Running`, `Archived`, `Recorded`, `Published`, `Stalled`, `Finished`.
+    /// Conditions lists one condition of each type: `Accepted`, `Running`, `Archived`, `Recorded`, `Published`, `Stalled`, `Finished`,
+    /// `Succeeded`, and where there is something to show `Plausible` and `Logged`.
     #[serde(default, skip_serializing_if = "Vec::is_empty")]
     #[schemars(schema_with = "super::conditions::schema")]
     pub conditions: Vec<Condition>,

@@ -97,6 +97,9 @@ reasons! {
         Stopping,
             "The submission is being stopped; completed routes are kept.",
             "Nothing. It ends within about three minutes after `deadlines.cancelSeconds`; later while the bucket cannot be read.";
+        InProgress,
+            "The submission has been accepted and has not come to its end (condition `Succeeded`).",
+            "Nothing.";
         NotStalled,
             "The submission is not held up (condition `Stalled`).",
             "Nothing.";

@@ -55,6 +55,7 @@ pub(super) fn decide(draft: &mut PlanBuilder<'_>) -> bool {
     }
     pin(draft, leaderboard, track, image);
     draft.condition(conditions::ACCEPTED, Truth::True, Reason::Accepted, "");
+    draft.condition(conditions::SUCCEEDED, Truth::Unknown, Reason::InProgress, "");
     true
 }
 

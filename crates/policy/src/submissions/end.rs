@@ -278,7 +278,7 @@ fn close(draft: &mut PlanBuilder<'_>, reason: impl Into<ReasonName>, message: &s
     draft.condition(conditions::ARCHIVED, truth, why, "");
     draft.condition(conditions::RUNNING, Truth::False, reason.clone(), "");
     draft.moves();
-    draft.condition(conditions::FINISHED, Truth::True, reason.clone(), message);
+    draft.ends(reason.clone(), message);
     if draft.spec().evalai.is_some() {
         draft.condition(conditions::PUBLISHED, Truth::False, Reason::Waiting, "");
     }

@@ -286,7 +286,7 @@ fn amend(draft: &mut PlanBuilder<'_>, status: Status) -> Delivery {
     }
     draft.status.failure = None;
     let message = format!("EvalAI shows {status}, so the result is not published.");
-    draft.condition(conditions::FINISHED, Truth::True, Reason::EndedInEvalAI, &message);
+    draft.ends(Reason::EndedInEvalAI, &message);
     draft.show(Reason::EndedInEvalAI, message);
     // While EvalAI refused the result, the table was handed the outcome that no longer holds; the status may not show that yet.
     let is_written = draft.view.record.as_ref().is_some_and(|row| row.end_written);
@@ -304,7 +304,7 @@ fn keep_evalais_end(draft: &mut PlanBuilder<'_>, status: Status) {
     let is_ours = end.is_some_and(|end| end.reason != Reason::EndedInEvalAI);
     if is_ours && status == Status::Finished {
         let message = format!("EvalAI showed {status} before the submission was run here; that is kept.");
-        draft.condition(conditions::FINISHED, Truth::True, Reason::EndedInEvalAI, &message);
+        draft.ends(Reason::EndedInEvalAI, &message);
         draft.show(Reason::EndedInEvalAI, message);
     }
 }

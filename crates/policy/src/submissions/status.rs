@@ -478,6 +478,14 @@ impl<'a> PlanBuilder<'a> {
         }
     }
 
+    /// Shows the end that the attempt has come to.
+    pub(super) fn ends(&mut self, reason: impl Into<ReasonName>, message: &str) {
+        let reason = reason.into();
+        let has_succeeded = Truth::from(reason == Reason::Finished);
+        self.condition(conditions::FINISHED, Truth::True, reason.clone(), message);
+        self.condition(conditions::SUCCEEDED, has_succeeded, reason, "");
+    }
+
     /// Publishes a changed state or reason, once.
     fn note_transition(&mut self) {
         let new = (self.status.state_of_conditions(), self.status.reason.clone());

@@ -8,7 +8,7 @@ use crate::view::{JobEnd, ObservedReport};
 use leaderboard_api::FailureClass::{Infrastructure, Participant};
 use leaderboard_api::Reason;
 use leaderboard_api::State::{Cancelled, Failed, Finished, Pending, Running};
-use leaderboard_api::conditions::{ARCHIVED, FINISHED, RUNNING, STALLED};
+use leaderboard_api::conditions::{ARCHIVED, FINISHED, RUNNING, STALLED, SUCCEEDED};
 use leaderboard_api::{Attempt, Failure, JobNumber};
 use leaderboard_contract::report::Report;
 
@@ -34,6 +34,7 @@ fn complete_results_that_count_finish() {
         "the Job's time, not ours"
     );
     assert_eq!(condition(&plan, FINISHED), ("True".into(), Reason::Finished.into()));
+    assert_eq!(condition(&plan, SUCCEEDED), ("True".into(), Reason::Finished.into()));
     assert_eq!(condition(&plan, ARCHIVED), ("True".into(), Reason::Stored.into()));
     assert_eq!(condition(&plan, RUNNING).0, "False");
 }

@@ -207,6 +207,12 @@ fn status_is_whole(plan: &Plan) {
     assert!(status.present_reason().is_some());
     assert!(status.waiting.is_none() || state == State::Pending);
     let failure = status.failure.as_ref();
+    let succeeded = status.condition(conditions::SUCCEEDED).map(|c| c.status.as_str());
+    match state {
+        State::Finished => assert_eq!(succeeded, Some("True")),
+        State::Failed | State::Cancelled => assert_eq!(succeeded, Some("False")),
+        _ => assert!(matches!(succeeded, None | Some("Unknown")), "{succeeded:?}"),
+    }
     match state {
         State::Failed => assert!(failure.is_some(), "Failed without a failure"),
         State::Finished | State::Cancelled => assert_eq!(failure, None),
