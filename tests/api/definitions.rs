@@ -155,6 +155,7 @@ fn half_filled_runs() -> Vec<HalfFilled> {
     ]
 }
 
+#[allow(clippy::needless_pass_by_value, reason = "the cases read better")]
 fn carla(simulator: Value, more: Value) -> Value {
     let mut carla = json!({"version": "V2", "contents": {"image": "contents:1"}, "simulator": simulator});
     merge(&mut carla, &more);

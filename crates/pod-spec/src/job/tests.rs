@@ -32,6 +32,7 @@ pub(super) fn lay(spec: &mut Value, more: &Value) {
 
 impl Case {
     /// A Leaderboard with one track, `more` laid over its spec.
+    #[allow(clippy::needless_pass_by_value, reason = "the cases read better")]
     pub(super) fn new(format: &str, more: Value) -> Self {
         let mut spec = json!({
             "evaluation": {"carla": {
