@@ -413,7 +413,7 @@ async fn what_a_pod_has_measured_is_the_leaderboards_condition_and_known_to_the_
     assert_eq!(told(&job), first);
     let message = "The Pod could connect to 10.96.0.1:443.";
     world
-        .pod(&job, &json!({"reason": "NotEnforced", "message": message}))
+        .pod(&job, &json!({"schema": 1, "reason": "NotEnforced", "message": message}))
         .await;
     let said = world.says("False", Reason::NotEnforced).await;
     assert_eq!(said.message, message);
@@ -427,7 +427,10 @@ async fn what_a_pod_has_measured_is_the_leaderboards_condition_and_known_to_the_
     let job = world.job("third").await;
     assert_eq!(told(&job)["isKnownOpen"], false);
     world
-        .pod(&job, &json!({"reason": "Enforced", "message": "It could not."}))
+        .pod(
+            &job,
+            &json!({"schema": 1, "reason": "Enforced", "message": "It could not."}),
+        )
         .await;
     world.says("True", Reason::Enforced).await;
     operator.end().await;
