@@ -20,7 +20,7 @@ impl SubmissionStatus {
     /// Whether another system has the end, or is to have none, by this condition.
     pub fn is_delivered(&self, type_: &str) -> bool {
         let found = self.condition(type_);
-        let settled = [Reason::NotRequired, Reason::CancelledInEvalAI];
+        let settled = [Reason::NotRequired, Reason::Superseded, Reason::CancelledInEvalAI];
         found.is_some_and(|c| c.is_true() || c.reason.is_one_of(&settled))
     }
 

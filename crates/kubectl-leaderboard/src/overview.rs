@@ -221,7 +221,7 @@ fn other_systems(status: &SubmissionStatus, now: Timestamp) -> Option<String> {
     let late = |c: &&Condition| {
         let age = now.duration_since(c.last_transition_time.0).as_secs();
         match c.reason.known() {
-            Some(Reason::NotRequired | Reason::CancelledInEvalAI) => false,
+            Some(Reason::NotRequired | Reason::Superseded | Reason::CancelledInEvalAI) => false,
             Some(Reason::WaitingForPreviousController) => age > PATIENCE_SECONDS,
             Some(Reason::Waiting) => !c.message.is_empty() || age > PATIENCE_SECONDS,
             _ => true,

@@ -257,7 +257,7 @@ reasons! {
             "Nothing.";
         Waiting,
             "The other system does not have the result yet.",
-            "Nothing. The message has the last error, or why the stored result cannot be read.";
+            "Nothing. The message has the last error.";
         WaitingForPreviousController,
             "The previous controller process (perhaps the same container before a restart) did not confirm its last requests to \
              EvalAI. Nothing is written there for 75 s after the takeover: such a request may still be running.",
@@ -267,9 +267,14 @@ reasons! {
              or archived the submission meanwhile, it becomes Cancelled.",
             "EvalAI: check that the phase's leaderboard schema has all metric labels. DynamoDB: check the table and the operator's \
              rights.";
+        Unread,
+            "The stored result cannot be read, so the other system does not have it yet. It is sent when it can be read.",
+            "Look at the bucket: the message has its answer.";
+        Superseded,
+            "The table keeps a later attempt or another end of the run, and this end was not written there.",
+            "The message says how the submission goes on. Correct the row by hand if this end is the one that counts.";
         NotRequired,
-            "There is nothing to publish: no EvalAI, no table, no team, or EvalAI ended the submission itself; or the table keeps a later \
-             attempt or another end of the run, as the message then says.",
+            "There is nothing to publish: no EvalAI, no table, no team, or EvalAI ended the submission itself.",
             "Nothing, unless the message asks for it.";
         CancelledInEvalAI,
             "EvalAI has cancelled the result since it took it, as a host's re-run does: it counts there no more (condition `Published`). State, \

@@ -82,8 +82,7 @@ fn show_published(draft: &mut PlanBuilder<'_>, at: Timestamp, recorded: bool) {
 
 /// A Leaderboard that is gone can't show what is wanted: what was decided before stands, and what never ran needs nothing.
 fn without_leaderboard(draft: &mut PlanBuilder<'_>, type_: &str) -> Delivery {
-    let known = draft.status.condition(type_);
-    if known.is_some_and(|c| c.reason == Reason::NotRequired) {
+    if draft.status.is_delivered(type_) {
         return Delivery::Done;
     }
     let message = draft.no_leaderboard();
@@ -196,16 +195,17 @@ fn send_end(draft: &mut PlanBuilder<'_>, evalai: EvalaiView, is_overtaken: bool,
     let failed = evalai
         .error
         .map(|e| format!("The last request failed: {}", sentence(&e)));
-    let failed = failed.or(unread);
     let (reason, message) = if is_overtaken {
-        (Reason::ConcurrentUpdate, failed.or_else(|| Some(SENT_AGAIN.to_owned())))
+        let message = failed.unwrap_or_else(|| SENT_AGAIN.to_owned());
+        (Reason::ConcurrentUpdate, message)
     } else if let Some(until) = evalai.writes_from {
         draft.requeue_at(until);
-        (Reason::WaitingForPreviousController, Some(previous_controller(until)))
+        (Reason::WaitingForPreviousController, previous_controller(until))
+    } else if let Some(unread) = unread.filter(|_| failed.is_none()) {
+        (Reason::Unread, unread)
     } else {
-        (Reason::Waiting, failed)
+        (Reason::Waiting, failed.unwrap_or_default())
     };
-    let message = message.unwrap_or_default();
     draft.condition(conditions::PUBLISHED, Truth::False, reason, &message);
 }
 
@@ -245,15 +245,16 @@ pub fn previous_controller(until: Timestamp) -> String {
 
 /// The message for an end that cannot be read. The first text stands: another one for the same would be a write each time.
 fn cannot_be_read(draft: &PlanBuilder<'_>, type_: &str, why: &str) -> String {
-    const BEGINS: &str = "The stored result cannot be read:";
-    let known = draft.status.condition(type_).map(|c| c.message.to_string());
-    let known = known.filter(|message| message.starts_with(BEGINS));
-    known.unwrap_or_else(|| {
-        format!(
-            "{BEGINS} {} It is published when it can; look at the bucket.",
-            sentence(why)
-        )
-    })
+    let known = draft.status.condition(type_).filter(|c| c.reason == Reason::Unread);
+    known.map_or_else(
+        || {
+            format!(
+                "The stored result cannot be read: {} It is published when it can; look at the bucket.",
+                sentence(why)
+            )
+        },
+        |c| c.message.to_string(),
+    )
 }
 
 /// True if EvalAI's own end may have been undone by a write of ours that was under way. The condition remembers it.
@@ -333,9 +334,6 @@ fn keep_at_end(draft: &mut PlanBuilder<'_>) -> Option<Duration> {
     stop::log_left(draft.view.log, None).filter(|_| !has_just_ended)
 }
 
-/// How the message begins of an end that is settled without a row: another try would be refused again.
-const SUPERSEDED: &str = "The table keeps another row of this run";
-
 /// Shown while the row may still turn out otherwise.
 const FOLLOWS_EVALAI: &str = "The table's row is written when EvalAI has answered, since EvalAI may still have cancelled the submission. The \
                               condition Published shows what EvalAI is waited for.";
@@ -352,8 +350,8 @@ fn record(draft: &mut PlanBuilder<'_>, is_shown: bool) -> Delivery {
     if draft.leaderboard().is_none() {
         return without_leaderboard(draft, conditions::RECORDED);
     }
-    if let Some(message) = why_without_row(draft) {
-        draft.condition(conditions::RECORDED, Truth::False, Reason::NotRequired, &message);
+    if let Some((reason, message)) = why_without_row(draft) {
+        draft.condition(conditions::RECORDED, Truth::False, reason, &message);
         return Delivery::Done;
     }
     let view = draft.view.record.clone().unwrap_or_default();
@@ -380,52 +378,53 @@ fn record(draft: &mut PlanBuilder<'_>, is_shown: bool) -> Delivery {
                 sentence(&error)
             ),
         ),
-        None => (
-            Reason::Waiting,
-            unread.unwrap_or_else(|| (if is_shown { IN_LINE } else { FOLLOWS_EVALAI }).to_owned()),
-        ),
+        None => match unread {
+            Some(unread) => (Reason::Unread, unread),
+            None => (
+                Reason::Waiting,
+                (if is_shown { IN_LINE } else { FOLLOWS_EVALAI }).to_owned(),
+            ),
+        },
     };
     draft.condition(conditions::RECORDED, Truth::False, reason, &message);
     Delivery::Waiting
 }
 
-/// Why the end has no row of its own; none if it has one, or will.
-fn why_without_row(draft: &PlanBuilder<'_>) -> Option<String> {
-    if draft.view.record.is_none() {
-        Some(String::new())
+/// The reason and the message of an end that has no row of its own; None if it has one, or will.
+fn why_without_row(draft: &PlanBuilder<'_>) -> Option<(Reason, String)> {
+    let message = if draft.view.record.is_none() {
+        ""
     } else if draft.is_held() {
-        Some(gates::NOT_WRITTEN.to_owned())
+        gates::NOT_WRITTEN
     } else if draft.status.plan.is_none() {
-        Some("The submission was never accepted, so the table has no row for it.".to_owned())
+        "The submission was never accepted, so the table has no row for it."
     } else if !draft.has_row() {
-        Some(
-            "The row needs a team: give spec.team.id to a submission that is not EvalAI's. A check has none."
-                .to_owned(),
-        )
+        "The row needs a team: give spec.team.id to a submission that is not EvalAI's. A check has none."
     } else {
-        superseded(draft)
-    }
+        return superseded(draft).map(|message| (Reason::Superseded, message));
+    };
+    Some((Reason::NotRequired, message.to_owned()))
 }
 
 /// Shows that the row waits for EvalAI, where there will be one.
 fn follow_evalai(draft: &mut PlanBuilder<'_>) {
     let known = draft.status.condition(conditions::RECORDED);
-    let is_waiting = known.is_some_and(|known| known.reason == Reason::Waiting);
+    let is_waiting = known.is_some_and(|known| known.reason.is_one_of(&[Reason::Waiting, Reason::Unread]));
     if is_waiting && draft.leaderboard().is_some() && why_without_row(draft).is_none() {
         draft.condition(conditions::RECORDED, Truth::False, Reason::Waiting, FOLLOWS_EVALAI);
     }
 }
 
-/// Shows that the table keeps another row than that of this end: the recorder knows until it has forgotten the end, then the status.
+/// The message for an end over which the table keeps another row: another try would be refused again. The recorder knows until it has forgotten
+/// the end, then the status.
 fn superseded(draft: &PlanBuilder<'_>) -> Option<String> {
     if let Some(kept) = draft.view.record.as_ref().and_then(|row| row.superseded_by) {
         let next = kept.saturating_add(1);
         return Some(format!(
-            "{SUPERSEDED}, of attempt {kept}, and this end was not written there. Raise spec.attempt to {next} if the submission is to \
-             go on. Correct the row by hand if this end is the one that counts."
+            "The table keeps another row of this run, of attempt {kept}, and this end was not written there. Raise spec.attempt to {next} if \
+             the submission is to go on. Correct the row by hand if this end is the one that counts."
         ));
     }
     let shown = draft.status.condition(conditions::RECORDED)?;
-    let is_shown = shown.reason == Reason::NotRequired && shown.message.starts_with(SUPERSEDED);
-    is_shown.then(|| shown.message.to_string())
+    (shown.reason == Reason::Superseded).then(|| shown.message.to_string())
 }

@@ -113,7 +113,7 @@ fn an_end_whose_result_cannot_be_read_shows_why_it_waits() {
         (condition.reason.clone(), condition.message.to_string())
     };
     let waits = (
-        Reason::Waiting.into(),
+        Reason::Unread.into(),
         "The stored result cannot be read: the bucket results did not answer in time. It is published when it can; look at the bucket."
             .to_owned(),
     );

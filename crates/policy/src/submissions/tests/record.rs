@@ -49,7 +49,7 @@ fn an_end_that_the_table_does_not_take_is_settled_and_not_written_again() {
     let shown = conditions::get(&plan.status.conditions, RECORDED).unwrap();
     assert_eq!(
         (shown.status.as_str(), shown.reason.known().unwrap()),
-        ("False", Reason::NotRequired)
+        ("False", Reason::Superseded)
     );
     for part in ["of attempt 3", "Raise spec.attempt to 4", "Correct the row by hand"] {
         assert!(shown.message.contains(part), "{}", shown.message);
@@ -72,7 +72,7 @@ fn a_cancel_in_evalai_after_a_refusal_is_written_over_the_end_that_the_table_kep
         assert!(records(&world.pass()));
         supersede(&mut world);
         let plan = world.pass();
-        assert_eq!(condition(&plan, RECORDED).1, Reason::NotRequired);
+        assert_eq!(condition(&plan, RECORDED).1, Reason::Superseded);
         assert!(!records(&plan) && !has(&plan, |a| *a == Action::Forget));
         if is_restarted {
             world.view.record = Some(RecordView::default());
