@@ -96,7 +96,9 @@ class Source:
 
     def services(self) -> dict[str, frozenset[str]]:
         """Module of the services' crate -> its operations; those without any are left out."""
-        own = [name.removeprefix(f"{SERVICES_FOLDER}/") for name in self.texts if name.startswith(f"{SERVICES_FOLDER}/")]
+        own = [
+            name.removeprefix(f"{SERVICES_FOLDER}/") for name in self.texts if name.startswith(f"{SERVICES_FOLDER}/")
+        ]
         names = {Path(name).parts[0].removesuffix(".rs") for name in own}
         found = {name: self.operations_of(self.below(f"{SERVICES_FOLDER}/{name}")) for name in names}
         return {name: operations for name, operations in found.items() if operations}

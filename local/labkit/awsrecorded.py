@@ -43,9 +43,15 @@ S3: Mapping[tuple[str, str], str] = {
 QUERIES = ("list-type", "partNumber", "uploads", "uploadId")
 # Allowed and maybe not called in a run of the cluster's tests, and why it is allowed all the same.
 RARE: Mapping[tuple[str, str], str] = {
-    ("log-groups", "logs:DescribeLogGroups"): "only with logs.cloudWatch.retentionDays, as tests/api/log_groups.rs has it",
+    (
+        "log-groups",
+        "logs:DescribeLogGroups",
+    ): "only with logs.cloudWatch.retentionDays, as tests/api/log_groups.rs has it",
     ("log-groups", "logs:CreateLogGroup"): "only with logs.cloudWatch.retentionDays, as tests/api/log_groups.rs has it",
-    ("log-groups", "logs:PutRetentionPolicy"): "only with logs.cloudWatch.retentionDays, as tests/api/log_groups.rs has it",
+    (
+        "log-groups",
+        "logs:PutRetentionPolicy",
+    ): "only with logs.cloudWatch.retentionDays, as tests/api/log_groups.rs has it",
     (
         "submission-worker",
         "logs:GetLogEvents",

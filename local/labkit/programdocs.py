@@ -45,7 +45,9 @@ def page(text: str, repository: Path) -> str:
     plugin = (repository / PLUGIN).read_text()
     tables = {
         f"the status files, from {PROTOCOL}": status_files(protocol),
-        f"the exit codes of leaderboard-runner, from {RUNNER}": runner(sources(repository / RUNNER) + (repository / VERDICT).read_text()),
+        f"the exit codes of leaderboard-runner, from {RUNNER}": runner(
+            sources(repository / RUNNER) + (repository / VERDICT).read_text()
+        ),
         f"the exit codes of leaderboard-operator, from {OPERATOR}": operator(repository),
         f"the exit codes of kubectl leaderboard, from {PLUGIN}": rows(helps(plugin)),
     }

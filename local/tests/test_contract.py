@@ -153,7 +153,9 @@ class CheckContents(unittest.TestCase):
     def test_the_contents_are_copied_as_in_the_cluster(self) -> None:
         calls = Calls(CHECK, "a/contents:1")
         self.assertEqual(calls.ended.returncode, 0, calls.ended.stdout + calls.ended.stderr)
-        self.assertEqual(calls.ended.stdout, "20 routes: evaluation.carla.routes of the Leaderboard\nThe contents are complete.\n")
+        self.assertEqual(
+            calls.ended.stdout, "20 routes: evaluation.carla.routes of the Leaderboard\nThe contents are complete.\n"
+        )
         made = contractcheck.container(REPOSITORY, "v2", "contents")
         copy = calls.container("a/contents:1")
         self.assertEqual(("/bin/bash", *copy.words[1:]), made.command)
