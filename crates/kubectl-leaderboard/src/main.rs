@@ -103,11 +103,11 @@ enum Command {
     /// Run submissions again, from their stored results.
     #[command(
         after_help = "A submission that is named is Failed or Cancelled; with --restart, it runs. With -l or --all, a terminal shows which ones \
-                      fit, and asks.\n\nExit code 0: all are requested, or nobody was asked for; with --wait, all are Finished. 1: one was refused \
-                      or did not finish, or an error."
+                      fit, and asks.\n\nExit code 0: all are requested, or none matched; with --wait, all are Finished. 1: one was refused or did \
+                      not finish, or an error."
     )]
     Resume(resume::Resume),
-    /// Write what a person who helps needs into one file, without secrets, routes and names of teams.
+    /// Collect a support bundle in one file, without Secrets, routes and names of teams.
     Report(report::Report),
     /// Print manifests for a pipeline of Step Functions that this operator takes over. It asks neither AWS nor a cluster.
     #[command(
