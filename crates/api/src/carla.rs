@@ -23,7 +23,7 @@ pub enum LeaderboardVersion {
     V2,
 }
 
-/// What is done with scores that do not follow from their infractions.
+/// Treatment of scores that do not follow from their infractions.
 #[derive(Serialize, Deserialize, JsonSchema, Clone, Copy, Debug, Default, PartialEq, Eq)]
 pub enum Verify {
     /// Nothing is recomputed.
@@ -45,19 +45,19 @@ pub struct Carla {
     pub contents: ContentsContainer,
     /// The simulator of each pair.
     pub simulator: SimulatorContainer,
-    /// Simulator-agent pairs that share out the routes.
+    /// Number of simulator-agent pairs that share out the routes.
     #[serde(default = "defaults::pairs")]
     #[schemars(range(min = 1, max = 16))]
     pub pairs: i32,
-    /// Routes of a run, not counting repetitions.
+    /// Number of routes of a run, not counting repetitions.
     #[serde(default = "defaults::routes")]
     #[schemars(range(min = 1, max = 10000))]
     pub routes: i32,
-    /// How often each route is run. Default: 5 in V1, 1 in V2.
+    /// Number of times that each route is run. Default: 5 in V1, 1 in V2.
     #[serde(default, skip_serializing_if = "Option::is_none")]
     #[schemars(range(min = 1, max = 100))]
     pub repetitions: Option<i32>,
-    /// What is done with scores that do not follow from their infractions.
+    /// Treatment of scores that do not follow from their infractions.
     #[serde(default)]
     pub verify: Verify,
 }
@@ -71,15 +71,15 @@ pub struct TrackCarla {
     #[serde(default, skip_serializing_if = "Option::is_none")]
     #[schemars(length(min = 1, max = 64), regex(pattern = r"^[A-Za-z0-9_.-]+$"))]
     pub codename: Option<String>,
-    /// Overrides the Leaderboard's routes.
+    /// Number of routes, in place of the Leaderboard's.
     #[serde(default, skip_serializing_if = "Option::is_none")]
     #[schemars(range(min = 1, max = 10000))]
     pub routes: Option<i32>,
-    /// Overrides the Leaderboard's repetitions.
+    /// Number of repetitions, in place of the Leaderboard's.
     #[serde(default, skip_serializing_if = "Option::is_none")]
     #[schemars(range(min = 1, max = 100))]
     pub repetitions: Option<i32>,
-    /// Overrides the Leaderboard's pairs.
+    /// Number of pairs, in place of the Leaderboard's.
     #[serde(default, skip_serializing_if = "Option::is_none")]
     #[schemars(range(min = 1, max = 16))]
     pub pairs: Option<i32>,
@@ -166,7 +166,7 @@ pub struct SimulatorContainer {
     /// The node's X server, for `X11Socket`.
     #[serde(default, skip_serializing_if = "Option::is_none")]
     pub x11: Option<X11>,
-    /// The graphics adapter of every simulator, for nodes where Vulkan counts otherwise than the devices. Default: the one GPU that a simulator sees; if it sees several, that of its pair. V2 only.
+    /// Number of the graphics adapter of every simulator, for nodes where Vulkan counts otherwise than the devices. Default: the one GPU that a simulator sees; if it sees several, that of its pair. V2 only.
     #[serde(default, skip_serializing_if = "Option::is_none")]
     #[schemars(range(min = 0, max = 255))]
     pub graphics_adapter: Option<i32>,
@@ -184,9 +184,9 @@ pub struct CarlaPlan {
     /// Routes of each pair; their number is the number of pairs.
     #[schemars(length(max = 16))]
     pub slices: Vec<RouteSlice>,
-    /// Routes, not counting repetitions.
+    /// Number of routes, not counting repetitions.
     pub routes: i32,
-    /// Repetitions of each route.
+    /// Number of repetitions of each route.
     pub repetitions: i32,
     /// Image of the contents, renewed by each attempt.
     #[schemars(length(max = 512))]
@@ -199,11 +199,11 @@ pub struct CarlaPlan {
 /// The numbers of what a track effectively runs.
 #[derive(Serialize, Deserialize, JsonSchema, Clone, Debug, Default, PartialEq, Eq)]
 pub struct CarlaShape {
-    /// Simulator-agent pairs.
+    /// Number of simulator-agent pairs.
     pub pairs: i32,
-    /// Routes, not counting repetitions.
+    /// Number of routes, not counting repetitions.
     pub routes: i32,
-    /// Repetitions of each route.
+    /// Number of repetitions of each route.
     pub repetitions: i32,
 }
 

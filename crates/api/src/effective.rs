@@ -10,11 +10,11 @@ use super::{CarlaPlan, LeaderboardSpec, LeaderboardVersion, RouteSlice, RunId, R
 /// How many of what one track runs.
 #[derive(Clone, Debug, PartialEq, Eq)]
 pub struct Shape {
-    /// Simulator-agent pairs.
+    /// Number of simulator-agent pairs.
     pub pairs: usize,
-    /// Routes, not counting repetitions.
+    /// Number of routes, not counting repetitions.
     pub routes: usize,
-    /// Repetitions of each route.
+    /// Number of repetitions of each route.
     pub repetitions: usize,
     /// ROUTES_SUBSET of each pair.
     pub slices: Vec<RouteSlice>,

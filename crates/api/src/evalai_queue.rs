@@ -10,7 +10,7 @@ pub struct EvalaiQueue {
     /// Its name: what EvalAI calls QUEUE_NAME.
     #[schemars(length(min = 1, max = 80), regex(pattern = r"^[A-Za-z0-9_-]+(\.fifo)?$"))]
     pub name: String,
-    /// How long after its submission a message may wait for its Leaderboard to be applied, before it is dropped.
+    /// Seconds after its submission that a message may wait for its Leaderboard to be applied, before it is dropped.
     #[serde(default = "unknown_after_seconds")]
     #[schemars(range(min = 0, max = 1_209_600))]
     pub unknown_after_seconds: i64,

@@ -6,7 +6,7 @@ use kube::KubeSchema;
 use schemars::JsonSchema;
 use serde::{Deserialize, Serialize};
 
-/// `None`: the operator requests no GPU and checks for none. `PerContainer`: simulator and agent request one `resourceName` each. `NodeIndex`: simulators request one each, and both containers of pair n use the node's GPU n-1. `Claim`: both containers of a pair share one ResourceClaim. Default: `PerContainer` with a `resourceName`, else `None`. docs/gpu.md has what each one needs of a cluster.
+/// `None`: the operator requests no GPU and checks for none. `PerContainer`: simulator and agent request one `resourceName` each. `NodeIndex`: simulators request one each, and both containers of pair n use the node's GPU n-1. `Claim`: both containers of a pair share one ResourceClaim. Default: `PerContainer` with a `resourceName`, else `None`.
 #[derive(Serialize, Deserialize, JsonSchema, Clone, Copy, Debug, PartialEq, Eq)]
 pub enum GpuMode {
     /// The operator requests none and checks for none.
@@ -32,14 +32,14 @@ pub struct Gpu {
     /// How the containers of a pair get their GPU.
     #[serde(default, skip_serializing_if = "Option::is_none")]
     pub mode: Option<GpuMode>,
-    /// What the device plugin advertises, for example `nvidia.com/gpu`.
+    /// Resource that the device plugin advertises, for example `nvidia.com/gpu`.
     #[serde(default, skip_serializing_if = "Option::is_none")]
     #[schemars(
         length(min = 3, max = 317),
         regex(pattern = r"^[a-z0-9]([-a-z0-9.]*[a-z0-9])?/[A-Za-z0-9]([-A-Za-z0-9_.]{0,61}[A-Za-z0-9])?$")
     )]
     pub resource_name: Option<String>,
-    /// What is claimed for each pair.
+    /// Devices that are claimed for each pair.
     #[serde(default, skip_serializing_if = "Option::is_none")]
     pub claim: Option<GpuClaim>,
 }

@@ -78,19 +78,19 @@ pub struct LeaderboardSpec {
     /// Where submissions come from and scores are published. Absent: a local leaderboard, nothing is reported.
     #[serde(default, skip_serializing_if = "Option::is_none")]
     pub evalai: Option<Evalai>,
-    /// What participants submit to: sensors, map, and so on.
+    /// Tracks that participants submit to: sensors, map, and so on.
     #[schemars(length(min = 1, max = 32))]
     #[x_kube(merge_strategy = ListMerge::Map(vec!["name".into()]))]
     pub tracks: Vec<Track>,
     /// The kind of evaluation: exactly one member.
     pub evaluation: Evaluation,
-    /// How the submitted image is run.
+    /// Settings by which the submitted image is run.
     #[serde(default)]
     pub agent: AgentContainer,
-    /// Which container gets which GPU. Absent: none.
+    /// Assignment of GPUs to containers. Absent: none.
     #[serde(default, skip_serializing_if = "Option::is_none")]
     pub gpu: Option<Gpu>,
-    /// What `kubectl leaderboard check` runs.
+    /// Image and settings that `kubectl leaderboard check` runs.
     #[serde(default, skip_serializing_if = "Option::is_none")]
     pub check: Option<CheckImage>,
     /// Crashes and infrastructure failures that are forgiven.
@@ -110,17 +110,17 @@ pub struct LeaderboardSpec {
     /// The store of container logs. Absent: they are in the store of the results alone.
     #[serde(default, skip_serializing_if = "Option::is_none")]
     pub logs: Option<Logs>,
-    /// Who the Pod's own containers are towards S3.
+    /// AWS identity by which `workspace` and `logcopy` read and write S3 and CloudWatch.
     #[serde(default, skip_serializing_if = "Option::is_none")]
     pub pod_identity: Option<PodIdentity>,
-    /// What the Pods of strangers may reach.
+    /// Addresses that the Pods of submissions may reach.
     #[serde(default)]
     pub network: Network,
     /// RuntimeClass of the Pods, for example `gvisor`.
     #[serde(default, skip_serializing_if = "Option::is_none")]
     #[schemars(length(max = 253))]
     pub runtime_class_name: Option<String>,
-    /// How many submissions run at once.
+    /// Numbers of submissions that may run at once.
     #[serde(default)]
     pub concurrency: Concurrency,
     /// No new submission starts while true; running ones go on.
@@ -134,11 +134,11 @@ pub struct LeaderboardSpec {
     #[serde(default = "defaults::sync_period_seconds")]
     #[schemars(range(min = 1, max = 600))]
     pub sync_period_seconds: i64,
-    /// How long a finished Job is kept, once every system has its end.
+    /// Seconds that a finished Job is kept, once every system has its end.
     #[serde(default = "defaults::ttl_seconds_after_finished")]
     #[schemars(range(min = 0, max = 31_536_000))]
     pub ttl_seconds_after_finished: i32,
-    /// How long ended Submissions are kept.
+    /// Time for which ended Submissions are kept.
     #[serde(default)]
     pub retention: Retention,
 }
@@ -206,7 +206,7 @@ impl Leaderboard {
     }
 }
 
-/// What the operator last observed of a Leaderboard.
+/// State of a Leaderboard as the operator last observed it.
 #[derive(Serialize, Deserialize, KubeSchema, Clone, Debug, Default, PartialEq)]
 #[serde(rename_all = "camelCase")]
 pub struct LeaderboardStatus {
@@ -231,7 +231,7 @@ pub struct LeaderboardStatus {
     #[x_kube(merge_strategy = ListMerge::Map(vec!["team".into()]))]
     #[schemars(length(max = MAX_USING_TEAMS))]
     pub gpu_use: Vec<TeamUse>,
-    /// What each track effectively runs.
+    /// Tracks as they effectively run.
     #[serde(default, skip_serializing_if = "Vec::is_empty")]
     #[x_kube(merge_strategy = ListMerge::Map(vec!["name".into()]))]
     #[schemars(length(max = 32))]
@@ -248,7 +248,7 @@ pub struct LeaderboardStatus {
 pub struct EvalaiUse {
     /// Sent in the last minute.
     pub requests_last_minute: i32,
-    /// The limit, `spec.evalai.requestsPerMinute`.
+    /// Limit of requests per minute, as `spec.evalai.requestsPerMinute` sets it.
     pub requests_per_minute: i32,
     /// Results that EvalAI does not have yet; absent if it has all.
     #[serde(default, skip_serializing_if = "Option::is_none")]
@@ -259,7 +259,7 @@ pub struct EvalaiUse {
 #[derive(Serialize, Deserialize, schemars::JsonSchema, Clone, Debug, PartialEq, Eq)]
 #[serde(rename_all = "camelCase")]
 pub struct EvalaiBacklog {
-    /// How many.
+    /// Number of results that wait.
     pub waiting: i32,
     /// When the last of them is expected to be in EvalAI, to the minute.
     pub last_expected_time: Time,
@@ -269,11 +269,11 @@ pub struct EvalaiBacklog {
 #[derive(Serialize, Deserialize, schemars::JsonSchema, Clone, Debug, PartialEq, Eq)]
 #[serde(rename_all = "camelCase")]
 pub struct TableUse {
-    /// How many wait for more than 10 s. The table gets one in 2 s.
+    /// Number of rows that wait for more than 10 s. The table gets one in 2 s.
     pub waiting: i32,
 }
 
-/// What a track effectively runs.
+/// Track as it effectively runs.
 #[derive(Serialize, Deserialize, schemars::JsonSchema, Clone, Debug, Default, PartialEq, Eq)]
 pub struct TrackStatus {
     /// Name of the track.
@@ -286,15 +286,15 @@ pub struct TrackStatus {
 /// Submissions of a Leaderboard by state; `resumed` counts as running.
 #[derive(Serialize, Deserialize, schemars::JsonSchema, Clone, Copy, Debug, Default, PartialEq, Eq)]
 pub struct Counts {
-    /// That wait.
+    /// Number of submissions that wait.
     pub pending: i32,
-    /// That run, also after a resume.
+    /// Number of submissions that run, also after a resume.
     pub running: i32,
-    /// With results that count.
+    /// Number of submissions that ended with results that count.
     pub finished: i32,
-    /// Without results that count.
+    /// Number of submissions that ended without results that count.
     pub failed: i32,
-    /// That a person, EvalAI or a deletion ended.
+    /// Number of submissions that a person, EvalAI or a deletion ended.
     pub cancelled: i32,
 }
 

@@ -51,7 +51,7 @@ pub struct Network {
     /// `Managed`: the operator applies and restores one NetworkPolicy, and creates no Job without it. `External`: the operator applies none; the cluster's own policies are trusted.
     #[serde(default)]
     pub policy: PolicySource,
-    /// What follows when a Pod measures that its NetworkPolicy is not enforced. `Require`: the run fails as NotIsolated. `Warn`: it goes on, and the condition Isolated shows it. `Disabled`: nothing is measured.
+    /// Consequence of a Pod's measurement that its NetworkPolicy is not enforced. `Require`: the run fails as NotIsolated. `Warn`: it goes on, and the condition Isolated shows it. `Disabled`: nothing is measured.
     #[serde(default)]
     pub enforcement: Enforcement,
     /// Address and port that the Pod connects to, to measure whether the policy is enforced, such as `10.0.0.1:443`. It must answer, and `egress` must not allow it: an address that never answers always looks enforced. Default: the API server's Service address. Set it where `egress` allows that one.

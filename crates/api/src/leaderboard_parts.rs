@@ -67,11 +67,11 @@ pub struct Track {
 #[derive(Serialize, Deserialize, JsonSchema, Clone, Copy, Debug, Default, PartialEq, Eq)]
 #[serde(rename_all = "camelCase")]
 pub struct TrackDeadlines {
-    /// For the pulls of all images of a Pod.
+    /// Seconds for the pulls of all images of a Pod.
     #[serde(default, skip_serializing_if = "Option::is_none")]
     #[schemars(range(min = 1, max = 31_536_000))]
     pub pull_seconds: Option<i64>,
-    /// From the Pod's scheduling, or from the end of its last pull, to its first agent.
+    /// Seconds from the Pod's scheduling, or from the end of its last pull, to its first agent.
     #[serde(default, skip_serializing_if = "Option::is_none")]
     #[schemars(range(min = 1, max = 31_536_000))]
     pub start_seconds: Option<i64>,
@@ -89,7 +89,7 @@ pub struct TrackContainer {
     pub resources: Option<ResourceRequirements>,
 }
 
-/// What `kubectl leaderboard check` runs.
+/// Image and settings that `kubectl leaderboard check` runs.
 #[derive(Serialize, Deserialize, JsonSchema, Clone, Debug, PartialEq, Eq)]
 pub struct CheckImage {
     /// The image of an agent of the host's own, which drives one route. `agent.images` need not allow it.
@@ -142,7 +142,7 @@ pub struct AgentContainer {
 #[derive(Serialize, Deserialize, JsonSchema, Clone, Copy, Debug, PartialEq, Eq)]
 #[serde(rename_all = "camelCase")]
 pub struct Retries {
-    /// How often a pair may be started again after a crash; 0 ends the run at the first one.
+    /// Number of times that a worker may be started again after a crash; 0 ends the run at the first one.
     #[serde(default = "defaults::retries_per_worker")]
     #[schemars(range(min = 0, max = 100))]
     pub per_worker: i32,
@@ -170,19 +170,19 @@ pub struct Deadlines {
     #[serde(default, skip_serializing_if = "Option::is_none")]
     #[schemars(range(min = 1, max = 31_536_000))]
     pub schedule_seconds: Option<i64>,
-    /// For the pulls of all images of a Pod. While a container waits for its image, `startSeconds` does not count.
+    /// Seconds for the pulls of all images of a Pod. While a container waits for its image, `startSeconds` does not count.
     #[serde(default = "defaults::pull_seconds")]
     #[schemars(range(min = 1, max = 31_536_000))]
     pub pull_seconds: i64,
-    /// From the Pod's scheduling, or from the end of its last pull, to its first agent.
+    /// Seconds from the Pod's scheduling, or from the end of its last pull, to its first agent.
     #[serde(default = "defaults::start_seconds")]
     #[schemars(range(min = 1, max = 31_536_000))]
     pub start_seconds: i64,
-    /// Until a simulator answers.
+    /// Seconds until a simulator must answer.
     #[serde(default = "defaults::ready_seconds")]
     #[schemars(range(min = 1, max = 31_536_000))]
     pub ready_seconds: i64,
-    /// An agent without output is stopped.
+    /// Seconds without output after which an agent is stopped.
     #[serde(default = "defaults::idle_seconds")]
     #[schemars(range(min = 1, max = 31_536_000))]
     pub idle_seconds: i64,
@@ -190,15 +190,15 @@ pub struct Deadlines {
     #[serde(default, skip_serializing_if = "Option::is_none")]
     #[schemars(range(min = 1, max = 31_536_000))]
     pub run_seconds: Option<i64>,
-    /// From a cancel to the end of the Pod.
+    /// Seconds from a cancel to the end of the Pod.
     #[serde(default = "defaults::cancel_seconds")]
     #[schemars(range(min = 1, max = 31_536_000))]
     pub cancel_seconds: i64,
-    /// How long a finished Pod waits for its results to be stored.
+    /// Seconds that a finished Pod waits for its results to be stored.
     #[serde(default = "defaults::flush_seconds")]
     #[schemars(range(min = 1, max = 31_536_000))]
     pub flush_seconds: i64,
-    /// How long a deleted Submission waits for its results to be published.
+    /// Seconds that a deleted Submission waits for its results to be published.
     #[serde(default = "defaults::finalize_seconds")]
     #[schemars(range(min = 0, max = 604_800))]
     pub finalize_seconds: i64,
@@ -231,11 +231,11 @@ pub struct PodIdentity {
 #[serde(rename_all = "camelCase")]
 #[x_kube(validation = Rule::new("!has(self.total) || !has(self.perTeam) || self.perTeam <= self.total").message("concurrency.perTeam is larger than concurrency.total: it could never be reached"))]
 pub struct Concurrency {
-    /// Of this Leaderboard.
+    /// Maximum number of running submissions of this Leaderboard.
     #[serde(default, skip_serializing_if = "Option::is_none")]
     #[schemars(range(min = 1))]
     pub total: Option<i32>,
-    /// Of one team.
+    /// Maximum number of running submissions of one team.
     #[serde(default, skip_serializing_if = "Option::is_none")]
     #[schemars(range(min = 1))]
     pub per_team: Option<i32>,

@@ -51,14 +51,14 @@ pub struct Evalai {
     #[serde(default = "defaults::requests_per_minute")]
     #[schemars(range(min = 6, max = 6000))]
     pub requests_per_minute: i32,
-    /// Time between two sweeps for submissions whose message was lost.
+    /// Seconds between two sweeps for submissions whose message was lost.
     #[serde(default = "defaults::sweep_seconds")]
     #[schemars(range(min = 5, max = 86400))]
     pub sweep_seconds: i64,
-    /// Who may read the tail of a failed submission's log.
+    /// Readers of the tail of a failed submission's log.
     #[serde(default)]
     pub log_tail: LogTail,
-    /// Whether results go to EvalAI, or the submissions of another program are only run once more.
+    /// Mode of the challenge: results go to EvalAI, or the submissions of another program are only run once more.
     #[serde(default)]
     pub mode: EvalaiMode,
 }
@@ -166,11 +166,11 @@ pub struct SqsQueue {
     #[serde(rename = "deadLetterURL", default, skip_serializing_if = "Option::is_none")]
     #[schemars(length(max = 512), regex(pattern = r"^https?://\S+$"))]
     pub dead_letter_url: Option<String>,
-    /// How long a message may wait for its Leaderboard to be applied.
+    /// Seconds that a message may wait for its Leaderboard to be applied.
     #[serde(default = "defaults::unknown_after_seconds")]
     #[schemars(range(min = 0, max = 1_209_600))]
     pub unknown_after_seconds: i64,
-    /// What becomes of messages that nobody serves.
+    /// Treatment of messages that no Leaderboard serves.
     #[serde(default)]
     pub foreign: Foreign,
 }
@@ -206,7 +206,7 @@ pub struct S3Bucket {
     #[serde(default, skip_serializing_if = "Option::is_none")]
     #[schemars(length(max = 512), regex(pattern = r"^https?://\S+$"))]
     pub endpoint: Option<String>,
-    /// What one run may store, `16Mi` to `1Ti`; what is beyond it is left out, and logcopy's log says so. A file counts at least 4 KiB.
+    /// Size that one run may store, `16Mi` to `1Ti`; what is beyond it is left out, and logcopy's log says so. A file counts at least 4 KiB.
     #[serde(default = "defaults::size_limit")]
     pub size_limit: ByteQuantity,
     /// Key of KMS that S3 encrypts each object with (SSE-KMS); default: what the bucket says.

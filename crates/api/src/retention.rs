@@ -9,7 +9,7 @@ use serde::{Deserialize, Serialize};
 #[derive(Serialize, Deserialize, JsonSchema, Clone, Copy, Debug, Default, PartialEq, Eq)]
 #[serde(rename_all = "camelCase")]
 pub struct Retention {
-    /// A Submission is deleted so long after its end, once EvalAI and the table have that end; 0 keeps all. Results and rows stay. Submissions that a tool applies from git would be applied again.
+    /// Seconds after its end at which a Submission is deleted, once EvalAI and the table have that end; 0 keeps all. Results and rows stay. Submissions that a tool applies from git would be applied again.
     #[serde(default)]
     #[schemars(range(min = 0, max = 31_536_000))]
     pub finished_seconds: i64,

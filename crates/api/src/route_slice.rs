@@ -11,10 +11,10 @@ use serde::{Deserialize, Serialize};
 /// Consecutive routes of one pair.
 #[derive(Serialize, Deserialize, JsonSchema, Clone, Copy, Debug, PartialEq, Eq)]
 pub struct RouteSlice {
-    /// The first one, counted from 0.
+    /// Number of the first route, counted from 0.
     #[schemars(range(min = 0, max = 99_999))]
     pub first: u32,
-    /// The last one.
+    /// Number of the last route.
     #[schemars(range(min = 0, max = 99_999))]
     pub last: u32,
 }

@@ -80,14 +80,14 @@ pub struct SubmissionSpec {
     /// is published and recorded nowhere. Its name begins with `check-`.
     #[serde(default, skip_serializing_if = "is_false")]
     pub check: bool,
-    /// Who submitted; asked from EvalAI when absent.
+    /// Team that submitted; asked from EvalAI when absent.
     #[serde(default, skip_serializing_if = "Option::is_none")]
     pub team: Option<Team>,
-    /// Higher goes first within a team.
+    /// Priority within a team; a higher number goes first.
     #[serde(default)]
     #[schemars(range(min = -1000, max = 1000))]
     pub priority: i32,
-    /// Grows to run it again from what is stored; a live run stores its results and stops first. Manifests in git leave it out.
+    /// Number of the attempt; a higher one runs it again from what is stored, and a live run stores its results and stops first. Manifests in git leave it out.
     #[serde(default)]
     #[schemars(range(min = 1, max = 9999))]
     pub attempt: Attempt,

@@ -55,7 +55,7 @@ impl State {
     }
 }
 
-/// What the operator last observed of a Submission.
+/// State of a Submission as the operator last observed it.
 #[derive(Serialize, Deserialize, KubeSchema, Clone, Debug, Default, PartialEq)]
 #[serde(rename_all = "camelCase")]
 pub struct SubmissionStatus {
@@ -71,7 +71,7 @@ pub struct SubmissionStatus {
     /// Jobs of this attempt that infrastructure failures ended, `interruptions` among them.
     #[serde(default, skip_serializing_if = "is_zero")]
     pub retry: i32,
-    /// Those of them whose node was taken away, which use up no retry.
+    /// Jobs whose node was taken away, which use up no retry.
     #[serde(default, skip_serializing_if = "Option::is_none")]
     pub interruptions: Option<Box<Interruptions>>,
     /// Times the Job of this attempt had to be created again after somebody deleted it.
@@ -87,21 +87,21 @@ pub struct SubmissionStatus {
     /// Reason names in one word why the submission is in its state.
     #[serde(default, skip_serializing_if = "Option::is_none")]
     pub reason: Option<ReasonName>,
-    /// The same as a sentence.
+    /// Reason as a sentence.
     #[serde(default, skip_serializing_if = "Option::is_none")]
     #[schemars(length(max = MAX_MESSAGE))]
     pub message: Option<SharedText>,
-    /// What holds the submission up at present, and since when.
+    /// Reason that holds the submission up at present, and since when.
     #[serde(default, skip_serializing_if = "Option::is_none")]
     pub blocked_since: Option<Box<BlockedSince>>,
-    /// Who submitted.
+    /// Team that submitted.
     #[serde(default, skip_serializing_if = "Option::is_none")]
     pub team: Option<TeamStatus>,
     /// Name of the track.
     #[serde(default, skip_serializing_if = "Option::is_none")]
     #[schemars(length(max = 32))]
     pub track: Option<String>,
-    /// What is run, pinned at acceptance.
+    /// Plan of the run, pinned at acceptance.
     #[serde(default, skip_serializing_if = "Option::is_none")]
     pub plan: Option<RunPlan>,
     /// The participant's image as the first agent ran it. Every later Job runs the same, wherever its tag moves.
@@ -129,7 +129,7 @@ pub struct SubmissionStatus {
     /// When what happened.
     #[serde(default, skip_serializing_if = "Times::is_empty")]
     pub times: Times,
-    /// How long the run took, for people, such as `1h25m`; only once it has ended. `times` has it exactly.
+    /// Duration of the run for people, such as `1h25m`; only once it has ended. `times` has it exactly.
     #[serde(default, skip_serializing_if = "Option::is_none")]
     #[schemars(length(max = 32))]
     pub duration: Option<String>,
@@ -151,14 +151,14 @@ pub struct SubmissionStatus {
     #[serde(rename = "resultsURL", default, skip_serializing_if = "Option::is_none")]
     #[schemars(length(max = 2048))]
     pub results_url: Option<String>,
-    /// What went wrong.
+    /// Failure of the submission, with its cause and next step.
     #[serde(default, skip_serializing_if = "Option::is_none")]
     pub failure: Option<Box<Failure>>,
     /// DoneBefore counts the units that were stored when the present Job was due. It is absent until an infrastructure failure that an
     /// agent can cause has ended a Job of this attempt. After another such failure a further Job follows only if more are stored.
     #[serde(default, skip_serializing_if = "Option::is_none")]
     pub done_before: Option<i32>,
-    /// What its Jobs have used. A resume keeps it.
+    /// Resources that its Jobs have used. A resume keeps them.
     #[serde(rename = "use", default, skip_serializing_if = "Option::is_none")]
     pub usage: Option<Use>,
     /// Conditions lists one condition of each type: `Accepted`, `Running`, `Archived`, `Recorded`, `Published`, `Stalled`, `Finished`,
@@ -220,7 +220,7 @@ pub struct RunPlan {
     /// Name of the track.
     #[schemars(length(max = 32))]
     pub track: SharedText,
-    /// EvalAI phase.
+    /// Number of the EvalAI phase.
     #[serde(default, skip_serializing_if = "Option::is_none")]
     pub phase: Option<i64>,
     /// Where the results go.
@@ -313,7 +313,7 @@ impl FailureClass {
     }
 }
 
-/// What went wrong.
+/// Failure of the submission, with its cause and next step.
 #[derive(Serialize, Deserialize, JsonSchema, Clone, Debug, PartialEq, Eq)]
 #[serde(rename_all = "camelCase")]
 pub struct Failure {
@@ -327,11 +327,11 @@ pub struct Failure {
     #[serde(default, skip_serializing_if = "Option::is_none")]
     #[schemars(length(max = MAX_MESSAGE))]
     pub next_step: Option<String>,
-    /// What the participant reads of it in EvalAI; absent where that is `message`.
+    /// Text that the participant reads of it in EvalAI; absent where that is `message`.
     #[serde(default, skip_serializing_if = "Option::is_none")]
     #[schemars(length(max = MAX_MESSAGE))]
     pub participant_message: Option<String>,
-    /// Worker is the `id` of the worker in which it happened. It is absent if the failure concerns the whole run.
+    /// Number (`id`) of the worker in which it happened; absent if the failure concerns the whole run.
     #[serde(default, skip_serializing_if = "Option::is_none")]
     pub worker: Option<i32>,
 }

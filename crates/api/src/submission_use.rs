@@ -12,7 +12,7 @@ pub const MAX_INTERRUPTED_NODES: usize = 8;
 #[derive(Serialize, Deserialize, KubeSchema, Clone, Debug, PartialEq)]
 #[serde(rename_all = "camelCase")]
 pub struct Interruptions {
-    /// How many.
+    /// Number of interruptions.
     pub number: i32,
     /// When the last of them ended.
     pub last_time: Time,
@@ -26,7 +26,7 @@ pub struct Interruptions {
 /// Teams that a Leaderboard shows.
 pub const MAX_USING_TEAMS: usize = 10;
 
-/// What the submissions of a team have used, of those that are still there.
+/// Use of GPUs by the submissions of a team, as far as they still exist.
 #[derive(Serialize, Deserialize, JsonSchema, Clone, Debug, PartialEq, Eq)]
 #[serde(rename_all = "camelCase")]
 pub struct TeamUse {
@@ -41,7 +41,7 @@ pub struct TeamUse {
 #[derive(Serialize, Deserialize, JsonSchema, Clone, Copy, Debug, Default, PartialEq, Eq)]
 #[serde(rename_all = "camelCase")]
 pub struct Use {
-    /// GPUs of the present or last Job.
+    /// Number of GPUs of the present or last Job.
     pub gpus: i64,
     /// GPUs times seconds from the Pod's scheduling to its end, summed over the Jobs that have ended.
     pub gpu_seconds: i64,

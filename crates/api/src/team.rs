@@ -8,7 +8,7 @@ use serde::{Deserialize, Serialize};
 
 use super::text::{LONGEST_NAME, one_line};
 
-/// Who submitted.
+/// Team that submitted.
 #[derive(Serialize, Deserialize, KubeSchema, Clone, Debug, Default, PartialEq, Eq)]
 #[x_kube(validation = Rule::new("has(self.id) || has(self.name)").message("team needs an id or a name"))]
 pub struct Team {

@@ -11,12 +11,12 @@ use serde::{Deserialize, Serialize};
 #[derive(Serialize, Deserialize, JsonSchema, Clone, Debug, PartialEq, Eq)]
 #[serde(rename_all = "camelCase")]
 pub struct Waiting {
-    /// From 1.
+    /// Place in the line, from 1.
     pub position: i32,
     /// Seconds until it starts, at the least; absent until runs of this track have ended, and while the Leaderboard is paused.
     #[serde(default, skip_serializing_if = "Option::is_none")]
     pub eta_min_seconds: Option<i64>,
-    /// The same, at the most.
+    /// Seconds until it starts, at the most.
     #[serde(default, skip_serializing_if = "Option::is_none")]
     pub eta_max_seconds: Option<i64>,
     /// For people: `3rd, 20-35 min`.

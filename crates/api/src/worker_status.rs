@@ -33,14 +33,14 @@ pub struct WorkerStatus {
     pub done: i32,
     /// Total counts the worker's units.
     pub total: i32,
-    /// Crashes counts how often the worker has crashed so far.
+    /// Number of crashes of the worker so far.
     pub crashes: i32,
     /// State shows what the worker does.
     pub state: WorkerState,
     /// Last shows how the worker's last container ended.
     #[serde(default, skip_serializing_if = "Option::is_none")]
     pub last: Option<Box<LastEnd>>,
-    /// EndedFromOutside counts how often the worker's containers were ended from outside and started again, which is no crash.
+    /// Number of times that the worker's containers were ended from outside and started again, which is no crash.
     #[serde(default, skip_serializing_if = "is_zero")]
     pub ended_from_outside: i32,
     /// EnvironmentFailed is true if the worker's environment has failed in this attempt, by its own container's word or by the kubelet's.
