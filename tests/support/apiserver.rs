@@ -38,7 +38,7 @@ const TRIES: usize = 3;
 /// The user that the tests are.
 const ADMIN: &str = "admin";
 /// Users with all rights whose requests the audit log has, each for one test that counts them.
-const COUNTED: u32 = 32;
+const COUNTED: u32 = 64;
 
 /// A request of a counted user.
 #[derive(Debug, Clone, serde::Deserialize)]
