@@ -316,7 +316,7 @@ def largest(tab: Tab, page: Page) -> str:
         view[name]["rows"] = [{**rows[at % len(rows)], "name": f"{name}-{at}"} for at in range(most)]
         view[name]["count"] = 10_000
     for row in view["running"]["rows"]:
-        row["pairs"] = [{**row["pairs"][0], "id": at} for at in range(1, 17)]
+        row["workers"] = [{**row["workers"][0], "id": at} for at in range(1, 17)]
     page.send(event(view))
     tab.wait("document.querySelectorAll('#waiting .row').length === 200")
     spent = """(() => {
@@ -330,7 +330,7 @@ def largest(tab: Tab, page: Page) -> str:
         "9,800 more" in str(tab.run("document.querySelector('#waiting').innerText")),
         "it does not say that there are more",
     )
-    return f"320 rows, 960 pairs, drawn again in {took:.0f} ms"
+    return f"320 rows, 960 workers, drawn again in {took:.0f} ms"
 
 
 CHECKS: dict[str, Callable[[Tab, Page], str]] = {
