@@ -97,7 +97,7 @@ def faults(query: str, metrics: Exported, literals: frozenset[str]) -> Iterator[
 
 def of_repository(repository: Path) -> tuple[Exported, frozenset[str]]:
     """The metrics of the operator, and every string that may be the value of a label."""
-    sources = [*(repository / "src").rglob("*.rs"), *(repository / "crates" / "api" / "src").rglob("*.rs")]
+    sources = [*(repository / "src").rglob("*.rs"), *(repository / "crates").glob("*/src/**/*.rs")]
     texts = "\n".join(file.read_text() for file in sources)
     metrics = exported(source_of(repository))
     if not metrics:
