@@ -75,7 +75,7 @@ async fn a_good_leaderboard_passes_while_it_is_paused() {
             &text,
             &[
                 "is Finished since",
-                "1/1 done",
+                "1/1 routes done",
                 "S3:          Stored",
                 "Ready:       True, Ready",
                 "The check passed.",

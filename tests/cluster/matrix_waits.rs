@@ -121,7 +121,8 @@ async fn unknown_track(scene: &Scene) {
 async fn quota(scene: &Scene) {
     let mut case = Case::open("quota exceeded", "Pending QuotaExceeded; Finished");
     // It counts Pods without a time limit alone: all others here have one, and the quota is of the whole namespace.
-    let no_limit = json!({"deadlines": {"runSeconds": null}});
+    let mut no_limit = small(json!({}));
+    no_limit["deadlines"]["runSeconds"] = Value::Null;
     let none = json!({"metadata": {"name": "none"}, "spec": {"hard": {"pods": "0"}, "scopes": ["NotTerminating"]}});
     let none: ResourceQuota = serde_json::from_value(none).unwrap();
     scene.api().create(&PostParams::default(), &none).await.unwrap();
@@ -130,7 +131,7 @@ async fn quota(scene: &Scene) {
         quota.is_some_and(|quota| quota.status.as_ref().is_some_and(|status| status.hard.is_some()))
     };
     scene.wait("none", "it is counted", SHOWN, counted).await;
-    board(scene, "quota", no_limit).await;
+    scene.leaderboard("quota", no_limit).await;
     case.cause();
     scene.submit_to("quota", "quota", "agent:standard").await;
     case.shows(scene, "quota", "QuotaExceeded", "exceeded quota: none")
