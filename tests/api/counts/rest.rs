@@ -57,6 +57,13 @@ pub async fn of_refused_jobs() -> Rest {
     for name in names() {
         world.until(&name, "it has a Job", has_job).await;
     }
+    // The status names a Job before it is there.
+    for name in names() {
+        let there = |job: Option<&Job>| job.is_some();
+        let job = format!("{name}-1");
+        let made = kube::runtime::wait::await_condition(world.api::<Job>(), &job, there);
+        made.await.unwrap();
+    }
     let jobs = world.api::<Job>().list(&ListParams::default()).await.unwrap();
     assert_eq!(jobs.items.len(), COUNT);
     for job in &jobs {
