@@ -56,7 +56,7 @@ fn served(all: Vec<Arc<Leaderboard>>, allowed: &Allowed) -> Vec<Arc<Leaderboard>
 mod tests {
     use super::*;
     use crate::bridge::sqs::desired;
-    use crate::bridge::tests::{board, with_queue};
+    use leaderboard_policy::intake::fixtures::{board, with_queue};
 
     #[test]
     fn a_queue_that_a_leaderboard_may_not_name_is_not_read() {

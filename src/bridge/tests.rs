@@ -14,34 +14,11 @@ use super::sqs::{PULSE_AGE, PULSE_LIMIT};
 use super::*;
 use crate::metrics::Program;
 use leaderboard_base::shutdown::Stop;
+use leaderboard_policy::intake::fixtures::{board, with_queue};
 
 type Server = Handle<Request<Body>, Response<Body>>;
 
 const QUEUE: &str = "https://q/1";
-
-/// A Leaderboard of challenge 1 with phases 2 and 3, created at this second.
-pub(super) fn board(name: &str, second: i64) -> Leaderboard {
-    let created = jiff::Timestamp::from_second(second).unwrap().to_string();
-    serde_json::from_value(json!({
-        "apiVersion": "leaderboard.carla.org/v1alpha1",
-        "kind": "Leaderboard",
-        "metadata": {"name": name, "namespace": "ns", "creationTimestamp": created},
-        "spec": {
-            "evalai": {"apiServer": "https://e", "challenge": 1, "token": {"secretKeyRef": {"name": "t", "key": "k"}}},
-            "tracks": [{"name": "sensors", "phase": 2}, {"name": "map", "phase": 3}],
-            "evaluation": {"carla": {
-                "version": "V2", "contents": {"image": "c"}, "simulator": {"image": "s"},
-            }},
-            "storage": {"s3": {"bucket": "bbb"}}
-        }
-    }))
-    .unwrap()
-}
-
-pub(super) fn with_queue(mut board: Leaderboard, url: &str) -> Arc<Leaderboard> {
-    board.spec.queue = Some(serde_json::from_value(json!({"sqs": {"url": url}})).unwrap());
-    Arc::new(board)
-}
 
 fn client() -> (Clients, Server) {
     let (service, handle) = pair();

@@ -30,16 +30,15 @@ use tokio::task::JoinHandle;
 use crate::support::files::until_there;
 use crate::support::ministack::{self, server};
 use leaderboard_api::names::FAILURE_LOG_KEY;
-use leaderboard_api::{
-    Attempt, CarlaPlan, LeaderboardVersion, RouteSlice, RunPlan, S3Bucket, Storage, StorageClass, Verify,
-};
+use leaderboard_api::{Attempt, StorageClass};
 use leaderboard_aws::archive::{Archive, Cause, Fetched, Kept};
 use leaderboard_aws::clients::Aws;
 use leaderboard_aws::logs::LogClient;
 use leaderboard_contract::report::{MAX_BYTES, OWNER_KEY, Owner, REPORT_KEY, Report};
-use leaderboard_contract::run::{Run, SCHEMA, STATUS_FOLDER, Stop};
+use leaderboard_contract::run::{Run, STATUS_FOLDER, Stop};
 use leaderboard_contract::verdict::{WorkspaceReason, WorkspaceVerdict};
 use leaderboard_evaluation::Object;
+use leaderboard_evaluation::fixtures::{self, checkpoint};
 use leaderboard_evaluation::judge::Pace;
 use leaderboard_evidence::Tree;
 use leaderboard_pod::logcopy::{self, LogcopyError};
@@ -245,86 +244,14 @@ async fn until<T, F: Future<Output = Option<T>>>(ask: impl Fn() -> F) -> T {
         .expect("it never came to be")
 }
 
-/// Two pairs of two routes each.
+/// Two pairs of two routes each, in a bucket of the stand-in.
 fn run(bucket: &str) -> Run {
-    Run {
-        schema: SCHEMA,
-        namespace: "default".to_owned(),
-        submission: "submission-77".to_owned(),
-        uid: "uid-1".to_owned(),
-        attempt: Attempt(1),
-        plan: RunPlan {
-            run_id: "77".parse().unwrap(),
-            track: "sensors".into(),
-            phase: None,
-            storage: Storage {
-                s3: S3Bucket {
-                    bucket: bucket.to_owned(),
-                    prefix: Some("runs/".to_owned()),
-                    region: None,
-                    endpoint: None,
-                    size_limit: LIMIT.to_string().parse().unwrap(),
-                    kms_key_arn: None,
-                    storage_class: None,
-                },
-            },
-            image: "image".to_owned(),
-            carla: CarlaPlan {
-                version: LeaderboardVersion::V2,
-                codename: "SENSORS".into(),
-                slices: vec![RouteSlice { first: 0, last: 1 }, RouteSlice { first: 2, last: 3 }],
-                routes: 4,
-                repetitions: 1,
-                contents_image: "contents".into(),
-                simulator_image: "simulator".into(),
-            },
-            resume: false,
-            earlier_attempts: 0,
-            submission_uid: None,
-        },
-        verify: Verify::Disabled,
-        period_seconds: 1,
-        flush_seconds: 60,
-        cancel_seconds: 20,
-        logs: None,
-        isolation: None,
-    }
-}
-
-/// A checkpoint of Leaderboard 2.0.
-fn checkpoint(first: u32, done: u32, total: u32) -> String {
-    let record = |index: u32| {
-        serde_json::json!({
-            "index": index,
-            "route_id": format!("RouteScenario_{}_rep0", first + index),
-            "status": "Completed",
-            "num_infractions": 0,
-            "infractions": {"collisions_pedestrian": [], "collisions_vehicle": [], "collisions_layout": [],
-                "red_light": [], "stop_infraction": [], "outside_route_lanes": [], "min_speed_infractions": [],
-                "yield_emergency_vehicle_infractions": [], "scenario_timeouts": [], "route_dev": [],
-                "vehicle_blocked": [], "route_timeout": []},
-            "scores": {"score_route": 100.0, "score_penalty": 1.0, "score_composed": 100.0},
-            "meta": {"route_length": 100.0, "duration_game": 10.0, "duration_system": 20.0},
-        })
-    };
-    let global = if done == total {
-        serde_json::json!({"index": -1})
-    } else {
-        serde_json::json!({})
-    };
-    let file = serde_json::json!({
-        "_checkpoint": {
-            "global_record": global,
-            "progress": [done, total],
-            "records": (0..done).map(record).collect::<Vec<_>>(),
-        },
-        "entry_status": "Started",
-        "eligible": false,
-        "sensors": ["carla_camera", "carla_gnss"],
-        "values": [],
-        "labels": [],
-    });
-    file.to_string()
+    let mut run = fixtures::run();
+    let s3 = &mut run.plan.storage.s3;
+    bucket.clone_into(&mut s3.bucket);
+    s3.prefix = Some("runs/".to_owned());
+    s3.size_limit = LIMIT.to_string().parse().unwrap();
+    run
 }
 
 /// Text that compresses to nothing and repeats nowhere.

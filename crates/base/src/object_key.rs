@@ -1,6 +1,6 @@
-//! TODO
+//! The key by which services answer about an object and wake it.
 
-/// One object of the cluster: services answer about it and wake it by this key.
+/// One object of the cluster.
 #[derive(Clone, Debug, PartialEq, Eq, Hash, PartialOrd, Ord)]
 pub struct ObjectKey {
     /// Its namespace.

@@ -1,5 +1,7 @@
 //! Real files of an evaluator of Leaderboard 2.0 that was started again.
 
+use leaderboard_api::RouteSlice;
+
 use super::*;
 
 /// The mean driving score of the real files.

@@ -2,34 +2,9 @@
 
 use std::collections::BTreeSet;
 
-use serde_json::json;
-
 use super::*;
+use crate::intake::fixtures::{board, with_queue};
 use leaderboard_api::Attempt;
-
-/// A Leaderboard of challenge 1 with phases 2 and 3, created at this second.
-fn board(name: &str, second: i64) -> Leaderboard {
-    let created = jiff::Timestamp::from_second(second).unwrap().to_string();
-    serde_json::from_value(json!({
-        "apiVersion": "leaderboard.carla.org/v1alpha1",
-        "kind": "Leaderboard",
-        "metadata": {"name": name, "namespace": "ns", "creationTimestamp": created},
-        "spec": {
-            "evalai": {"apiServer": "https://e", "challenge": 1, "token": {"secretKeyRef": {"name": "t", "key": "k"}}},
-            "tracks": [{"name": "sensors", "phase": 2}, {"name": "map", "phase": 3}],
-            "evaluation": {"carla": {
-                "version": "V2", "contents": {"image": "c"}, "simulator": {"image": "s"},
-            }},
-            "storage": {"s3": {"bucket": "bbb"}}
-        }
-    }))
-    .unwrap()
-}
-
-fn with_queue(mut board: Leaderboard, url: &str) -> Arc<Leaderboard> {
-    board.spec.queue = Some(serde_json::from_value(json!({"sqs": {"url": url}})).unwrap());
-    Arc::new(board)
-}
 
 fn with(mut board: Arc<Leaderboard>, change: fn(&mut Leaderboard)) -> Arc<Leaderboard> {
     change(Arc::make_mut(&mut board));

@@ -14,7 +14,6 @@ use crate::answer::{Answer, Silence};
 use crate::budget::WINDOW;
 use crate::request::{Purpose, Reply};
 use crate::row::Row;
-use crate::token::Token;
 use leaderboard_api::evalai_status::Status;
 
 const SUBMISSIONS: i64 = 12;
@@ -110,18 +109,8 @@ struct World {
 fn target() -> Target {
     Target {
         leaderboard: key(0),
-        api_server: "http://evalai".into(),
-        challenge: 1,
-        split: "leaderboard".into(),
-        token: Arc::new(Token::parse("x").unwrap()),
-        requests_per_minute: 54,
-        sweep: Duration::from_mins(1),
-        period: Duration::from_secs(10),
-        phases: [1].into(),
-        labels: ["Driving score".to_owned()].into(),
-        inbox: None,
-        is_observed: false,
         since: submitted_at(),
+        ..super::target()
     }
 }
 
