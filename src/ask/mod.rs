@@ -67,7 +67,7 @@ impl<Q: Ask> Asker<Q> {
     }
 
     /// Asks about an object, in place of what was asked about it before. The answer to the same question stays. A question that is
-    /// not repeated for ten minutes is asked no more.
+    /// not repeated for a quarter of an hour is asked no more.
     pub fn want(&self, about: &ObjectKey, question: Q, log: LogSpan) {
         let is_new = lock(&self.0.state).want(about, question, log, Instant::now());
         if is_new {
@@ -129,10 +129,11 @@ async fn bounded<Q: Ask>(
     let reading = reading.instrument(work.log.span());
     let result = tokio::time::timeout(Q::LONGEST, reading).await;
     let result = result.unwrap_or_else(|_| {
-        Err(Failure {
-            is_refused: false,
-            why: format!("{} did not answer within {} s", work.service, Q::LONGEST.as_secs()),
-        })
+        Err(Failure::silent(format!(
+            "{} did not answer within {} s",
+            work.service,
+            Q::LONGEST.as_secs()
+        )))
     });
     (work, result)
 }

@@ -11,8 +11,8 @@ use leaderboard_base::object_key::ObjectKey;
 use leaderboard_base::spans::LogSpan;
 use leaderboard_policy::ask::{Answered, Ask, Failure, Lookup, Rank, Service, Silence};
 
-/// Time after which a question that no caller repeats is asked no more.
-pub(super) const KEPT: Duration = Duration::from_mins(10);
+/// Time after which a question that no caller repeats is asked no more: longer than any object goes without a reconcile.
+pub(crate) const KEPT: Duration = Duration::from_mins(15);
 
 type Uid = Arc<str>;
 

@@ -88,10 +88,7 @@ impl World {
             lock(&noted).push((about.uid, question.number, second));
             async move {
                 tokio::time::sleep(question.takes).await;
-                let why = || Failure {
-                    is_refused: false,
-                    why: "no".into(),
-                };
+                let why = || Failure::silent("no");
                 (question.outcome != Outcome::Fails)
                     .then_some(question.number)
                     .ok_or_else(why)
@@ -290,10 +287,7 @@ async fn a_service_that_does_not_answer_in_time_has_failed() {
     world.want("u", hangs.clone());
     world.sent_until(11).await;
     let looked = world.asker.get("u");
-    let expected = Failure {
-        is_refused: false,
-        why: "bucket a did not answer within 10 s".into(),
-    };
+    let expected = Failure::silent("bucket a did not answer within 10 s");
     assert_eq!(*looked.answer_to(&hangs).unwrap().result, Err(expected));
 }
 

@@ -185,10 +185,7 @@ mod tests {
     }
 
     fn silent() -> Found {
-        Err(Failure {
-            is_refused: false,
-            why: "it does not answer; check the network".into(),
-        })
+        Err(Failure::silent("it does not answer; check the network"))
     }
 
     fn place(resource: AwsResource, address: &str) -> Place {

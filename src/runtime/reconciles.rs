@@ -34,6 +34,8 @@ pub(super) const LEADERBOARD: &str = "Leaderboard";
 const TIME_LIMIT: Duration = Duration::from_secs(90);
 /// An object without any other cause is reconciled this often.
 const RESYNC: Duration = Duration::from_mins(10);
+/// The share by which the time of each object differs, so that they come apart.
+const SPREAD: f64 = 0.2;
 /// Jobs that are created at once, and in one namespace: an admission webhook may take ten seconds for each.
 const CREATES: usize = 8;
 const CREATES_PER_NAMESPACE: usize = 4;
@@ -238,7 +240,7 @@ fn finish(
 
 /// Spreads the resync of many objects.
 fn jittered_resync() -> Duration {
-    jittered(RESYNC, 0.2)
+    jittered(RESYNC, SPREAD)
 }
 
 #[cfg(test)]

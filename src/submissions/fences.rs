@@ -55,10 +55,10 @@ async fn write(aws: &Aws, asked: &Asked<Fence>) -> Result<(), Failure> {
     let put = archive.put(OWNER_KEY, Owner::new(mark).to_json());
     let written = match tokio::time::timeout(TRIES.saturating_sub(asked.waited), put).await {
         Ok(written) => written.map(|_| ()).map_err(|error| silent(&error)),
-        Err(_) => Err(Failure {
-            is_refused: false,
-            why: format!("the bucket {} did not answer in time", archive.bucket()),
-        }),
+        Err(_) => Err(Failure::silent(format!(
+            "the bucket {} did not answer in time",
+            archive.bucket()
+        ))),
     };
     if let Err(failure) = &written {
         tracing::warn!(why = failure.why, "the fence against a lost Pod was not written");
@@ -101,12 +101,7 @@ mod tests {
 
     #[test]
     fn a_fence_is_tried_until_it_is_held_or_its_time_is_over() {
-        let away = || {
-            Err(Failure {
-                is_refused: false,
-                why: "away".into(),
-            })
-        };
+        let away = || Err(Failure::silent("away"));
         let again = |result, waited| fence(0).again(&result, 1, Duration::from_secs(waited));
         assert_eq!(again(away(), 0), Some(TRY_AGAIN));
         assert_eq!(again(away(), 56), Some(TRY_AGAIN));
@@ -133,10 +128,7 @@ mod tests {
             }),
             ..asked.clone()
         };
-        let failure = Failure {
-            is_refused: false,
-            why: "away".into(),
-        };
+        let failure = Failure::silent("away");
         assert_eq!(of(&answered(Err(failure)), 1), ObservedFence::Failed(waited));
         assert_eq!(of(&answered(Ok(())), 1), ObservedFence::Held);
     }

@@ -71,10 +71,7 @@ pub fn start(
         async move {
             let (tables, may_write) = shared.as_ref();
             if !may_write() {
-                return Err(Failure {
-                    is_refused: false,
-                    why: "this process does not lead any more".to_owned(),
-                });
+                return Err(Failure::silent("this process does not lead any more"));
             }
             let Record { table, row, .. } = &asked.question;
             let written = tables.write(table, row).await;

@@ -149,20 +149,14 @@ async fn read(aws: &Aws, asked: &Asked<Report>) -> Result<Stored, Failure> {
         Ok(None) => Ok(Stored::Foreign { etag }),
         Err(error) => {
             tracing::warn!(%error, "a stored report is not used");
-            Err(Failure {
-                is_refused: false,
-                why: error.to_string(),
-            })
+            Err(Failure::silent(error.to_string()))
         }
     }
 }
 
 /// A bucket that refuses may be opened again at any moment, and what it held before still counts then.
 pub(super) fn silent(error: &ArchiveError) -> Failure {
-    Failure {
-        is_refused: false,
-        why: error.to_string(),
-    }
+    Failure::silent(error.to_string())
 }
 
 /// The report as it is known, seen from a run that is at this Job with this Pod.

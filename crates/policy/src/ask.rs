@@ -48,6 +48,16 @@ pub struct Failure {
     pub why: String,
 }
 
+impl Failure {
+    /// The service has not answered, or its answer may pass.
+    pub fn silent(why: impl Into<String>) -> Self {
+        Self {
+            is_refused: false,
+            why: why.into(),
+        }
+    }
+}
+
 /// The question about an object, and its last answer.
 #[derive(Clone, Debug)]
 pub struct Lookup<Q: Ask> {

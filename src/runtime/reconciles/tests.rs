@@ -19,6 +19,11 @@ const BEHIND: usize = 300;
 /// Cancels of others.
 const CANCELS: usize = 6;
 
+#[test]
+fn a_question_outlasts_the_longest_pause_between_two_reconciles() {
+    assert!(crate::ask::state::KEPT > RESYNC.mul_f64(1.0 + SPREAD));
+}
+
 #[tokio::test(start_paused = true)]
 async fn cancels_do_not_wait_for_a_bucket_that_hangs() {
     let silent = std::net::TcpListener::bind("127.0.0.1:0").unwrap();

@@ -52,10 +52,7 @@ fn found(done: u32) -> Stored {
 }
 
 fn failed(why: &str) -> Result<Stored, Failure> {
-    Err(Failure {
-        is_refused: false,
-        why: why.into(),
-    })
+    Err(Failure::silent(why))
 }
 
 impl Bench {
