@@ -270,7 +270,7 @@ fn crashes(worker: &WorkerStatus, is_failed: bool, now: Timestamp) -> String {
 
 fn system_text(condition: &Condition, system: &str, now: Timestamp) -> String {
     let meaning = meaning(&condition.reason).replacen("The other system", system, 1);
-    let since = if condition.is_true() || condition.reason == Reason::NotRequired {
+    let since = if condition.is_true() || condition.reason.is_one_of(&[Reason::NotRequired, Reason::Superseded]) {
         String::new()
     } else {
         format!("Since {}.", when(condition.last_transition_time.0, now))
