@@ -11,7 +11,7 @@ use kube::{Api, Client};
 
 use super::places;
 use super::reach::{AwsResource, Place, Reach};
-use super::token::TokenSource;
+use super::token::of_entry;
 use super::tried_pods::{self, Pods, TriedPods};
 use crate::ask::{Asker, Wake};
 use crate::kubernetes::call;
@@ -191,7 +191,7 @@ impl Looked {
             labels: leaderboard_evaluation::of(spec)
                 .columns()
                 .into_iter()
-                .map(|column| column.label)
+                .map(|column| column.label.to_owned())
                 .collect(),
             inbox: spec.evalai_queue().map(|queue| queue.name.clone()),
             is_observed: evalai.mode == EvalaiMode::Observe,
@@ -224,7 +224,7 @@ fn unanswered<Q: Ask>(lookup: &Lookup<Q>) -> Option<Duration> {
 }
 
 async fn read_token(client: &Client, aws: &Aws, namespace: &str, place: &TokenPlace) -> Result<Arc<Token>, String> {
-    let source = match (&place.secret_key_ref, &place.secrets_manager) {
+    let token = match (&place.secret_key_ref, &place.secrets_manager) {
         (Some(key), _) => {
             let api: Api<Secret> = Api::namespaced(client.clone(), namespace);
             let secret = call("reading the token", &key.name, api.get(&key.name))
@@ -234,17 +234,12 @@ async fn read_token(client: &Client, aws: &Aws, namespace: &str, place: &TokenPl
             let value = value.ok_or_else(|| format!("Secret {} has no key {}", key.name, key.key))?;
             let text = String::from_utf8(value.0.clone())
                 .map_err(|_| format!("key {} of Secret {} is not text", key.key, key.name))?;
-            TokenSource::Literal(text)
+            Token::parse(&text)
         }
-        (None, Some(entry)) => TokenSource::SecretsManager {
-            id: entry.id.clone(),
-            key: entry.key.clone(),
-            region: entry.region.clone(),
-            endpoint: entry.endpoint.clone(),
-        },
+        (None, Some(entry)) => of_entry(aws, entry).await,
         (None, None) => return Err("evalai.token names no place".into()),
     };
-    source.read(aws).await.map(Arc::new).map_err(|e| e.to_string())
+    token.map(Arc::new).map_err(|error| error.to_string())
 }
 
 #[cfg(test)]

@@ -8,7 +8,7 @@ use kube::runtime::reflector::ObjectRef;
 
 use super::objects::board_of;
 use crate::kubernetes::objects::{Job, Meta, Node, Pod};
-use crate::kubernetes::{Store, Synced};
+use crate::kubernetes::{Store, Synced, Watch};
 use leaderboard_api::{Leaderboard, Submission, names};
 use leaderboard_pod_spec::network_policy;
 
@@ -24,15 +24,7 @@ pub struct Stores {
     /// Whether what `policies` shows can be relied on.
     pub policies_synced: Synced,
     /// None: an operator without rights of the whole cluster has none to nodes.
-    pub nodes: Option<Nodes>,
-}
-
-/// The nodes of the cluster.
-#[derive(Clone)]
-pub struct Nodes {
-    pub store: Store<Node>,
-    /// Whether what `store` shows can be relied on.
-    pub synced: Synced,
+    pub nodes: Option<Watch<Node>>,
 }
 
 impl Stores {

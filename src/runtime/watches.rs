@@ -14,7 +14,7 @@ use crate::observability::Observability;
 use crate::page::Reads;
 use crate::runtime::objects::children_selector;
 use crate::runtime::settings::Settings;
-use crate::runtime::stores::{Nodes, Stores, owner_uid};
+use crate::runtime::stores::{Stores, owner_uid};
 use leaderboard_api::{Leaderboard, Submission};
 
 /// The cache of policies is waited for so long at the start: without a right to them nothing starts, but runs are watched.
@@ -71,10 +71,7 @@ impl Watches {
             pods: self.pods.store.clone(),
             policies: self.policies.store.clone(),
             policies_synced: self.policies.synced.clone(),
-            nodes: self.nodes.as_ref().map(|nodes| Nodes {
-                store: nodes.store.clone(),
-                synced: nodes.synced.clone(),
-            }),
+            nodes: self.nodes.clone(),
         }
     }
 

@@ -1,12 +1,13 @@
 //! EvalAI's token in Secrets Manager, against the AWS stand-in.
 
 use super::bridge::StandIn;
+use leaderboard_api::SecretsManagerKey;
 use leaderboard_evalai::token::{Scheme, TokenError};
-use leaderboard_operator::leaderboards::token::TokenSource;
+use leaderboard_operator::leaderboards::token::of_entry;
 
 impl StandIn {
-    fn token(&self, name: &str, key: &str) -> TokenSource {
-        TokenSource::SecretsManager {
+    fn token(&self, name: &str, key: &str) -> SecretsManagerKey {
+        SecretsManagerKey {
             id: self.name(name),
             key: key.to_owned(),
             region: None,
@@ -27,9 +28,7 @@ async fn it_is_read_from_a_key_of_the_entry() {
     let key = "0123456789abcdef0123456789abcdef01234567";
     let text = format!(r#"{{"auth_token": "Token {key}\n", "api_server": "https://eval.ai", "challenge_pk": 2098}}"#);
     stand_in.store("evalai", &text).await;
-    let token = stand_in
-        .token("evalai", "auth_token")
-        .read(&stand_in.aws)
+    let token = of_entry(&stand_in.aws, &stand_in.token("evalai", "auth_token"))
         .await
         .unwrap();
     assert_eq!((token.scheme(), token.expires()), (Scheme::Token, None));
@@ -47,9 +46,7 @@ async fn why_there_is_none_is_an_error_without_what_is_stored() {
         ("plain", "check token.secretsManager.key"),
         ("empty", "put a host's refresh token there"),
     ] {
-        let error: TokenError = stand_in
-            .token(name, "auth_token")
-            .read(&stand_in.aws)
+        let error: TokenError = of_entry(&stand_in.aws, &stand_in.token(name, "auth_token"))
             .await
             .unwrap_err();
         let error = error.to_string();
@@ -64,11 +61,11 @@ async fn why_there_is_none_is_an_error_without_what_is_stored() {
 async fn a_new_value_of_the_entry_is_another_token() {
     let stand_in = StandIn::start().await;
     stand_in.store("evalai", r#"{"auth_token": "one"}"#).await;
-    let source = stand_in.token("evalai", "auth_token");
-    let old = source.read(&stand_in.aws).await.unwrap();
+    let place = stand_in.token("evalai", "auth_token");
+    let old = of_entry(&stand_in.aws, &place).await.unwrap();
     let client = stand_in.aws.secrets(None, Some(&stand_in.endpoint));
     let put = client.put_secret_value().secret_id(stand_in.name("evalai"));
     put.secret_string(r#"{"auth_token": "two"}"#).send().await.unwrap();
-    let new = source.read(&stand_in.aws).await.unwrap();
+    let new = of_entry(&stand_in.aws, &place).await.unwrap();
     assert!(old != new && old.digest() != new.digest());
 }
