@@ -11,9 +11,10 @@ use sha2::{Digest, Sha256};
 
 use leaderboard_aws::archive::Archive;
 use leaderboard_aws::clients::Aws;
+use leaderboard_contract::keys::{METADATA, STDOUT};
 use leaderboard_contract::report::{ContentId, MAX_BYTES, REPORT_KEY, Report, StoredFile};
 use leaderboard_evalai::{Outline, Payload, PayloadProblem, PayloadReader, StoredResult};
-use leaderboard_policy::report_digest::{MAX_TEXT, METADATA_KEY, STDOUT_KEY};
+use leaderboard_policy::report_digest::MAX_TEXT;
 
 /// Time that one read may take.
 const LIMIT: Duration = Duration::from_secs(10);
@@ -45,7 +46,7 @@ async fn read(aws: &Aws, outline: &Outline, stored: &StoredResult) -> Result<Pay
         ..bare
     };
     let of = |key| text(&archive, key, report.files.get(key));
-    match futures::future::try_join(of(STDOUT_KEY), of(METADATA_KEY)).await {
+    match futures::future::try_join(of(STDOUT), of(METADATA)).await {
         Ok((stdout, metadata)) => Ok(Payload {
             stdout,
             metadata,

@@ -90,7 +90,7 @@ pub(super) fn row(report: Option<&ReportDigest>, status: &SubmissionStatus) -> O
         results: status.results_url.clone().unwrap_or_default(),
         progress: status.progress.as_ref().map(|p| p.text.clone()).unwrap_or_default(),
         gpu_seconds: gpu_seconds(status),
-        metrics: columns(report.filter(|_| is_finished(status)), &*of_plan(plan)),
+        metrics: columns(report.filter(|_| is_finished(status)), of_plan(plan)),
     })
 }
 
@@ -133,8 +133,8 @@ fn columns(report: Option<&ReportDigest>, kind: &dyn Evaluation) -> Vec<(String,
         None => value.to_string(),
     };
     let all = kind.columns().into_iter().map(|column| {
-        let value = accuracies.and_then(|all| all.get(&column.label));
-        (column.name, value.map(text))
+        let value = accuracies.and_then(|all| all.get(column.label));
+        (column.name.to_owned(), value.map(text))
     });
     all.collect()
 }
@@ -143,7 +143,7 @@ fn columns(report: Option<&ReportDigest>, kind: &dyn Evaluation) -> Vec<(String,
 mod tests {
     use super::*;
     use leaderboard_api::{Attempt, LeaderboardVersion};
-    use leaderboard_evaluation::carla::Carla;
+    use leaderboard_evaluation::carla;
     use serde_json::json;
 
     fn report(results: &str) -> ReportDigest {
@@ -167,7 +167,7 @@ mod tests {
     #[test]
     fn columns_keep_the_digits_and_the_names_of_the_original() {
         let results = r#"[{"split": "leaderboard", "accuracies": {"Driving score": 43.125, "Off-road infractions": 0.0, "Agent blocked": 0}}]"#;
-        let found = columns(Some(&report(results)), &Carla::new(LeaderboardVersion::V2));
+        let found = columns(Some(&report(results)), carla::of(LeaderboardVersion::V2));
         let get = |name: &str| found.iter().find(|(n, _)| n == name).and_then(|(_, v)| v.as_deref());
         assert_eq!(get("driving_score"), Some("43.125"));
         assert_eq!(get("off_road_infractions"), Some("0.0"));
@@ -262,7 +262,7 @@ mod tests {
 
     #[test]
     fn a_broken_report_has_no_columns() {
-        let found = columns(Some(&report("not json")), &Carla::new(LeaderboardVersion::V2));
+        let found = columns(Some(&report("not json")), carla::of(LeaderboardVersion::V2));
         assert!(found.iter().all(|(_, value)| value.is_none()));
     }
 }

@@ -1,6 +1,6 @@
 //! The status of a submission in EvalAI, and the updates that we request.
 //!
-//! Pure. Used by every module of `evalai` and by the controller.
+//! Pure. Used by the crate `evalai` and by the controller.
 
 use std::fmt;
 

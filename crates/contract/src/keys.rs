@@ -9,6 +9,10 @@ use leaderboard_protocol::files::Pair;
 pub const MERGED: &str = "agent/agent_results.json";
 /// Before the keys of EvalAI's texts.
 pub const EVALAI: &str = "evalai/";
+/// The text that participants read in EvalAI.
+pub const STDOUT: &str = "evalai/stdout.txt";
+/// The merged file under EvalAI's name.
+pub const METADATA: &str = "evalai/metadata.json";
 /// Before the key of a refused checkpoint: no agent can put a file of its own there.
 pub const REFUSED: &str = "logcopy/refused/";
 

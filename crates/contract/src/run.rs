@@ -1,6 +1,6 @@
 //! What the controller gives to a Pod: one JSON document without secrets, and the paths inside the Pod.
 //!
-//! Written by `controller::submissions::job_spec`, read by `workspace` and `logcopy`. Pure.
+//! Written by `pod-spec`, read by `workspace` and `logcopy`. Pure.
 
 use serde::{Deserialize, Serialize};
 

@@ -1,4 +1,4 @@
-//! A run and its checkpoints, for the tests of this module.
+//! A run and its checkpoints, for the tests of this crate and of others.
 
 use std::fs;
 use std::path::Path;

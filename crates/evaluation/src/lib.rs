@@ -84,19 +84,19 @@ const PLAIN: Words = Words {
 #[derive(Clone, Debug, PartialEq, Eq)]
 pub struct Column {
     /// The label in EvalAI's result and on its leaderboard.
-    pub label: String,
+    pub label: &'static str,
     /// The column of the submissions table.
-    pub name: String,
+    pub name: &'static str,
 }
 
 /// The kind of evaluation of a Leaderboard.
-pub fn of(spec: &LeaderboardSpec) -> Box<dyn Evaluation> {
-    Box::new(carla::Carla::new(spec.evaluation.carla.version))
+pub fn of(spec: &LeaderboardSpec) -> &'static dyn Evaluation {
+    carla::of(spec.evaluation.carla.version)
 }
 
 /// The kind of evaluation of a plan.
-pub fn of_plan(plan: &RunPlan) -> Box<dyn Evaluation> {
-    Box::new(carla::Carla::new(plan.carla.version))
+pub fn of_plan(plan: &RunPlan) -> &'static dyn Evaluation {
+    carla::of(plan.carla.version)
 }
 
 /// The words of a plan's kind.

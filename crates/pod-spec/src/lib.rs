@@ -9,4 +9,4 @@ pub mod layout;
 pub mod network_policy;
 pub mod notes;
 pub mod overlay;
-pub mod owner;
+mod owner;

@@ -1,6 +1,6 @@
 //! A Leaderboard's `podOverrides`: a partial PodTemplateSpec laid over ours, and what it may not say.
 //!
-//! Pure, and on JSON, so that Pod fields newer than this client survive. Called by `job_spec` (apply) and by the check of a
+//! Pure, and on JSON, so that Pod fields newer than this client survive. Called by `job` (lay) and by the check of a
 //! Leaderboard (validate). The rules, for people too: objects are merged deep; lists by `name`, volumeMounts by
 //! `mountPath`; variables are replaced whole, tolerations added, all other lists replaced; `null` removes;
 //! the names of the two roles stand for the containers of every worker, `agent-2` for one, whichever comes first in the list.
@@ -9,6 +9,8 @@ mod rules;
 #[cfg(test)]
 mod tests;
 
+use leaderboard_api::LeaderboardSpec;
+use leaderboard_evaluation::workload::Reserved;
 use leaderboard_protocol::files::Side;
 use serde_json::{Map, Value};
 
@@ -16,6 +18,14 @@ pub use rules::{OverlayError, validate, validate_overlay};
 
 /// Names that stand for the containers of all workers.
 const ALIASES: [&str; 2] = [Side::Host.name(), Side::Agent.name()];
+
+/// Lays a Leaderboard's overlay over a template. One that the rules refuse is not applied at all, so that nothing gets around them.
+pub(super) fn lay(template: &mut Value, spec: &LeaderboardSpec, reserved: &Reserved) {
+    let overlay = spec.pod_overrides.as_ref();
+    if let Some(overlay) = overlay.filter(|pod| validate_overlay(pod, reserved).is_ok()) {
+        apply(template, overlay);
+    }
+}
 
 /// Lays `overlay` over a PodTemplateSpec, or a part of one. Only for overlays that [`validate_overlay`] accepts.
 pub(super) fn apply(base: &mut Value, overlay: &Value) {

@@ -82,11 +82,7 @@ impl Census {
 }
 
 fn lacks_image(status: &SubmissionStatus) -> bool {
-    !status.has_ended()
-        && status
-            .reason
-            .as_ref()
-            .is_some_and(|reason| *reason == Reason::ImagePull)
+    !status.has_ended() && status.shows(Reason::ImagePull)
 }
 
 fn needs_leaderboard(status: &SubmissionStatus) -> bool {

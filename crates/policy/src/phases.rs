@@ -179,7 +179,7 @@ impl Step<'_> {
             let is = self
                 .new
                 .condition(type_)
-                .filter(|found| found.status == "True" && !was && finished.is_some());
+                .filter(|found| found.is_true() && !was && finished.is_some());
             let Some(is) = is else { continue };
             let published = self.new.times.published.as_ref().filter(|_| phase == Phase::Publish);
             let end = published.unwrap_or(&is.last_transition_time).0;
@@ -193,7 +193,7 @@ impl Step<'_> {
             return Some(created(self.view));
         }
         let mut known = self.old.into_iter().chain([self.new]);
-        let shown = known.find_map(|status| status.condition(FINISHED).filter(|end| end.status != "True"));
+        let shown = known.find_map(|status| status.condition(FINISHED).filter(|end| !end.is_true()));
         shown.map(|end| end.last_transition_time.0)
     }
 
@@ -205,7 +205,7 @@ impl Step<'_> {
         let scheduled = known.times.scheduled.as_ref().map(|time| time.0);
         let of_status = of_status.filter(|started| scheduled.is_some_and(|scheduled| *started >= scheduled));
         let seen = || {
-            let running = known.condition(RUNNING).filter(|running| running.status == "True");
+            let running = known.condition(RUNNING).filter(|running| running.is_true());
             running.map(|running| running.last_transition_time.0)
         };
         of_pod.or(of_status).or_else(seen)
@@ -226,7 +226,7 @@ impl Step<'_> {
 fn has_run(status: &SubmissionStatus) -> bool {
     status
         .condition(RUNNING)
-        .is_some_and(|running| running.status == "True" || running.reason == Reason::Replacing)
+        .is_some_and(|running| running.is_true() || running.reason == Reason::Replacing)
 }
 
 fn created(view: &View) -> Timestamp {

@@ -4,15 +4,13 @@ use serde_json::{Map, Value};
 
 use leaderboard_api::text::one_line;
 use leaderboard_api::{Attempt, Metric, Progress, Score};
+use leaderboard_contract::keys::{METADATA, STDOUT};
 use leaderboard_contract::report::{ContentId, Logs, Report, ReportError, ReportWorker};
 use leaderboard_contract::run::Stop;
 use leaderboard_evaluation::labels;
 
 /// Largest text that is passed on to EvalAI, in bytes.
 pub const MAX_TEXT: u64 = 4 << 20;
-/// Where logcopy puts the texts for EvalAI, below the run's prefix.
-pub const STDOUT_KEY: &str = "evalai/stdout.txt";
-pub const METADATA_KEY: &str = "evalai/metadata.json";
 /// Longest text of a report that is kept, in characters.
 const LONGEST: usize = 500;
 
@@ -132,7 +130,7 @@ impl From<&Report> for ReportDigest {
 
 /// Why a text is left out of what EvalAI is sent of a report, for people.
 pub fn left_out(report: &Report) -> Option<String> {
-    let files = [STDOUT_KEY, METADATA_KEY].map(|key| Some((key, report.files.get(key)?)));
+    let files = [STDOUT, METADATA].map(|key| Some((key, report.files.get(key)?)));
     let (key, file) = files.into_iter().flatten().find(|(_, file)| file.size > MAX_TEXT)?;
     let (size, limit) = (file.size, MAX_TEXT >> 20);
     Some(format!(

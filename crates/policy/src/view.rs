@@ -151,6 +151,11 @@ impl PodView {
     pub fn needs_node(&self) -> bool {
         self.delete_by.is_some() || self.run_ended.is_none()
     }
+
+    /// Its container of this name.
+    pub fn container(&self, name: &str) -> Option<&ContainerView> {
+        self.containers.iter().find(|container| container.name == name)
+    }
 }
 
 /// The Pod's node, while the Pod runs or is being deleted.

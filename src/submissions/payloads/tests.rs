@@ -92,11 +92,11 @@ async fn texts_count_only_with_the_digest_that_the_report_names() {
     let read = || bench.read(&decided, false, Patience::ENDLESS);
     assert_eq!(read().await, unfit_as("evalai/stdout.txt is missing"));
     for other in ["of another", "of a later round"] {
-        bench.stores(STDOUT_KEY, other);
+        bench.stores(STDOUT, other);
         let expected = "evalai/stdout.txt is of another round than the report";
         assert_eq!(read().await, unfit_as(expected), "{other}");
     }
-    bench.stores(STDOUT_KEY, "all is well");
+    bench.stores(STDOUT, "all is well");
     let found = read().await.unwrap();
     assert_eq!(
         (&*found.result, &*found.stdout, &*found.metadata),
@@ -145,10 +145,10 @@ async fn a_text_that_is_too_large_is_left_out_at_once_and_reported() {
     let bench = Bench::new().await;
     let mut named: serde_json::Value = serde_json::from_str(&report("all is well")).unwrap();
     // It is not even asked for: the bucket of this test has none.
-    named["files"][METADATA_KEY] = json!({"size": MAX_TEXT + 1, "sha256": ""});
+    named["files"][METADATA] = json!({"size": MAX_TEXT + 1, "sha256": ""});
     let decided = named.to_string();
     bench.stores(REPORT_KEY, decided.as_str());
-    bench.stores(STDOUT_KEY, "all is well");
+    bench.stores(STDOUT, "all is well");
     let found = bench.read(&decided, false, Patience::ENDLESS).await.unwrap();
     assert_eq!((&*found.stdout, &*found.metadata), ("all is well", ""));
     let shown = left_out(&Report::parse(decided.as_bytes()).unwrap()).unwrap();

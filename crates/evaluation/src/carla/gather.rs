@@ -11,15 +11,12 @@ use super::measures;
 use crate::carla::results_format;
 use crate::{Gathered, Object, Objects, Refused, Results, Summary, Texts, WorkerSeen};
 use leaderboard_api::Verify;
-use leaderboard_contract::keys::{MERGED, checkpoint_path};
+use leaderboard_contract::keys::{MERGED, METADATA, STDOUT, checkpoint_path};
 use leaderboard_contract::report::ReportWorker;
 use leaderboard_contract::run::{Run, STATUS_FOLDER};
 use leaderboard_evidence::{Stamp, Tree, TreeError};
 use leaderboard_protocol::files::{KEPT_CHECKPOINT, Pair};
 use leaderboard_results::{Checkpoint, Files, Merged, Plan, Refusal, Slice, Strictness, read_worker};
-
-/// The merged file under EvalAI's name.
-const METADATA: &str = "evalai/metadata.json";
 
 impl From<Refusal> for Refused {
     fn from(refusal: Refusal) -> Self {
@@ -58,12 +55,6 @@ pub fn results_plan(run: &Run) -> Result<Plan, Refusal> {
     }
     plan.check()?;
     Ok(plan)
-}
-
-/// An error if the plan of a run contradicts itself.
-pub fn check(run: &Run) -> Result<(), Refused> {
-    results_plan(run)?;
-    Ok(())
 }
 
 /// Its last whole copy, which the agent's runner keeps.
@@ -115,7 +106,7 @@ fn take_texts(objects: &mut Objects, files: Files) -> Arc<Texts> {
         "evalai/results.json".to_owned(),
         Object::new(files.results_json.clone()),
     );
-    objects.insert("evalai/stdout.txt".to_owned(), Object::new(files.stdout_txt));
+    objects.insert(STDOUT.to_owned(), Object::new(files.stdout_txt));
     if let Some(metadata) = files.metadata_json {
         let merged = Object::new(metadata);
         objects.insert(MERGED.to_owned(), merged.clone());

@@ -1,9 +1,9 @@
 //! CARLA: pairs of a simulator and an agent share out the routes, and each agent's evaluator writes a checkpoint.
 
-pub mod commands;
+mod commands;
 mod display;
 pub mod gather;
-pub mod layout;
+mod layout;
 mod measures;
 mod workload;
 
@@ -27,11 +27,13 @@ const WORDS: Words = Words {
 
 /// The CARLA Leaderboard, by its version.
 #[derive(Clone, Copy, Debug)]
-pub struct Carla(LeaderboardVersion);
+struct Carla(LeaderboardVersion);
 
-impl Carla {
-    pub fn new(version: LeaderboardVersion) -> Self {
-        Self(version)
+/// The member of a version.
+pub fn of(version: LeaderboardVersion) -> &'static dyn Evaluation {
+    match version {
+        LeaderboardVersion::V1 => &Carla(LeaderboardVersion::V1),
+        LeaderboardVersion::V2 => &Carla(LeaderboardVersion::V2),
     }
 }
 
@@ -44,8 +46,8 @@ impl Evaluation for Carla {
         let of_format = metrics(results_format(self.0)).iter();
         of_format
             .map(|metric| Column {
-                label: metric.name.to_owned(),
-                name: metric.column.to_owned(),
+                label: metric.name,
+                name: metric.column,
             })
             .collect()
     }
@@ -63,7 +65,8 @@ impl Evaluation for Carla {
     }
 
     fn check(&self, run: &Run) -> Result<(), Refused> {
-        gather::check(run)
+        gather::results_plan(run)?;
+        Ok(())
     }
 
     fn results(&self, run: &Run, tree: Arc<Tree>) -> Result<Box<dyn Results>, Refused> {
@@ -72,7 +75,7 @@ impl Evaluation for Carla {
 }
 
 /// The format of the results of a version.
-pub fn results_format(version: LeaderboardVersion) -> Format {
+fn results_format(version: LeaderboardVersion) -> Format {
     match version {
         LeaderboardVersion::V1 => Format::V1,
         LeaderboardVersion::V2 => Format::V2,

@@ -10,7 +10,7 @@ use leaderboard_api::{GpuSource, LeaderboardSpec, RunPlan, Track};
 
 /// GPUs that the Pod of a plan requests or claims; shares of GPUs and MIG slices count as one each.
 pub fn gpus(spec: &LeaderboardSpec, track: Option<&Track>, plan: &RunPlan) -> i64 {
-    let (source, kind) = (source(spec), leaderboard_evaluation::of_plan(plan));
+    let source = source(spec);
     let of_worker = |worker: Pair| {
         [worker.host(), worker.agent()].map(|member| {
             let hosts = spec.given(track, workers::part(member.side)).resources;
@@ -20,10 +20,7 @@ pub fn gpus(spec: &LeaderboardSpec, track: Option<&Track>, plan: &RunPlan) -> i6
     };
     let containers: Vec<Value> = Pair::first(plan.workers()).flat_map(of_worker).collect();
     let mut template = json!({"spec": {"containers": containers}});
-    let overlay = spec.pod_overrides.as_ref();
-    if let Some(overlay) = overlay.filter(|pod| pod_overlay::validate_overlay(pod, &kind.reserved()).is_ok()) {
-        pod_overlay::apply(&mut template, overlay);
-    }
+    pod_overlay::lay(&mut template, spec, &leaderboard_evaluation::of_plan(plan).reserved());
     let containers = template.pointer("/spec/containers").and_then(Value::as_array);
     let each = containers
         .into_iter()

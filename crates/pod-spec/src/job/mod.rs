@@ -97,7 +97,7 @@ impl JobInput<'_> {
         effective::deadlines(self.spec(), self.track())
     }
 
-    fn kind(&self) -> Box<dyn Evaluation> {
+    fn kind(&self) -> &'static dyn Evaluation {
         leaderboard_evaluation::of_plan(self.plan)
     }
 
@@ -128,16 +128,11 @@ impl JobInput<'_> {
 
 /// The Job as it is created: ours, with the Leaderboard's `podOverrides` laid over its template. As JSON, since newer Pod fields
 /// survive there.
-///
-/// An overlay that `pod_overlay::validate_overlay` refuses is not applied at all, so that nothing gets around its rules.
 pub fn build_object(input: &JobInput<'_>) -> DynamicObject {
     // Maps with text as keys and finite numbers always become JSON.
     let mut spec = serde_json::to_value(ours(input)).unwrap_or_default();
     let template = &mut spec["template"];
-    let overlay = input.spec().pod_overrides.as_ref();
-    if let Some(overlay) = overlay.filter(|pod| pod_overlay::validate_overlay(pod, &input.kind().reserved()).is_ok()) {
-        pod_overlay::apply(template, overlay);
-    }
+    pod_overlay::lay(template, input.spec(), &input.kind().reserved());
     settle(template, input);
     skip_strangers(template);
     DynamicObject {

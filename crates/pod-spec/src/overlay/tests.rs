@@ -3,12 +3,11 @@
 use serde_json::{Value, json};
 
 use super::*;
-use leaderboard_evaluation::Evaluation;
-use leaderboard_evaluation::carla::Carla;
+use leaderboard_evaluation::carla;
 use leaderboard_evaluation::workload::Reserved;
 
 fn reserved() -> Reserved {
-    Carla::new(leaderboard_api::LeaderboardVersion::V2).reserved()
+    carla::of(leaderboard_api::LeaderboardVersion::V2).reserved()
 }
 
 fn base() -> Value {

@@ -1,6 +1,6 @@
 //! Whose fault the last crash of a worker was: one table over both containers. Pure.
 //!
-//! Called by `crashes`. No participant's program runs in the host's container, so its verdict, and what the kubelet reports of it,
+//! No participant's program runs in the host's container, so its verdict, and what the kubelet reports of it,
 //! decide. An agent's processes can replace or suppress the agent's verdict; it therefore only names the agent's fault more closely.
 //! Both ends are matched by their round. Where the host's end of a round is missing, it is waited for, and then the agent is the
 //! cause.
@@ -348,13 +348,12 @@ fn last_crash_of(pod: &PodView, id: i32, now: Timestamp) -> Option<Crash> {
     last_crash(container(pod, pair.host()), container(pod, pair.agent()), now)
 }
 
-fn pair_with(id: i32) -> Option<Pair> {
+pub(super) fn pair_with(id: i32) -> Option<Pair> {
     u16::try_from(id).ok().and_then(Pair::new)
 }
 
 fn container(pod: &PodView, member: Member) -> Option<&ContainerView> {
-    let name = member.to_string();
-    pod.containers.iter().find(|container| container.name == name)
+    pod.container(&member.to_string())
 }
 
 fn pair_of(container: &str) -> Option<i32> {

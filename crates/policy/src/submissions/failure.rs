@@ -11,7 +11,6 @@ use leaderboard_api::{
 use leaderboard_contract::keys::agent_log;
 use leaderboard_contract::run::{Stop, console};
 use leaderboard_evaluation::{Words, words};
-use leaderboard_protocol::files::Pair;
 
 /// A failure that is the participant's: `what` happened, in one sentence, and what each reader does about it.
 pub(super) fn participant(reason: Reason, what: &str, next: &Steps) -> Failure {
@@ -384,7 +383,7 @@ pub(super) fn log_places(status: &SubmissionStatus, pod: Option<&PodView>) -> Ve
         return Vec::new();
     };
     let id = failure.worker.unwrap_or_else(|| unfinished(status));
-    let Some(pair) = u16::try_from(id).ok().and_then(Pair::new) else {
+    let Some(pair) = super::blame::pair_with(id) else {
         return Vec::new();
     };
     let (agent, host) = (pair.agent().to_string(), pair.host().to_string());
@@ -438,7 +437,7 @@ fn stored(container: &str, key: String) -> LogPlace {
 
 /// None for a container that never ran: it has no log.
 fn on_node(pod: &PodView, container: &str) -> Option<LogPlace> {
-    let found = pod.containers.iter().find(|c| c.name == container)?;
+    let found = pod.container(container)?;
     if !found.running && found.last.is_none() {
         return None;
     }

@@ -11,7 +11,7 @@ use crate::ask::{Answered, Failure};
 use crate::questions::{ForeignRun, Row};
 use crate::slots::member::check_team;
 use crate::slots::turns::{InLine, Turn};
-use crate::view::{ContainerView, JobView, PodView};
+use crate::view::{JobView, PodView};
 use leaderboard_api::conditions::{self, Truth};
 use leaderboard_api::text::{LONGEST_NAME, one_line, sentence};
 use leaderboard_api::{Eta, PolicySource, Reason, ResourceExt, Waiting, names};
@@ -296,9 +296,8 @@ fn is_held_by_prefix(draft: &PlanBuilder<'_>) -> bool {
 
 /// The words of the Pod's `workspace`, if it has found results of something else below the prefix.
 fn prefix_in_use(pod: &PodView) -> Option<&str> {
-    let is_workspace = |c: &&ContainerView| c.name == names::CONTAINER_WORKSPACE && pod.agent_started.is_none();
-    let end = pod.containers.iter().find(is_workspace)?.last.as_ref()?;
-    let is_in_use = end.own_reason == Some(WorkspaceReason::PrefixInUse);
+    let end = pod.container(names::CONTAINER_WORKSPACE)?.last.as_ref()?;
+    let is_in_use = end.own_reason == Some(WorkspaceReason::PrefixInUse) && pod.agent_started.is_none();
     is_in_use.then(|| {
         end.why
             .as_deref()

@@ -8,7 +8,7 @@ use super::stop;
 use super::waits::{Wait, after};
 use crate::view::ObservedJob;
 use leaderboard_api::conditions;
-use leaderboard_api::{Ingested, JOB_SECONDS, Reason, State};
+use leaderboard_api::{Ingested, JOB_SECONDS, Reason};
 
 /// Why an attempt does not begin.
 const NO_MESSAGE: &str = "no queue message announced it, and participants can edit the status there. Raise spec.attempt if it is to \
@@ -23,8 +23,7 @@ pub(super) fn show_refused_attempt(draft: &mut PlanBuilder<'_>) {
     let Some(refused) = refused.filter(|refused| refused.attempt == draft.spec().attempt.next()) else {
         return;
     };
-    let has_finished = draft.status.state_of_conditions() == State::Finished;
-    let (reason, why) = if has_finished {
+    let (reason, why) = if draft.is_successful() {
         (Reason::AttemptAfterFinish, HAS_FINISHED)
     } else {
         (Reason::AttemptWithoutMessage, NO_MESSAGE)

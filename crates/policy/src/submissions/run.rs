@@ -451,7 +451,7 @@ fn lost_at(draft: &PlanBuilder<'_>, scheduled: Timestamp) -> Timestamp {
     let made = draft.view.pod.as_ref().and_then(|pod| pod.created);
     let running = draft.status.condition(conditions::RUNNING);
     let stopped = running
-        .filter(|running| running.status != "True")
+        .filter(|running| !running.is_true())
         .map(|running| running.last_transition_time.0);
     let known = [made, stopped].into_iter().flatten().filter(|at| *at > scheduled);
     known.min().unwrap_or(draft.now())

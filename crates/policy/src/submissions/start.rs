@@ -230,14 +230,8 @@ fn show_preparing(draft: &mut PlanBuilder<'_>, pod: &PodView, since: Timestamp) 
 }
 
 fn stage(pod: &PodView) -> &'static str {
-    let ended = |name: &str| {
-        let end = pod
-            .containers
-            .iter()
-            .find(|c| c.name == name)
-            .and_then(|c| c.last.as_ref());
-        end.is_some_and(|l| l.exit_code == 0)
-    };
+    let end = |name: &str| pod.container(name)?.last.as_ref();
+    let ended = |name: &str| end(name).is_some_and(|last| last.exit_code == 0);
     if pod.logcopy_running {
         "images are pulled, its containers start"
     } else if ended(names::CONTAINER_CONTENTS) {

@@ -76,7 +76,7 @@ fn steady(status: &SubmissionStatus) -> SubmissionStatus {
     steady.times.scheduled = None;
     for condition in &mut steady.conditions {
         // Why nothing is stalled is no news.
-        if condition.type_ == STALLED && condition.status != "True" {
+        if condition.type_ == STALLED && !condition.is_true() {
             condition.reason = ReasonName::default();
         }
         condition.message = SharedText::default();
