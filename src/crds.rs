@@ -192,52 +192,40 @@ mod tests {
         "port",
     ];
 
-    /// Calls `check` with path, description and type of each field of ours.
-    fn described(schema: &Value, path: &str, check: &mut dyn FnMut(&str, &str, &str)) {
-        if let Some(text) = schema["description"].as_str() {
-            check(path, text, schema["type"].as_str().unwrap_or_default());
-        }
-        for (name, field) in schema["properties"].as_object().into_iter().flatten() {
-            if !OF_KUBERNETES.contains(&name.as_str()) {
-                described(field, &format!("{path}.{name}"), check);
-            }
-        }
-        if schema["items"]["properties"].is_object() {
-            described(&schema["items"], &format!("{path}[]"), check);
-        }
-    }
-
     #[test]
     fn each_description_is_a_sentence_with_its_unit() {
         let (mut read, mut faults) = (0, Vec::new());
         for definition in definitions().unwrap() {
-            let schema = &definition.json()["spec"]["versions"][0]["schema"]["openAPIV3Schema"]["properties"];
-            for part in ["spec", "status"] {
-                described(&schema[part], part, &mut |path, text, kind| {
-                    read += 1;
-                    let begins = [
-                        "What ", "Who ", "Whether ", "Of ", "How ", "Which ", "That ", "The same", "Those ",
-                    ];
-                    let lower = text.to_lowercase();
-                    let fault = if !text.starts_with(|first: char| first.is_uppercase() || first == '`') {
-                        "has no capital"
-                    } else if !text.ends_with('.') {
-                        "has no full stop"
-                    } else if begins.iter().any(|word| text.starts_with(word)) {
-                        "begins with a pronoun"
-                    } else if ["crates/", "src/", "docs/", "::"]
-                        .iter()
-                        .any(|place| text.contains(place))
-                    {
-                        "names a place in this repository"
-                    } else if kind == "integer" && !UNITS.iter().any(|unit| lower.contains(unit)) {
-                        "names no unit"
-                    } else {
-                        return;
-                    };
-                    faults.push(format!("{}, {path} {fault}: {text}", definition.file));
-                });
-            }
+            let root = definition.json().pointer("/spec/versions/0/schema/openAPIV3Schema");
+            walk(definition.kind, root.unwrap(), &mut |path, schema| {
+                let is_kubernetes = |name: &str| OF_KUBERNETES.contains(&name.trim_end_matches("[]"));
+                let described = schema["description"].as_str();
+                let Some(text) = described.filter(|_| !path.split('.').any(is_kubernetes)) else {
+                    return;
+                };
+                read += 1;
+                let begins = [
+                    "What ", "Who ", "Whether ", "Of ", "How ", "Which ", "That ", "The same", "Those ",
+                ];
+                let lower = text.to_lowercase();
+                let fault = if !text.starts_with(|first: char| first.is_uppercase() || first == '`') {
+                    "has no capital"
+                } else if !text.ends_with('.') {
+                    "has no full stop"
+                } else if begins.iter().any(|word| text.starts_with(word)) {
+                    "begins with a pronoun"
+                } else if ["crates/", "src/", "docs/", "::"]
+                    .iter()
+                    .any(|place| text.contains(place))
+                {
+                    "names a place in this repository"
+                } else if schema["type"] == "integer" && !UNITS.iter().any(|unit| lower.contains(unit)) {
+                    "names no unit"
+                } else {
+                    return;
+                };
+                faults.push(format!("{path} {fault}: {text}"));
+            });
         }
         assert!(read > 200, "only {read} descriptions were read");
         assert!(faults.is_empty(), "{}", faults.join("\n"));

@@ -76,15 +76,15 @@ def runbooks(repository: Path) -> str:
 
 def pages(repository: Path) -> list[Path]:
     """Every Markdown file that git knows or would add."""
-    argv = ["git", "-C", str(repository), "ls-files", "--cached", "--others", "--exclude-standard", "*.md"]
-    listed = subprocess.run(argv, capture_output=True, text=True, check=True).stdout.splitlines()
+    listed = tracked(repository, "--cached", "--others", "--exclude-standard", "*.md")
     return [repository / name for name in sorted(set(listed)) if (repository / name).exists()]
 
 
-def tracked(repository: Path) -> list[str]:
-    """Every file that git knows."""
-    argv = ["git", "-C", str(repository), "ls-files"]
-    return subprocess.run(argv, capture_output=True, text=True, check=True).stdout.splitlines()
+def tracked(repository: Path, *chosen: str) -> list[str]:
+    """Every file that git knows, or those that these arguments of `git ls-files` choose."""
+    argv = ["git", "-C", str(repository), "ls-files", "-z", *chosen]
+    listed = subprocess.run(argv, capture_output=True, text=True, check=True).stdout
+    return [name for name in listed.split("\0") if name]
 
 
 def place_faults(repository: Path, page: Path, files: Sequence[str]) -> Iterator[str]:

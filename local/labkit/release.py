@@ -3,12 +3,12 @@
 import hashlib
 import json
 import re
-import subprocess
 import tomllib
 from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
+from . import doccheck
 from .errors import LabError
 
 # Of the archives: what krew calls the machine, and how the program is called in it.
@@ -64,8 +64,7 @@ def set_owner(repository: Path, name: str) -> list[str]:
     if not re.fullmatch(r"[A-Za-z0-9](?:-?[A-Za-z0-9])*", name):
         raise LabError(f"{name} is no account of GitHub: it has letters, digits and single hyphens")
     pattern, changed = owned(owner(repository)), []
-    files = subprocess.run(["git", "ls-files", "-z"], cwd=repository, check=True, capture_output=True, text=True)
-    for file in filter(None, files.stdout.split("\0")):
+    for file in doccheck.tracked(repository):
         path = repository / file
         if path.is_symlink() or not path.is_file() or b"\0" in (content := path.read_bytes()):
             continue

@@ -6,11 +6,12 @@ strings and the names of functions, since that of a test is a sentence. Any othe
 
 import io
 import re
-import subprocess
 import tokenize
 from collections.abc import Iterator
 from pathlib import Path
 from typing import NamedTuple
+
+from . import doccheck
 
 # At the start of a message: nobody knows whose Pod it is.
 NAMED = {"Its Pod": "The Pod, or its name", "Its Job": "The Job, or its name"}
@@ -104,9 +105,8 @@ def check(texts: dict[str, str], listing: str) -> tuple[list[Finding], list[str]
 
 def tracked(folder: Path) -> dict[str, str]:
     """The text files of the repository."""
-    listed = subprocess.run(["git", "ls-files", "-z"], cwd=folder, check=True, capture_output=True, text=True)
     texts = {}
-    for name in filter(None, listed.stdout.split("\0")):
+    for name in doccheck.tracked(folder):
         path = folder / name
         if path.is_symlink() or not path.is_file() or path.name in LEFT_OUT:
             continue

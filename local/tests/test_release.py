@@ -7,7 +7,7 @@ import tomllib
 import unittest
 from pathlib import Path
 
-from labkit import release
+from labkit import doccheck, release
 from labkit.errors import LabError
 
 REPOSITORY = Path(__file__).resolve().parents[2]
@@ -49,9 +49,8 @@ class Owner(unittest.TestCase):
 
     def test_no_file_names_another_account(self) -> None:
         own = {release.owner(REPOSITORY), "${OWNER,,}", "$GITHUB_REPOSITORY"}
-        files = subprocess.run(["git", "ls-files", "-z"], cwd=REPOSITORY, check=True, capture_output=True, text=True)
         found = {}
-        for file in filter(None, files.stdout.split("\0")):
+        for file in doccheck.tracked(REPOSITORY):
             if file == "local/tests/test_release.py":
                 continue
             text = (REPOSITORY / file).read_text(errors="replace") if (REPOSITORY / file).is_file() else ""

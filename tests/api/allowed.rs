@@ -22,7 +22,6 @@ async fn change(world: &World, spec: &Value) {
     api.patch("lb", &PatchParams::default(), &patch).await.unwrap();
 }
 
-/// Waits until `Ready` has this reason; hands back its message.
 /// The message of `Ready` once it has this reason and this part.
 async fn until_says(world: &World, reason: Reason, part: &str) -> String {
     let condition = |board: Option<&Leaderboard>| {

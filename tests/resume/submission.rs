@@ -6,9 +6,10 @@ use std::path::{Path, PathBuf};
 use std::sync::OnceLock;
 use std::sync::atomic::{AtomicU32, Ordering};
 
-use leaderboard_api::{Attempt, ByteQuantity, CarlaPlan, LeaderboardVersion, RunPlan, S3Bucket, Storage, Verify};
+use leaderboard_api::{LeaderboardVersion, Verify};
 use leaderboard_aws::archive::Archive;
-use leaderboard_contract::run::{ENV_POD_UID, ENV_RUN, Run, SCHEMA};
+use leaderboard_contract::run::{ENV_POD_UID, ENV_RUN, Run};
+use leaderboard_evaluation::fixtures;
 use leaderboard_pod::places::Places;
 use leaderboard_protocol::files::{KEPT_CHECKPOINT, Member, Side};
 use tokio::process::Command;
@@ -214,49 +215,21 @@ pub fn make_volumes(root: &Path) {
 }
 
 fn run(endpoint: &str, bucket: &str, id: &str, format: LeaderboardVersion) -> Run {
-    Run {
-        schema: SCHEMA,
-        namespace: "default".to_owned(),
+    let mut run = Run {
         submission: id.to_owned(),
         uid: format!("uid of {id}"),
-        attempt: Attempt(1),
-        plan: RunPlan {
-            run_id: id.parse().unwrap(),
-            track: "sensors".into(),
-            phase: None,
-            storage: Storage {
-                s3: S3Bucket {
-                    bucket: bucket.to_owned(),
-                    prefix: Some("runs/".to_owned()),
-                    region: None,
-                    endpoint: Some(endpoint.to_owned()),
-                    size_limit: ByteQuantity::gibibytes(1),
-                    kms_key_arn: None,
-                    storage_class: None,
-                },
-            },
-            image: "image".to_owned(),
-            carla: CarlaPlan {
-                version: format,
-                codename: "SENSORS".into(),
-                slices: leaderboard_api::effective::slices(20, 4),
-                routes: 20,
-                repetitions: 1,
-                contents_image: "contents".into(),
-                simulator_image: "simulator".into(),
-            },
-            resume: false,
-            earlier_attempts: 0,
-            submission_uid: None,
-        },
         verify: Verify::Refuse,
         // The smallest pause between two rounds is what is left.
         period_seconds: 0,
-        flush_seconds: 60,
-        cancel_seconds: 20,
-        logs: None,
-        isolation: None,
-    }
+        ..fixtures::run()
+    };
+    run.plan.run_id = id.parse().unwrap();
+    let carla = &mut run.plan.carla;
+    (carla.version, carla.slices, carla.routes) = (format, leaderboard_api::effective::slices(20, 4), 20);
+    let s3 = &mut run.plan.storage.s3;
+    (s3.bucket, s3.prefix) = (bucket.to_owned(), Some("runs/".to_owned()));
+    s3.endpoint = Some(endpoint.to_owned());
+    run
 }
 
 fn free_ports(random: &mut fastrand::Rng) -> Vec<u16> {

@@ -13,6 +13,8 @@ use serde::{Deserialize, Serialize};
 use serde_json::json;
 use tokio::time::sleep;
 
+use crate::support::player::Cluster;
+
 use super::lifecycle::{Controller, Scenario, Watched, World, has_job, is_read, is_running};
 
 /// Submissions.
@@ -54,15 +56,11 @@ pub async fn of_refused_jobs() -> Rest {
     let controller = Controller::start(&world, Watched::default()).await;
     world.ready().await;
     submit(&world).await;
+    let cluster = Cluster::new(&world.client, &world.namespace);
     for name in names() {
         world.until(&name, "it has a Job", has_job).await;
-    }
-    // The status names a Job before it is there.
-    for name in names() {
-        let there = |job: Option<&Job>| job.is_some();
-        let job = format!("{name}-1");
-        let made = kube::runtime::wait::await_condition(world.api::<Job>(), &job, there);
-        made.await.unwrap();
+        // The status names a Job before it is there.
+        cluster.job(&format!("{name}-1")).await;
     }
     let jobs = world.api::<Job>().list(&ListParams::default()).await.unwrap();
     assert_eq!(jobs.items.len(), COUNT);
