@@ -1,7 +1,7 @@
 # The operator's image, for those who have a container engine: `docker build -t leaderboard-operator:dev .`
 # `make image` makes the same one without an engine; local/operator-image.toml is its list of files.
 
-# The release workflow resolves both names to digests and records them (docs/release.md); by hand they are what the tags point at.
+# The release workflow resolves both names to digests and records them (docs/versions.md); by hand they are what the tags point at.
 ARG BUILD_IMAGE=rust:1.95-bookworm
 ARG BASE_IMAGE=gcr.io/distroless/cc-debian12:nonroot
 

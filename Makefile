@@ -69,7 +69,7 @@ images: image ## Make and push all images of the demo
 crds: ## Generate crds/ from the types
 	UPDATE_CRDS=1 cargo test --profile $(PROFILE) --workspace --lib -- crds
 
-docs: ## Write docs/security-probes.md and the tables of reasons in docs/states.md
+docs: ## Write docs/reference/probes.md and the tables of reasons in docs/states.md
 	UPDATE_DOCS=1 cargo test --profile $(PROFILE) --workspace --lib -- documentation
 
 fmt: ## Format the code
@@ -104,7 +104,7 @@ bench: ## Measure the operator next to the limit of its API server (30 min after
 bench-quick: ## The same with smaller numbers (5 min after the build)
 	$(MAKE) bench BENCH_FLAGS="--quick $(BENCH_FLAGS)"
 
-bench-report: ## Write tables and plots of docs/performance.md and docs/scale.md from what bench has measured
+bench-report: ## Write tables and plots of docs/performance.md from what bench has measured
 	$(BENCH) report $(BENCH_LINES)
 
 bench-results: ## Measure the merge of results

@@ -42,7 +42,7 @@ struct Outlook {
     ready: f64,
 }
 
-/// The table of docs/scale.md.
+/// The table of docs/performance.md.
 pub fn table(lines: &[Line]) -> Outcome<String> {
     let Some(rates) = rates(lines) else {
         return Ok("Not simulated: the cases intake-1000 and live were not measured.\n".into());

@@ -257,7 +257,7 @@ async fn lose_all(world: &World) {
     lose::<NetworkPolicy>(world).await;
 }
 
-/// The commands of docs/backup.md that make the objects of a file anew; `$BACKUP` is that file.
+/// The commands of docs/availability.md that make the objects of a file anew; `$BACKUP` is that file.
 const CREATE: &str = r"sed -E '/^    (resourceVersion|uid): /d' $BACKUP > $BACKUP.new
 kubectl --namespace $NS create --filename $BACKUP.new";
 /// The command that gives them their statuses.
@@ -392,7 +392,7 @@ async fn what_a_backup_brings_back_with_its_status_goes_on_as_it_was() {
     lose_all(world).await;
 
     boards.run(world, CREATE).await;
-    // One half as docs/backup.md restores a file, the other half as a tool such as Velero does.
+    // One half as docs/availability.md restores a file, the other half as a tool such as Velero does.
     others.run(world, CREATE).await;
     others.run(world, STATUSES).await;
     locals.run(world, CREATE).await;

@@ -11,24 +11,37 @@ use crate::record::{Line, read};
 use crate::scale;
 use crate::stats::{Summary, number};
 
+/// The summary for people who choose, below docs/.
+const SUMMARY: &str = "performance.md";
+/// Every figure and the machine, below docs/.
+const FIGURES: &str = "performance/figures.md";
+
 /// Writes everything that the lines are enough for.
 pub fn write(file: &Path, docs: &Path) -> Outcome<()> {
     let lines = read(file)?;
     if lines.is_empty() {
         return Err(format!("{} has no line", file.display()).into());
     }
-    let document = docs.join("performance.md");
-    let text = std::fs::read_to_string(&document)?;
-    let text = replaced(&text, "machine", &machine(&lines))?;
-    let text = replaced(&text, "aims", &aims::table(&lines))?;
-    let text = replaced(&text, "figures", &figures(&lines))?;
     let plots = plots::write(&lines, &docs.join("performance"))?;
-    let text = replaced(&text, "plots", &plots)?;
-    std::fs::write(&document, text)?;
-    let document = docs.join("scale.md");
-    let text = std::fs::read_to_string(&document)?;
-    std::fs::write(&document, replaced(&text, "simulation", &scale::table(&lines)?)?)?;
-    Ok(())
+    let summary = [
+        ("aims", aims::table(&lines)),
+        ("plots", plots),
+        ("simulation", scale::table(&lines)?),
+    ];
+    fill(&docs.join(SUMMARY), &summary)?;
+    fill(
+        &docs.join(FIGURES),
+        &[("machine", machine(&lines)), ("figures", figures(&lines))],
+    )
+}
+
+/// Replaces the content of each mark of a document.
+fn fill(document: &Path, contents: &[(&str, String)]) -> Outcome<()> {
+    let mut text = std::fs::read_to_string(document)?;
+    for (mark, content) in contents {
+        text = replaced(&text, mark, content)?;
+    }
+    Ok(std::fs::write(document, text)?)
 }
 
 /// The text with another content between two marks.
@@ -128,8 +141,8 @@ mod tests {
     fn the_documents_have_their_marks() {
         let docs = Path::new(env!("CARGO_MANIFEST_DIR")).join("../docs");
         for (file, marks) in [
-            ("performance.md", vec!["machine", "aims", "figures", "plots"]),
-            ("scale.md", vec!["simulation"]),
+            (SUMMARY, vec!["aims", "plots", "simulation"]),
+            (FIGURES, vec!["machine", "figures"]),
         ] {
             let text = std::fs::read_to_string(docs.join(file)).unwrap();
             for mark in marks {

@@ -1,4 +1,4 @@
-//! What has begun since the last backup comes back from the table, by the commands of docs/backup.md.
+//! What has begun since the last backup comes back from the table, by the commands of docs/availability.md.
 
 use aws_sdk_dynamodb::types::AttributeValue;
 use kube::runtime::wait::await_condition;
@@ -61,7 +61,7 @@ async fn put_others(world: &World, [rows, local_rows]: &[String; 2]) {
 
 /// The commands of the page for one Leaderboard, whose table `aws` prints from a file.
 fn commands(world: &World, board: &str, file: &str) -> String {
-    let page = std::path::Path::new(env!("CARGO_MANIFEST_DIR")).join("docs/backup.md");
+    let page = std::path::Path::new(env!("CARGO_MANIFEST_DIR")).join("docs/availability.md");
     let page = std::fs::read_to_string(page).unwrap();
     let at = page.find("   aws dynamodb scan").unwrap();
     let (lines, _) = page[at..].split_once("```").unwrap();

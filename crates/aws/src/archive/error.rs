@@ -79,7 +79,7 @@ impl Cause {
                  the controller and its Pods then send none."
             }
             Self::Refused(_) => {
-                "Check storage.s3.bucket, storage.s3.region and storage.s3.endpoint of the leaderboard; docs/storage.md has the stores that refuse \
+                "Check storage.s3.bucket, storage.s3.region and storage.s3.endpoint of the leaderboard; docs/results.md has the stores that refuse \
                  checksums."
             }
             Self::Slow => "It is tried again later.",

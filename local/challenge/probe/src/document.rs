@@ -1,4 +1,4 @@
-//! docs/security-probes.md, written from the tables that the tests run.
+//! docs/reference/probes.md, written from the tables that the tests run.
 
 use std::fmt::Write as _;
 
@@ -93,7 +93,7 @@ pub fn text() -> String {
 mod tests {
     use super::*;
 
-    const PAGE: &str = concat!(env!("CARGO_MANIFEST_DIR"), "/../../../docs/security-probes.md");
+    const PAGE: &str = concat!(env!("CARGO_MANIFEST_DIR"), "/../../../docs/reference/probes.md");
 
     /// `make docs` sets UPDATE_DOCS: the page is then written, not compared.
     #[test]
@@ -105,7 +105,7 @@ mod tests {
         let found = std::fs::read_to_string(PAGE).unwrap();
         assert!(
             found == text(),
-            "docs/security-probes.md does not show the tables of local/challenge/probe: run `make docs`"
+            "docs/reference/probes.md does not show the tables of local/challenge/probe: run `make docs`"
         );
     }
 }

@@ -2,7 +2,7 @@
 //! the code that tries them.
 //!
 //! One table serves three: the program in the image runs it, `tests/cluster/probes.rs` judges what it printed, and
-//! docs/security-probes.md is written from it. Nothing here uses the operator's code: paths are those that a container finds
+//! docs/reference/probes.md is written from it. Nothing here uses the operator's code: paths are those that a container finds
 //! mounted. No probe sends anything beyond its own Pod, and none does harm where it gets through.
 
 mod call;
