@@ -45,8 +45,11 @@ def run(settings: Settings) -> None:
             raise LabError("the pictures are of the demo's cluster, which is not there: run `make demo` first")
         with changed_back(kube):
             shown = submissions(settings, kube)
-            for name, data in [*terminals(kube, tab, shown), *pages(kube, tab)]:
-                pagetest.keep(settings.repository / "docs" / "images" / f"{name}.png", data)
+            folder = settings.repository / "docs" / "images"
+            for name, drawing in terminals(kube, shown):
+                pagetest.keep(folder / f"{name}.svg", drawing.encode())
+            for name, data in pages(kube, tab):
+                pagetest.keep(folder / f"{name}.png", data)
 
 
 @contextmanager
@@ -109,14 +112,15 @@ def wait(kube: Kube, submission: str, what: str) -> None:
     kube.run("kubectl", *argv, action=f"waiting for {what} of {submission}")
 
 
-def terminals(kube: Kube, tab: Tab, shown: Shown) -> Iterator[tuple[str, bytes]]:
-    """Pictures of terminals; all that is shown is printed too."""
+def terminals(kube: Kube, shown: Shown) -> Iterator[tuple[str, str]]:
+    """Drawings of terminals; all that is shown is printed too."""
     sessions = {
-        "submissions": ["kubectl get submissions", f"kubectl leaderboard status {shown.running}"],
+        "submissions": ["kubectl get submissions"],
         "top": ["kubectl leaderboard status", "kubectl leaderboard top"],
         "why": [f"kubectl leaderboard why {shown.failed}"],
         "": [
             "kubectl get submissions -o wide",
+            f"kubectl leaderboard status {shown.running}",
             f"kubectl describe submission {shown.failed}",
             *(f"kubectl leaderboard why {name}" for name in (shown.waiting, shown.running, shown.finished)),
         ],
@@ -126,7 +130,7 @@ def terminals(kube: Kube, tab: Tab, shown: Shown) -> Iterator[tuple[str, bytes]]
         for command, text in session:
             print(f"$ {command}\n{terminal.plain(text)}\n", flush=True)
         if name:
-            yield f"terminal-{name}", terminal.picture(tab, session)
+            yield f"terminal-{name}", terminal.picture(session)
 
 
 def pages(kube: Kube, tab: Tab) -> Iterator[tuple[str, bytes]]:

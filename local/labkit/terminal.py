@@ -1,4 +1,4 @@
-"""Owns what a command shows on a terminal: runs it on one, and draws what it wrote as a picture. Knows no command."""
+"""Owns what a command shows on a terminal: runs it on one, and draws what it wrote as an SVG. Knows no command."""
 
 import fcntl
 import html
@@ -10,22 +10,20 @@ import subprocess
 import termios
 from collections.abc import Iterator, Mapping, Sequence
 
-from .browser import Tab
-
 # Code of a colour -> what a dark terminal shows, as those of the page.
 COLOURS = {31: "#ffaba4", 32: "#7fe0bd", 33: "#ffd690", 34: "#8ab8ff", 35: "#d9b8ff", 36: "#7fd4ea"}
 DIM = 2
 SEQUENCE = re.compile(r"\x1b\[([0-9;]*)m")
 ROWS = 60
-# A picture has two pixels for one of a small screen, so that letters stay sharp.
-SCALE = 2
-PAGE = """<!doctype html><meta charset="utf-8"><style>
-* { margin: 0 }
-body { background: #0f1216 }
-pre { display: inline-block; padding: 14px 18px; background: #0f1216; color: #e8eaee; font: 14px/1.35 "DejaVu Sans Mono", monospace }
-.prompt { color: #7fe0bd; font-weight: bold }
-.command { font-weight: bold }
-</style><pre>BODY</pre>"""
+# The shape of a picture, in pixels: a letter of the font at this size is that wide.
+SIZE, WIDE, HIGH = 14, 8.4, 19
+LEFT, TOP = 18, 40
+TEXT, PROMPT = "#e8eaee", "#7fe0bd"
+HEAD = """<svg xmlns="http://www.w3.org/2000/svg" viewBox="0 0 {width} {height}" width="{width}" height="{height}" role="img" aria-label="{label}">
+<rect width="{width}" height="{height}" rx="9" fill="#0f1216"/>
+<g fill="#3c4450"><circle cx="20" cy="18" r="5.5"/><circle cx="38" cy="18" r="5.5"/><circle cx="56" cy="18" r="5.5"/></g>
+<g font-family="ui-monospace, 'DejaVu Sans Mono', Menlo, Consolas, monospace" font-size="{size}" fill="{text}" xml:space="preserve">
+"""
 
 
 def shown(argv: Sequence[str], env: Mapping[str, str], columns: int) -> str:
@@ -55,36 +53,41 @@ def plain(text: str) -> str:
     return SEQUENCE.sub("", text)
 
 
-def marked_up(text: str) -> str:
-    """The text as HTML, with an element for each stretch in a colour."""
+def picture(commands: Sequence[tuple[str, str]]) -> str:
+    """An SVG of a terminal with these commands and what each has written."""
+    lines = []
+    for command, text in commands:
+        prompt = f'<tspan fill="{PROMPT}" font-weight="bold">$</tspan>'
+        lines.append((len(command) + 2, f'{prompt}<tspan font-weight="bold"> {html.escape(command)}</tspan>'))
+        lines += [(len(plain(line)), marked_up(line)) for line in text.split("\n")]
+        lines.append((0, ""))
+    lines.pop()
+    width = round(2 * LEFT + WIDE * max(length for length, _ in lines))
+    height = TOP + HIGH * len(lines) + 10
+    label = html.escape(", ".join(command for command, _ in commands), quote=True)
+    parts = [HEAD.format(width=width, height=height, label=label, size=SIZE, text=TEXT)]
+    for row, (length, markup) in enumerate(lines):
+        if length:
+            # The length makes columns straight in any font.
+            place = f'x="{LEFT}" y="{TOP + HIGH * (row + 1) - 6}" textLength="{WIDE * length:.1f}"'
+            parts.append(f"<text {place}>{markup}</text>\n")
+    return "".join([*parts, "</g>\n</svg>\n"])
+
+
+def marked_up(line: str) -> str:
+    """A line as the content of an SVG's text, with an element for each stretch in a colour."""
     parts, style = [], ""
-    for at, part in enumerate(SEQUENCE.split(text)):
+    for at, part in enumerate(SEQUENCE.split(line)):
         if at % 2:
             style = style_of(part)
         elif part:
             escaped = html.escape(part)
-            parts.append(f'<span style="{style}">{escaped}</span>' if style else escaped)
+            parts.append(f"<tspan {style}>{escaped}</tspan>" if style else escaped)
     return "".join(parts)
 
 
 def style_of(codes: str) -> str:
-    """What stands after the last sequence alone: our programs end each stretch before they begin another."""
+    """What stands after the last sequence alone: our programs end each stretch before they begin another, and each line with it."""
     numbers = [int(code) for code in codes.split(";") if code]
-    styles = [f"color: {COLOURS[number]}" for number in numbers if number in COLOURS]
-    return "; ".join([*styles, *(["opacity: 0.65"] if DIM in numbers else [])])
-
-
-def picture(tab: Tab, commands: Sequence[tuple[str, str]]) -> bytes:
-    """A PNG of a terminal with these commands and what each has written."""
-    stretches = [
-        f'<span class="prompt">$</span> <span class="command">{html.escape(command)}</span>\n{marked_up(text)}'
-        for command, text in commands
-    ]
-    tab.prefer()
-    tab.size(2000, 2000, SCALE)
-    tab.open("about:blank")
-    tab.fill(PAGE.replace("BODY", "\n\n".join(stretches)))
-    width, height = tab.run(
-        "(({ width, height }) => [width, height])(document.querySelector('pre').getBoundingClientRect())"
-    )
-    return tab.picture(width, height)
+    styles = [f'fill="{COLOURS[number]}"' for number in numbers if number in COLOURS]
+    return " ".join([*styles, *(['opacity="0.65"'] if DIM in numbers else [])])
