@@ -32,16 +32,18 @@ PLACE = re.compile(
     r"`((?:[\w.-]+/)*[\w.-]+\.(?:rs|py)|(?:src|crates|tests|local|benches|charts|examples)/[\w./-]*\w/?)`"
 )
 NAME_IN_PLACE = re.compile(r"`([\w:]+)` in\s+`((?:[\w.-]+/)*[\w.-]+\.(?:rs|py))`")
+# A row of docs/reference/attacks.md.
+SHOWN = re.compile(r"^\| (\d+) \| `([\w./-]+\.(?:rs|py))::(\w+)` \|$", re.MULTILINE)
 KINDS = ("held", "by policy", "inherent", "open", "struck")
 # How the sums are written in the text, so that it cannot contradict its table.
 SUMS = re.compile(
-    r"Of (\d+) attacks (\d+) are held, (\d+) are held by policy, (\d+) are inherent, (\d+) are open, and (\d+) are struck\."
+    r"The table has (\d+) attacks: (\d+) are held, (\d+) are held by policy, (\d+) are inherent, (\d+) are open, and (\d+) are struck\."
 )
 
 
 @dataclass(frozen=True)
 class Attack:
-    """One row of the table in docs/security.md. `tests` are pairs of a file and a test's name."""
+    """One row of the table in docs/security.md. `tests` are pairs of a file and a test's name, from the row or the page of tests."""
 
     number: int
     kind: str
@@ -126,19 +128,26 @@ def link_faults(page: Path) -> Iterator[str]:
             yield f"{page.name}: {link}: there is no heading {place}"
 
 
-def attacks(text: str) -> list[Attack]:
-    """The rows of the table, in the order of the page."""
-    rows = ROW.findall(text)
-    return [Attack(int(number), kind, tuple(TEST.findall(why))) for number, _, kind, why in rows]
+def attacks(text: str, tests: str) -> list[Attack]:
+    """The rows of the table, in the order of the page, with what the page of tests has for each number."""
+    shown: dict[int, list[tuple[str, str]]] = {}
+    for number, file, name in SHOWN.findall(tests):
+        shown.setdefault(int(number), []).append((file, name))
+    return [
+        Attack(int(number), kind, (*TEST.findall(why), *shown.get(int(number), [])))
+        for number, _, kind, why in ROW.findall(text)
+    ]
 
 
-def attack_faults(text: str, expected: int) -> Iterator[str]:
+def attack_faults(text: str, tests: str, expected: int) -> Iterator[str]:
     """What is wrong with the table of attacks by itself: numbers, kinds, missing tests, and the sums in the text."""
-    found = attacks(text)
+    found = attacks(text, tests)
     numbers = [attack.number for attack in found]
     if numbers != list(range(1, expected + 1)):
         odd = sorted(set(numbers) ^ set(range(1, expected + 1)))
         yield f"the rows must be 1 to {expected} in order; wrong or missing: {odd or 'the order'}"
+    for number in sorted({int(row[0]) for row in SHOWN.findall(tests)} - set(numbers)):
+        yield f"the page of tests has attack {number}, which the table lacks"
     for attack in found:
         if attack.kind not in KINDS:
             yield f"attack {attack.number} is {attack.kind!r}, not one of {', '.join(KINDS)}"

@@ -23,7 +23,7 @@ HABITS = {
     r"nothing\b[^.;:|]{0,60}\bbut\b": "only",
     r"whoever": "anyone who",
     r"whosoever": "anyone who",
-    r"strangers?(?:'s?)?": "participants",
+    r"strangers'?": "participants",
     r"so that it be\b": "a plain verb",
 }
 HABIT = re.compile(r"\b(?:" + "|".join(f"({pattern})" for pattern in HABITS) + r")(?!\w)", re.IGNORECASE)
@@ -79,7 +79,9 @@ def faults(path: str, text: str) -> Iterator[Fault]:
 def of_block(block: Block) -> Iterator[str]:
     """The faults of a block."""
     shown = seen(block.text)
-    if block.kind == "cell" and len(shown) > CELL:
+    # A query or a command is read as one word.
+    is_code = CODE.fullmatch(block.text) is not None
+    if block.kind == "cell" and len(shown) > CELL and not is_code:
         yield f"a cell of {len(shown)} characters, {CELL} at most: {begin(shown)}"
     if block.kind == "heading":
         return
@@ -88,7 +90,8 @@ def of_block(block: Block) -> Iterator[str]:
         if count > SENTENCE:
             yield f"a sentence of {count} words, {SENTENCE} at most: {begin(sentence)}"
         headless = HEADLESS.match(sentence.lstrip("*_\"'("))
-        if headless and block.kind != "cell" and not sentence.rstrip(")*\"'").endswith("?"):
+        is_head = sentence.startswith("**") and "**" not in sentence[2:]
+        if headless and block.kind != "cell" and not is_head and not sentence.rstrip(")*\"'").endswith("?"):
             yield f'a sentence begins with "{headless[0]}": name its subject first: {begin(sentence)}'
         for habit in HABIT.finditer(sentence):
             better = list(HABITS.values())[(habit.lastindex or 1) - 1]
@@ -121,6 +124,8 @@ def blocks(text: str) -> Iterator[Block]:
     fenced = in_list = False
     for number, line in enumerate(lines, 1):
         kind, part = kind_of(line, fenced)
+        if kind == "text" and line.startswith("    ") and open_block is None and not in_list:
+            continue
         fenced ^= kind == "fence"
         if kind == "text" and open_block is not None:
             open_block = open_block._replace(text=f"{open_block.text}\n{part}")

@@ -90,7 +90,7 @@ impl Shared {
             oldest_message: r.gauges(
                 "queue_oldest_message_timestamp_seconds",
                 ["queue"],
-                "Unix time at which the oldest message was sent that was received and is not deleted; absent without one. `queue` is the URL of a queue in SQS, or server and name of one in EvalAI, where a message is as old as its row's last request to be run",
+                "Unix time of the oldest message that was received and is not deleted; absent without one. `queue` is an SQS URL, or server and name in EvalAI, where a row's last request to run counts",
             ),
         }
     }

@@ -11,8 +11,8 @@ use thiserror::Error;
 
 /// No verdict is longer, in bytes. The containers of a Pod share 12 KiB of termination messages: 16 pairs leave 351 bytes each.
 pub const MAX_BYTES: usize = 340;
-/// Exit code of a runner to which its node has refused what it needs, before its command ran (EX_OSERR). It counts without a verdict, too,
-/// which takes an open file. Nothing of the image has run in this life of the container, so nothing of it can have brought that about.
+/// Exit code of a runner whose node refused what it needs before its command ran (EX_OSERR). It counts without a verdict, too: a verdict
+/// takes an open file. The image cannot cause it, because no process of the image has run.
 pub const CODE_NODE_REFUSED: i32 = 71;
 /// The same for want of a process (EX_TEMPFAIL), which the other containers of the Pod can use up.
 pub const CODE_NO_PROCESS: i32 = 75;

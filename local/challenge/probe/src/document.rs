@@ -12,13 +12,13 @@ const HEAD: &str = "\
 # What a hostile image tries, and what comes of it
 
 `make test` runs an image that tries each attack of this page, and fails if one gets through. The image runs as root and as
-user 1000, under Leaderboard 1.0 and 2.0. The same tables make this page, so what is not tried is not on it.
+user 1000, under Leaderboard 1.0 and 2.0. Its own tables make this page, so each attack on it is tried.
 
 | verdict | means |
 |---|---|
 | held | the operator's own Pods and rules refuse it in any cluster |
 | by policy | the cluster decides: the named object or setting must be there, and be enforced |
-| inherent | it works for every image and yields nothing that is secret; or nobody can distinguish it from honest work |
+| inherent | it works for every image and yields nothing that is secret; or it cannot be distinguished from honest work |
 
 A host who gives containers more rights (`securityContext`, `podOverrides`) opens what this page calls held. A test does that on
 purpose, to see that the probes find it.

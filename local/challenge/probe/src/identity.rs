@@ -23,7 +23,7 @@ pub(crate) const PROBES: &[Probe] = &[
     held(
         "service-account-token",
         "Read the ServiceAccount's token, or a cloud's token of the Pod",
-        "the Pod mounts none (`automountServiceAccountToken: false`), and admission webhooks are asked to skip these containers",
+        "the Pod mounts none (`automountServiceAccountToken: false`), and an annotation makes admission webhooks skip these containers",
         || found(TOKENS),
     ),
     held(
@@ -52,7 +52,7 @@ pub(crate) const PROBES: &[Probe] = &[
     ),
     held(
         "gpu-variable",
-        "Use a GPU of the node that nobody requested for it",
+        "Use a GPU of the node that it was not given",
         "`NVIDIA_VISIBLE_DEVICES` is `void` for every container without one",
         || match env::var("NVIDIA_VISIBLE_DEVICES").as_deref() {
             Ok("void") => Seen::Denied("void".to_owned()),
