@@ -1,4 +1,4 @@
-"""Words that a reader does not search for, and the usual ones of the field.
+"""Words that a reader does not search for, and the usual ones of the field; with `prose`, what `local/words` finds.
 
 Only words without another use are listed, so that a finding is never a matter of taste. Of Rust and Python these are read: comments,
 strings and the names of functions, since that of a test is a sentence. Any other text file is read as a whole.
@@ -11,7 +11,7 @@ from collections.abc import Iterator
 from pathlib import Path
 from typing import NamedTuple
 
-from . import doccheck
+from . import doccheck, prose
 
 # At the start of a message: nobody knows whose Pod it is.
 NAMED = {"Its Pod": "The Pod, or its name", "Its Job": "The Job, or its name"}
@@ -40,7 +40,7 @@ PATTERN = re.compile(
 # A comment, a raw string, a string, a character, which may be a quotation mark, or the name of a function.
 RUST = re.compile(r"\bfn\s+\w+|//[^\n]*|/\*.*?\*/|\br(#*)\".*?\"\1|\"(?:\\.|[^\"\\])*\"|'(?:\\.|[^\\'\n])'", re.DOTALL)
 # Written by programs, or about these words.
-LEFT_OUT = ("Cargo.lock", "go.sum", "words.py", "words.allow", "test_words.py")
+LEFT_OUT = ("Cargo.lock", "go.sum", "words.py", "prose.py", "words.allow", "test_words.py", "test_prose.py")
 
 
 class Finding(NamedTuple):
@@ -120,8 +120,15 @@ def tracked(folder: Path) -> dict[str, str]:
 def main(folder: Path, allow: Path) -> int:
     texts = tracked(folder)
     findings, unused = check(texts, allow.read_text(encoding="utf-8"))
-    for finding in findings:
+    faults = prose_faults(texts)
+    for finding in [*findings, *faults]:
         print(finding)
     for rule in unused:
         print(f'{allow.name}: "{rule}" allows nothing any more: remove it')
-    return 1 if findings or unused else 0
+    return 1 if findings or faults or unused else 0
+
+
+def prose_faults(texts: dict[str, str]) -> list[prose.Fault]:
+    """What is hard to read in the documents."""
+    pages = {path: text for path, text in sorted(texts.items()) if path.endswith(".md") and path not in prose.LEFT_OUT}
+    return [fault for path, text in pages.items() for fault in prose.faults(path, text)]

@@ -11,8 +11,8 @@ use thiserror::Error;
 
 /// No verdict is longer, in bytes. The containers of a Pod share 12 KiB of termination messages: 16 pairs leave 351 bytes each.
 pub const MAX_BYTES: usize = 340;
-/// Exit code of a runner whose node refused what it needs before its command ran (EX_OSERR). It counts without a verdict, too: a verdict
-/// takes an open file. The image cannot cause it, because no process of the image has run.
+/// Exit code of a runner whose node refused what it needs before its command ran (EX_OSERR). It counts without a verdict, since no process
+/// of the image has run and can have caused it.
 pub const CODE_NODE_REFUSED: i32 = 71;
 /// The same for want of a process (EX_TEMPFAIL), which the other containers of the Pod can use up.
 pub const CODE_NO_PROCESS: i32 = 75;
