@@ -21,21 +21,16 @@ reasons! {
             "Check that EvalAI serves the submission's input file, or set `spec.image`. If it lasts, ask the participant to push \
              again, and cancel this submission.";
         PhaseDiffers,
-            "EvalAI's row belongs to another phase than the Submission: one of the two was edited, or the Submission was applied \
-             with the wrong phase. It does not run, and for an hour nothing is reported to EvalAI; then it fails (which does not \
-             count as an attempt), so that the participant sees an end in EvalAI.",
-            "Set the phase back in EvalAI: within the hour the submission continues without further action; after it has failed, \
-             resume it. If the Submission has the wrong phase, delete it within the hour and apply it with the right one.",
-            after_failure: "Set the phase back in EvalAI, then resume the submission. If the Submission has the wrong phase, \
-             delete it and apply it with the right one.";
+            "EvalAI's row belongs to another phase than the Submission: one of the two was edited. It does not run. After an hour it \
+             fails, which does not count as an attempt, so that EvalAI shows an end.",
+            "Set the phase back in EvalAI within the hour, and the submission continues. If the Submission's own phase is wrong, \
+             delete it and apply it anew.",
+            after_failure: "Set the phase back, then resume it.";
         Foreign,
-            "The submission is held back, because another program such as the old pipeline may run it. Either the table's row is \
-             `SUBMITTED` or `RUNNING` and has no `attempt`, or the row cannot be read; then nothing has been written anywhere. Or the \
-             Pod has found results of something else below the run's prefix; then its Job was deleted, and nothing more is written to \
-             EvalAI, table and bucket.",
-            "With a row: wait for the end of the other run; the row is read every 30 s. If nothing runs it any more, set the row's \
-             `submission_status` to `FAILED`. In each case the annotation `leaderboard.carla.org/adopt=true` hands the Submission over: \
-             it then continues from what is stored. If the message has an error, do what it asks.";
+            "Another program may run the submission, such as the old pipeline. The table's row shows such a run or cannot be read, or \
+             the Pod found its files below the run's prefix. The operator writes nothing.",
+            "Wait for the end of the other run. If none runs, set the row's `submission_status` to `FAILED`, or hand the Submission \
+             over by the annotation `leaderboard.carla.org/adopt=true`.";
         WaitingForSlot,
             "All slots that `concurrency.total` and `concurrency.perTeam` allow are in use. `status.waiting` has the position in the line \
              and an estimate.",
@@ -61,12 +56,9 @@ reasons! {
             "The API server refuses the Job or its Pod: a LimitRange, Pod Security, or a webhook.",
             "Fix what the message names, in the Leaderboard or in the namespace.";
         ImagePull,
-            "An image cannot be pulled. The submission fails after `deadlines.startSeconds`. The agent's image is the cause only where its \
-             registry has no such image, has it for other machines, or has what is no container image: `ImageNotFound`, \
-             `ImagePlatform`, `ImageInvalid`. Every other cause, such as refused rights, a time-out or a full disk, is an \
-             infrastructure failure.",
-            "Fix the name, the rights of the nodes, or the network, as the message asks. If the registry does not have the agent's image, \
-             the participant pushes it again for linux/amd64.",
+            "An image cannot be pulled; the submission fails after `deadlines.startSeconds`. That counts as an attempt only if the \
+             registry lacks the image (`ImageNotFound`, `ImagePlatform`, `ImageInvalid`).",
+            "Fix the image's name, the rights of the nodes, or the network, as the message asks.",
             after_failure: "Fix this, then resume the submission.";
         ContainerConfig,
             "A container cannot be set up: a Secret or a key is missing, or the Leaderboard's settings of its user contradict each other.",
@@ -74,10 +66,9 @@ reasons! {
             after_failure: "Fix this, then resume the submission.";
 
         NotIsolated,
-            "The NetworkPolicy of the Leaderboard is not in place, and no Job is created without it. As a failure: \
-             `network.enforcement` is `Require`, and the Pod could reach what the policy forbids, or could not measure it.",
-            "Nothing for a moment after the Leaderboard was applied or edited. If it lasts, do what the condition `Isolated` of the \
-             Leaderboard reports.",
+            "The Leaderboard's NetworkPolicy is not in place, and no Job starts without it. As a failure: with `network.enforcement: \
+             Require` the Pod could reach what it forbids, or could not measure it.",
+            "Nothing for a moment after an edit of the Leaderboard. If it lasts, do what its condition `Isolated` reports.",
             after_failure: "Do what the message asks, then resume the submission.";
     }
     Running {
@@ -91,8 +82,8 @@ reasons! {
             "The agents are running and continue from the stored results.",
             "Nothing.";
         Replacing,
-            "The Pod or the Job was lost, or a host has raised `spec.attempt` of a live run, and a new Job continues from the stored \
-             results; or the operator retries after an infrastructure failure.",
+            "The Pod or the Job was lost, a failure of the infrastructure is retried, or a host has raised `spec.attempt` of a live \
+             run. A new Job continues from the stored results.",
             "Nothing. The message names the cause.";
         Stopping,
             "The submission is being stopped; completed routes are kept.",
@@ -112,12 +103,10 @@ reasons! {
             "A person cancelled it; completed routes are kept.",
             "To continue it, resume it: a patch to a higher `attempt` with `cancel: false`.";
         EndedInEvalAI,
-            "It ended in EvalAI: cancelled, archived, deleted, or set to an end by hand. (`finished` counts only before the run was \
-             under way: participants can write it, and the operator's own result later replaces it.) The operator then writes \
-             nothing to EvalAI, with one exception: for a Submission deleted before its end it writes `cancelled`, because EvalAI \
-             would otherwise count it as in progress permanently.",
-            "To run it after all: resume it in EvalAI if EvalAI shows `failed`, else re-run it there. A submission deleted in \
-             EvalAI cannot continue; the participant submits again.";
+            "It ended in EvalAI: cancelled, archived, deleted, or set to an end by hand. `finished` counts only before the run was \
+             under way. The operator writes nothing more to EvalAI.",
+            "Resume it in EvalAI if EvalAI shows `failed`, else re-run it there. After a deletion in EvalAI the participant submits \
+             again.";
         Deleted,
             "The Submission was deleted.",
             "Nothing. To continue from the stored results, apply it again with a higher attempt.";
@@ -137,8 +126,8 @@ reasons! {
             "Look at `agent/agent<n>/leaderboard.log` of the results; the participant fixes the agent and submits again.",
             log: "the log of agent `<n>`, `agent/agent<n>/leaderboard.log`";
         CannotStart,
-            "The agent's command is missing in the image, may not be executed, or is not for this machine; or the image has no user \
-             of the name that it asks for. For a simulator: an infrastructure failure. `NodeCannotStart` is for a node that fails.",
+            "The agent's command is missing, may not be executed, or is for another machine, or the image lacks the user that it \
+             names. For a simulator this is an infrastructure failure.",
             "Rebuild the image for linux/amd64.",
             after_failure: "Fix this, then resume the submission.",
             log: "the log of agent `<n>`, `agent/agent<n>/leaderboard.log`";
@@ -147,8 +136,8 @@ reasons! {
             "Make the agent faster, or ask the host for more time.",
             log: "the log of the agent of the first pair that was not done, else of the first pair";
         InvalidResults,
-            "A checkpoint was refused: malformed, implausible, or incomplete at the end; or it names a crash of the simulation that its \
-             simulator did not have.",
+            "A checkpoint was refused: malformed, implausible, or incomplete at the end. Or it names a crash of the simulation that \
+             its simulator did not have.",
             "Check what the agent writes into its checkpoint, and submit again.",
             log: "the log of the agent whose checkpoint was refused";
         NotEligible,
@@ -156,14 +145,12 @@ reasons! {
             "Compare the agent's sensors with those the track allows, and submit again.",
             log: "the log of the agent of the first pair that was not done, else of the first pair";
         ImageInvalid,
-            "The submitted image is not a valid image reference: empty, no text, upper-case letters in the repository, or white \
-             space; or what its registry has under that name is not a container image; or the Pod sets `runAsNonRoot`, and the image runs as \
-             root or names its user instead of giving its number. The submission fails at once, usually before a Job is created; where \
-             only the kubelet refuses the image, with the first Pod.",
+            "The name is no valid image reference, or its registry has no container image there, or the Pod sets `runAsNonRoot` and \
+             the image runs as root or names its user. The submission fails at once.",
             "Submit again with an image such as registry.example/team/agent:1.";
         ImageNotAllowed,
-            "`agent.images` of the Leaderboard does not allow the submitted image: it is another team's, of another registry, or the \
-             host's own. No Job is created.",
+            "`agent.images` of the Leaderboard does not allow the image: it is another team's, of another registry, or the host's \
+             own. No Job is created.",
             "Push the image to the team's own repository, and submit again.";
         ImageNotFound,
             "The registry does not have the submitted image. The submission fails after `deadlines.startSeconds`.",
@@ -176,9 +163,8 @@ reasons! {
              stopped at once.",
             "Push the image under a tag that stays, and submit again.";
         DiskFull,
-            "The Pod was evicted because its disk was full. A participant failure if the kubelet names an agent's container or a volume that \
-             agents alone write to, or if `logcopy` has measured that agents fill the logs. Else it is an infrastructure failure: \
-             CARLA's saves and core dumps are on the same account.",
+            "The Pod was evicted for a full disk. A participant failure if the kubelet names what agents alone write, or `logcopy` \
+             measured that they fill the logs; else an infrastructure failure.",
             "Write less to disk or to the log.",
             after_failure: "Look at what fills the disk, such as the simulator's Saved and core dumps, or raise the limit; then resume the \
              submission.",
@@ -186,27 +172,23 @@ reasons! {
     }
     Infrastructure {
         SimulationCrashed,
-            "A simulator crashed, or was not ready, more often than `retries.perWorker` allows; or the results name a crash of the simulation, \
-             and that pair's simulator has failed in this attempt.",
+            "A simulator crashed, or was not ready, more often than `retries.perWorker` allows. Or the results name such a crash, and \
+             that simulator has failed in this attempt.",
             "Look at the simulator's log, then resume the submission; it repeats the route it was at.",
             log: "the log of simulator `<n>`, read from its node before the Pod ends; else `simulator/console-<n>.log`";
         NoGPU,
-            "A simulator, or with `gpu.mode: NodeIndex` an agent that had not begun, saw no GPU on its node although `gpu` of the \
-             Leaderboard gives it one; the simulator's log says which. The Job ends at once, and another one follows; after two on one \
-             node the Jobs of this attempt avoid it.",
+            "A simulator, or in `NodeIndex` an agent that had not begun, saw no GPU although `gpu` gives it one. Another Job follows; \
+             after two such ends on one node the Jobs of the attempt avoid it.",
             "Look at the node: driver, device plugin, container runtime, and what docs/gpu.md asks for the Leaderboard's `gpu.mode`. Then \
              resume the submission.";
         NodeCannotStart,
-            "The node could not start a container, or its kubelet did not admit the Pod (`UnexpectedAdmissionError`): the container engine, \
-             the GPU toolkit or device plugin, a full disk, too many open files. All that is not proven to be the image's counts here. \
-             Another Job follows, which prefers other nodes (`status.failedNodes`); after a second such end only if its Job has finished a \
-             route.",
+            "The node could not start a container, or did not admit the Pod: container engine, GPU toolkit, device plugin, full disk, \
+             open files. Another Job follows on other nodes where there are some.",
             "Look at the node that the message names. The participant's image is not the cause.",
-            after_failure: "Look at the node that the message names: its container engine, GPU toolkit, device plugin and disk. Then resume the \
-             submission.";
+            after_failure: "Look at that node, then resume the submission.";
         GraphicsDriverMissing,
-            "A simulator saw its GPU, but the node's NVIDIA driver has no Vulkan/OpenGL part: nvidia_icd.json (V2) or libGLX_nvidia.so.0 (V1) \
-             is missing in the container. It was not started. There is no retry.",
+            "A simulator saw its GPU, and the node's NVIDIA driver has no Vulkan (V2) or OpenGL (V1) part in the container. It was \
+             not started. There is no retry.",
             "Use a node image whose driver includes Vulkan and OpenGL, as docs/gpu.md says, then resume the submission.";
         ResultsNotStored,
             "The Pod ended before its final results were stored.",
@@ -216,14 +198,13 @@ reasons! {
             "The node went silent or was removed with the Pod, or did not end the Pod within its grace period.",
             "Look at the node, then resume the submission.";
         NodeInterrupted,
-            "The node was about to be taken away (Spot, Karpenter, cluster-autoscaler, the AWS Node Termination Handler), or the Pod was \
-             evicted from it or preempted. The results were stored, and a new Job resumes from them; this uses up neither an attempt nor \
-             `retries.infrastructure`.",
+            "The node was about to be taken away, or the Pod was evicted or preempted. A new Job resumes from the stored results. \
+             This uses up neither an attempt nor `retries.infrastructure`.",
             "Nothing. If it happens often, give the track nodes that stay.",
             after_failure: "Resume the submission.";
         StartDeadline,
-            "No agent started within `deadlines.startSeconds` after the Pod was scheduled and its images were pulled, or the images were \
-             not pulled within `deadlines.pullSeconds`.",
+            "No agent started within `deadlines.startSeconds` after its images were pulled, or they were not pulled within \
+             `deadlines.pullSeconds`.",
             "Fix this, then resume the submission.",
             log: "the log of `contents`, `workspace` or `logcopy`, whichever fails, read from its node before the Job is deleted";
         ScheduleDeadline,
@@ -233,8 +214,8 @@ reasons! {
             "Somebody deleted the Job four times between two retries. There is no further retry.",
             "Find out who deletes Jobs in this namespace, then resume the submission.";
         JobExpired,
-            "The Job ended while the operator was away, or the bucket could not be read, for longer than the Job is kept (at least 7 \
-             days): Kubernetes removed it before its end was read. There is no further Job.",
+            "The Job ended while the operator was away or the bucket could not be read, and Kubernetes removed it after its time (at \
+             least 7 days). There is no further Job.",
             "Look at the stored results and logs, then resume the submission.";
         JobFailed,
             "Kubernetes ended the Job for a reason that no container explains.",
@@ -247,8 +228,8 @@ reasons! {
             "Nothing.";
         NotStored,
             "No final results are in S3. For a live submission: they cannot be read at the moment.",
-            "Nothing while the submission is live: the operator waits for the bucket for up to a day (after a cancel: for \
-             `deadlines.cancelSeconds`, at least 60 s).";
+            "Nothing while the submission is live. The operator waits for the bucket for up to a day, after a cancel for \
+             `deadlines.cancelSeconds` (at least 60 s).";
         Published,
             "EvalAI has the result.",
             "Nothing.";
@@ -259,12 +240,12 @@ reasons! {
             "The other system does not have the result yet.",
             "Nothing. The message has the last error.";
         WaitingForPreviousController,
-            "The previous controller process (perhaps the same container before a restart) did not confirm its last requests to \
-             EvalAI. Nothing is written there for 75 s after the takeover: such a request may still be running.",
+            "The controller before this one may still have a request to EvalAI under way. Nothing is written there for 75 s after the \
+             takeover.",
             "Nothing. The message names the time until which it waits.";
         Refused,
-            "The other system rejected the result. The operator keeps retrying (EvalAI: every ten minutes); if EvalAI has cancelled \
-             or archived the submission meanwhile, it becomes Cancelled.",
+            "The other system rejected the result. The operator keeps trying (EvalAI: every ten minutes). If EvalAI has cancelled or \
+             archived the submission meanwhile, it becomes Cancelled.",
             "EvalAI: check that the phase's leaderboard schema has all metric labels. DynamoDB: check the table and the operator's \
              rights.";
         Unread,
@@ -277,12 +258,12 @@ reasons! {
             "There is nothing to publish: no EvalAI, no table, no team, or EvalAI ended the submission itself.",
             "Nothing, unless the message asks for it.";
         CancelledInEvalAI,
-            "EvalAI has cancelled the result since it took it, as a host's re-run does: it counts there no more (condition `Published`). State, \
-             score and the table's row stay.",
+            "EvalAI has cancelled a result that it had taken, as a host's re-run does. It counts there no more. State, score and the \
+             table's row stay.",
             "Nothing. A re-run is a new submission.";
         ConcurrentUpdate,
-            "An update of EvalAI and one of the operator happened at the same time, or the submission was deleted before its end: \
-             EvalAI may show the wrong end. The operator reads EvalAI again and writes `cancelled` if needed.",
+            "EvalAI and the operator wrote at one time, or the submission was deleted before its end, so EvalAI may show the wrong \
+             end. The operator reads it again, and writes `cancelled` if needed.",
             "Nothing.";
     }
     Scores {
@@ -297,9 +278,8 @@ reasons! {
     CloudWatch {
         LogsRefused,
             "CloudWatch refuses the lines of the run. Results do not depend on it, and the logs are in S3.",
-            "Check that `logs.cloudWatch` of the Leaderboard exists (`logs.cloudWatch.retentionDays` has the controller make it) and that the Pods' role has \
-             logs:CreateLogStream, logs:PutLogEvents and logs:GetLogEvents for it; on a cluster that enforces policies also that \
-             `network.egress` names CloudWatch's endpoint.";
+            "Check that the group of `logs.cloudWatch` exists and that the Pods' role has logs:CreateLogStream, logs:PutLogEvents and \
+             logs:GetLogEvents for it. `network.egress` must name CloudWatch's endpoint.";
         LogsSent,
             "CloudWatch takes the lines of the run.",
             "Nothing.";
@@ -309,47 +289,43 @@ reasons! {
             "Somebody deleted the Job; the operator creates it again, at most three times between two retries.",
             "Find out who deletes Jobs.";
         AttemptWithoutMessage,
-            "EvalAI's row asks for another attempt that no message has announced. EvalAI lets hosts resume and re-run, and \
-             participants only where the challenge has `allow_participants_resubmissions`; but any participant can edit the row. One such attempt begins (a message can be lost) if the row shows `resuming` and the \
-             attempt before has failed, or if it is the new row of a re-run; the next one begins only after a message. Until then \
-             the condition `Stalled` reports it, too.",
-            "Check in EvalAI who asked. If the attempt has begun and must not run, cancel it. If it has not begun and must run, \
-             raise `spec.attempt`; otherwise set the status back in EvalAI.";
+            "EvalAI's row asks for another attempt that no message has announced. One such attempt begins after a failure or a \
+             re-run; a further one waits for a message, and `Stalled` shows it.",
+            "Ask in EvalAI who did it. Cancel an attempt that must not run. For one that must run raise `spec.attempt`, else set the \
+             status back in EvalAI.";
         AttemptAfterFinish,
-            "EvalAI asks for another attempt of a submission that has finished, as after its row was set to `failed` by hand and resumed. \
-             It is not run again: a finished submission is final. The condition `Stalled` reports it, too.",
+            "EvalAI asks for another attempt of a submission that has finished, for example after its row was set to `failed`. A \
+             finished submission is final. `Stalled` shows it, too.",
             "Re-run the submission in EvalAI, which makes a new one. Otherwise set its status back to `finished` there.";
         TeamDiffers,
-            "EvalAI showed the submission under another team when its result was published; the run counts for the team it was \
+            "EvalAI showed the submission under another team when its result was published. The run counts for the team that it was \
              accepted for.",
             "Set the team back in EvalAI, or correct the table.";
         ReleasedUnpublished,
             "A deleted Submission was released after `deadlines.finalizeSeconds` before all systems had its result.",
             "Correct EvalAI or the table by hand.";
         DeadLetter,
-            "Event of a Leaderboard: a message of its queue cannot be used and was moved to the dead-letter queue. The message \
-             names the cause.",
+            "Event of a Leaderboard: a message of its queue cannot be used and is in the dead-letter queue now. The event names the \
+             cause.",
             "Look at the message in the dead-letter queue: its attributes `reason` and `detail` name the cause.";
         MessageDropped,
-            "Event of a Leaderboard: a message of its queue in EvalAI (`queue.evalai`) cannot be used and was deleted there. The event \
-             and the controller's log have the cause and the message. Its submission stays in EvalAI, and starts later if EvalAI \
-             shows it as `submitted` and a Leaderboard serves its phase by then.",
+            "Event of a Leaderboard: a message of its queue in EvalAI cannot be used and was deleted. The event has cause and text. \
+             The submission starts later if EvalAI shows `submitted` and a phase fits.",
             "As the cause asks. To start a submission after all, re-run it in EvalAI.";
     }
     Leaderboard {
         Ready,
-            "Submissions can run. The message may have a note: metrics of a phase's leaderboard that stay empty, a token that \
-             expires soon, until when nothing is written to EvalAI after a change of operators, images of several teams that cannot be pulled \
-             (`ImagePull`), or Secrets that participants can read.",
+            "Submissions can run. A note in the message names what is no obstacle: metrics that stay empty, a token that expires \
+             soon, images that cannot be pulled, Secrets that participants can read.",
             "Nothing, or what the note asks for.";
         Checking,
             "The operator asks bucket, table, queues and the place of EvalAI's token for the first time, and not all have answered yet.",
             "Wait: what does not answer is named after ten seconds, an entry of Secrets Manager after a minute.";
         OtherOperator,
-            "Only in an event, the log and the metrics of an operator: another installation drives this Leaderboard, which `status.operator` \
-             names by its Lease. This one leaves the Leaderboard and its submissions alone.",
-            "Let the two installations serve different namespaces (`leaderboards` of the chart's values), or uninstall one and hand the \
-             Leaderboard over by the command in the event.";
+            "In events, log and metrics of an operator only: another installation, which `status.operator` names by its Lease, drives \
+             this Leaderboard.",
+            "Let the installations serve different namespaces (the chart's values), or uninstall one and hand the Leaderboard over by \
+             the command in the event.";
         TokenMissing,
             "EvalAI's token is not where `evalai.token` points.",
             "Create the Secret, or correct the reference.";
@@ -357,8 +333,8 @@ reasons! {
             "EvalAI refuses the token, or its user is no host of the challenge.",
             "Renew the token; or store a host's token, make the user a host, or correct `evalai.challenge`, as the message asks.";
         NotAllowed,
-            "The Leaderboard names an entry of Secrets Manager, a queue, a bucket, a table or a log group that Leaderboards of its namespace \
-             may not name. Its token is not read, its queue is left alone, EvalAI is not asked, and no submission starts or is recorded.",
+            "The Leaderboard names a Secret's entry, a queue, a bucket, a table or a log group that its namespace may not use. The \
+             operator reads neither token nor queue, and starts and records nothing.",
             "Name another one, or let the operator's administrator allow it under `leaderboards` of the chart's values.";
         InsecureServer,
             "`evalai.apiServer` begins with http and is on the internet: everyone on the way could read the host's token.",
@@ -379,16 +355,16 @@ reasons! {
             "The table does not answer, refuses the operator, or has other keys.",
             "As the message asks: create the table, or correct `table` or the operator's rights.";
         QueueUnreachable,
-            "The queue does not answer or does not exist. With `Unknown` also: the controller lacks the right \
-             `sqs:GetQueueAttributes`. Of a queue in EvalAI: it refuses to let this token read it, or has not for five minutes.",
+            "The queue does not answer or does not exist, or EvalAI does not let the token read it. With `Unknown` also: the \
+             controller lacks `sqs:GetQueueAttributes`.",
             "As the message asks: create the queue, or correct `queue` or the controller's rights; or correct `queue.evalai`.";
         DeadLetterQueueUnreachable,
-            "The dead-letter queue does not answer or does not exist. With `Unknown` also: the controller lacks the right \
+            "The dead-letter queue does not answer or does not exist. With `Unknown` also: the controller lacks \
              `sqs:GetQueueAttributes`.",
             "As the message asks: create the queue, or correct `queue.sqs.deadLetterURL` or the controller's rights.";
         InvalidPod,
-            "The Pods cannot be made: the API server refuses them, `spec.podOverrides` says what it may not, `resources` and `gpu` \
-             contradict each other, or a PriorityClass does not exist or preempts.",
+            "The Pods cannot be made: the API server refuses them, `spec.podOverrides` sets what it may not, `resources` and `gpu` \
+             contradict each other, or a PriorityClass is missing or preempts.",
             "Correct what the message names.";
         ClaimsNotServed,
             "`gpu.mode` is `Claim`, and the API server does not serve `resource.k8s.io/v1`, which Kubernetes has from 1.34 on. No Job is \
@@ -414,8 +390,8 @@ reasons! {
             "Use a network plugin that enforces policies. If `network.egress` contains the API server's own addresses, set \
              `network.probe`.";
         NotMeasured,
-            "The policy is in place, but no run of this spec has measured whether it is enforced, or none could (with `Require` \
-             such a run fails with `NotIsolated`).",
+            "The policy is in place, and no run of this spec has measured whether it is enforced, or none could. With `Require` such \
+             a run fails with `NotIsolated`.",
             "Nothing before the first run; after that, as the message asks.";
         External,
             "`network.policy` is `External`: the operator relies on the cluster's own policies.",
@@ -425,8 +401,8 @@ reasons! {
             "Give the operator's role the verbs that the message names, or correct what the webhook reports; or set \
              `network.policy` to `External`.";
         NotApplied,
-            "The policy could not be applied, or the API server stored another one, or the operator cannot see it, because its role \
-             lacks list and watch. No Job is created.",
+            "The policy could not be applied, another one is stored, or the operator's role lacks list and watch of policies. No Job \
+             is created.",
             "As the message asks. The operator retries every 10 s.";
     }
 }
