@@ -22,7 +22,7 @@ TEXT, PROMPT = "#e8eaee", "#7fe0bd"
 HEAD = """<svg xmlns="http://www.w3.org/2000/svg" viewBox="0 0 {width} {height}" width="{width}" height="{height}" role="img" aria-label="{label}">
 <rect width="{width}" height="{height}" rx="9" fill="#0f1216"/>
 <g fill="#3c4450"><circle cx="20" cy="18" r="5.5"/><circle cx="38" cy="18" r="5.5"/><circle cx="56" cy="18" r="5.5"/></g>
-<g font-family="ui-monospace, 'DejaVu Sans Mono', Menlo, Consolas, monospace" font-size="{size}" fill="{text}" xml:space="preserve">
+<g font-family="ui-monospace, 'DejaVu Sans Mono', Menlo, Consolas, monospace" font-size="{size}" fill="{text}">
 """
 
 
@@ -58,7 +58,7 @@ def picture(commands: Sequence[tuple[str, str]]) -> str:
     lines = []
     for command, text in commands:
         prompt = f'<tspan fill="{PROMPT}" font-weight="bold">$</tspan>'
-        lines.append((len(command) + 2, f'{prompt}<tspan font-weight="bold"> {html.escape(command)}</tspan>'))
+        lines.append((len(command) + 2, f'{prompt}<tspan font-weight="bold">{kept(" " + command)}</tspan>'))
         lines += [(len(plain(line)), marked_up(line)) for line in text.split("\n")]
         lines.append((0, ""))
     lines.pop()
@@ -81,9 +81,13 @@ def marked_up(line: str) -> str:
         if at % 2:
             style = style_of(part)
         elif part:
-            escaped = html.escape(part)
-            parts.append(f"<tspan {style}>{escaped}</tspan>" if style else escaped)
+            parts.append(f"<tspan {style}>{kept(part)}</tspan>" if style else kept(part))
     return "".join(parts)
+
+
+def kept(text: str) -> str:
+    """A text with each of its spaces, of which an SVG would keep one."""
+    return html.escape(text).replace(" ", "&#160;")
 
 
 def style_of(codes: str) -> str:

@@ -20,7 +20,7 @@ class Terminal(unittest.TestCase):
         green = terminal.COLOURS[32]
         self.assertEqual(
             terminal.marked_up(COLOURED),
-            f'a <tspan fill="{green}">Finished</tspan> &lt;b&gt;\n<tspan opacity="0.65">rest</tspan>',
+            f'a&#160;<tspan fill="{green}">Finished</tspan>&#160;&lt;b&gt;\n<tspan opacity="0.65">rest</tspan>',
         )
         self.assertEqual(terminal.plain(COLOURED), "a Finished <b>\nrest")
 
@@ -28,7 +28,7 @@ class Terminal(unittest.TestCase):
         drawing = ElementTree.fromstring(terminal.picture([("kubectl get <x>", COLOURED), ("true", "")]))
         texts = [element for element in drawing.iter(f"{SVG}text")]
         self.assertEqual(
-            ["".join(text.itertext()) for text in texts], ["$ kubectl get <x>", "a Finished <b>", "rest", "$ true"]
+            ["".join(text.itertext()).replace("\xa0", " ") for text in texts], ["$ kubectl get <x>", "a Finished <b>", "rest", "$ true"]
         )
         self.assertEqual([text.get("textLength") for text in texts], ["142.8", "117.6", "33.6", "50.4"])
         rows = [int(text.get("y", "0")) for text in texts]
