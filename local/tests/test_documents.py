@@ -5,7 +5,7 @@ import tempfile
 import unittest
 from pathlib import Path
 
-from labkit import doccheck
+from labkit import doccheck, kubeversions, toolsets
 
 REPOSITORY = Path(__file__).resolve().parents[2]
 # Numbered as in the review that they come from, so that none can be lost.
@@ -120,6 +120,26 @@ class Readme(unittest.TestCase):
 
     def test_it_fits_into_what_a_reader_gives_it(self) -> None:
         self.assertLessEqual(len(self.text.split()), 700)
+
+
+class Versions(unittest.TestCase):
+    """docs/versions.md names what the tests run."""
+
+    def test_the_page_has_the_versions_that_are_pinned(self) -> None:
+        page = (REPOSITORY / "docs" / "versions.md").read_text()
+        modules = "\n".join(file.read_text() for file in sorted((REPOSITORY / "local" / "tools").rglob("go.mod")))
+        helm = re.findall(r"^\s*(?:require )?helm\.sh/helm/v4 v(\S+)", modules, re.MULTILINE)
+        # Prometheus counts its module apart from itself: 3.13.4 is v0.313.4.
+        prometheus = re.findall(r"prometheus/prometheus v0\.(\d)(\d+)\.(\d+)", modules)
+        pinned = {
+            "Kubernetes": [toolsets.KUBERNETES_VERSION[1:], *(version[1:] for version in kubeversions.SUMS)],
+            "Helm": helm[:1],
+            "Prometheus": [".".join(prometheus[0])] if prometheus else [],
+        }
+        for name, versions in pinned.items():
+            self.assertTrue(versions, name)
+            for version in versions:
+                self.assertIn(version, page, name)
 
 
 class Security(unittest.TestCase):
