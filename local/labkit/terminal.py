@@ -19,7 +19,8 @@ ROWS = 60
 SIZE, WIDE, HIGH = 14, 8.4, 19
 LEFT, TOP = 18, 40
 TEXT, PROMPT = "#e8eaee", "#7fe0bd"
-HEAD = """<svg xmlns="http://www.w3.org/2000/svg" viewBox="0 0 {width} {height}" width="{width}" height="{height}" role="img" aria-label="{label}">
+HEAD = """<svg xmlns="http://www.w3.org/2000/svg" viewBox="0 0 {width} {height}" width="{width}" height="{height}"
+    role="img" aria-label="{label}">
 <rect width="{width}" height="{height}" rx="9" fill="#0f1216"/>
 <g fill="#3c4450"><circle cx="20" cy="18" r="5.5"/><circle cx="38" cy="18" r="5.5"/><circle cx="56" cy="18" r="5.5"/></g>
 <g font-family="ui-monospace, 'DejaVu Sans Mono', Menlo, Consolas, monospace" font-size="{size}" fill="{text}">

@@ -173,7 +173,11 @@ class Security(unittest.TestCase):
             (TABLE, 5, "the page of tests has attack 7, which the table lacks"),
         ):
             with self.subTest(word):
-                self.assertTrue(any(word in fault for fault in doccheck.attack_faults(text, "| 7 | `src/d.rs::d_test` |\n", attacks)))
+                self.assertTrue(
+                    any(
+                        word in fault for fault in doccheck.attack_faults(text, "| 7 | `src/d.rs::d_test` |\n", attacks)
+                    )
+                )
 
     def test_tests_are_found_under_their_attributes_unless_they_are_ignored(self) -> None:
         rust = "\n".join(

@@ -21,7 +21,7 @@ class Sentences(unittest.TestCase):
         )
 
     def test_a_sentence_goes_on_over_lines_and_ends_at_its_full_stop(self) -> None:
-        self.assertEqual(len(found(words(20, "") [:-1] + "\n" + words(20))), 1)
+        self.assertEqual(len(found(words(20, "")[:-1] + "\n" + words(20))), 1)
         self.assertEqual(found(words(20) + "\n" + words(20)), [])
         self.assertEqual(found(words(20) + " (" + words(15, ".)")), [])
 
@@ -42,7 +42,7 @@ class Sentences(unittest.TestCase):
             f"<!-- {long} -->\n",
             f"# {long}\n",
             f"Text.\n\n    {long}\n",
-            f"<img alt=\"{long}\">\n",
+            f'<img alt="{long}">\n',
         ):
             with self.subTest(text[:12]):
                 self.assertEqual(found(text), [])
@@ -70,7 +70,13 @@ class Habits(unittest.TestCase):
         for text in ("What runs is here.", "Of these two run.", "Those end.", "The same holds.", "Who reads it wins."):
             with self.subTest(text):
                 self.assertEqual(len(found(text)), 1)
-        for text in ("What runs?", "**What runs.** The check.", "# What runs", "| What runs | Those |", "Offscreen it is."):
+        for text in (
+            "What runs?",
+            "**What runs.** The check.",
+            "# What runs",
+            "| What runs | Those |",
+            "Offscreen it is.",
+        ):
             with self.subTest(text):
                 self.assertEqual(found(text), [])
 

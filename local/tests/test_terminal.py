@@ -28,7 +28,8 @@ class Terminal(unittest.TestCase):
         drawing = ElementTree.fromstring(terminal.picture([("kubectl get <x>", COLOURED), ("true", "")]))
         texts = [element for element in drawing.iter(f"{SVG}text")]
         self.assertEqual(
-            ["".join(text.itertext()).replace("\xa0", " ") for text in texts], ["$ kubectl get <x>", "a Finished <b>", "rest", "$ true"]
+            ["".join(text.itertext()).replace("\xa0", " ") for text in texts],
+            ["$ kubectl get <x>", "a Finished <b>", "rest", "$ true"],
         )
         self.assertEqual([text.get("textLength") for text in texts], ["142.8", "117.6", "33.6", "50.4"])
         rows = [int(text.get("y", "0")) for text in texts]
