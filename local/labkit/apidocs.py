@@ -3,14 +3,18 @@
 A section for each object, a row for each field. What Kubernetes defines itself is named and not shown again.
 """
 
+import re
 from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
 
-from . import crdyaml
+from . import crdyaml, prose
 from .errors import LabError
 
 FOLDER = Path("docs/reference")
+# Up to its full stop, of which code may hold others.
+SENTENCE = re.compile(r"(?:`[^`]*`|[^`])*?[.!?](?: |$)")
+BELOW = "See below."
 MADE = "<!-- made from crds/ by `make chart-docs`: edit the types in crates/api, then run `make crds chart-docs` -->"
 # The types of Kubernetes that occur, each by fields that no type of ours has.
 KUBERNETES = {
@@ -30,7 +34,7 @@ INTRODUCTIONS = {
     ),
     "Submission": (
         "The bridge makes them of EvalAI's messages; [submission-local.yaml](../../examples/submission-local.yaml) is one made by hand."
-        " What states and reasons mean is in [states.md](../states.md)."
+        " The meaning of states and reasons is in [states.md](../states.md)."
     ),
 }
 
@@ -64,16 +68,19 @@ def page(definition: dict[str, Any]) -> str:
     names, [version] = spec["names"], spec["versions"]
     kind, schema = names["kind"], version["schema"]["openAPIV3Schema"]
     short = " and ".join(f"`kubectl get {name}`" for name in [names["plural"], *names["shortNames"]])
-    columns = ", ".join(
-        f"{one['name'].upper()}{' (with `-o wide`)' if one.get('priority') else ''}"
-        for one in version["additionalPrinterColumns"]
+    columns, wide = (
+        ", ".join(
+            one["name"].upper() for one in version["additionalPrinterColumns"] if bool(one.get("priority")) is is_wide
+        )
+        for is_wide in (False, True)
     )
     lines = [
         f"# {kind}: all fields",
         "",
         MADE,
         "",
-        f"`apiVersion: {spec['group']}/{version['name']}`, `kind: {kind}`, {spec['scope'].lower()}. {short} show {columns}.",
+        f"`apiVersion: {spec['group']}/{version['name']}`, `kind: {kind}`, {spec['scope'].lower()}. {short} show {columns}."
+        f"{f' With `-o wide` they also show {wide}.' if wide else ''}",
         "",
         INTRODUCTIONS[kind],
         "",
@@ -91,9 +98,13 @@ def sections(schema: dict[str, Any], path: str, level: int) -> Iterator[str]:
     yield from ("", f"{'#' * level} {path}", "", text_of(schema, path), "")
     yield from ("| field | type | default | meaning |", "|---|---|---|---|")
     required = schema.get("required", [])
+    notes = []
     for name, field in below.items():
         default = "required" if name in required and path_is_asked(path) else default_of(field)
-        yield f"| `{name}` | {type_of(field, f'{path}.{name}')} | {default} | {meaning(field, f'{path}.{name}')} |"
+        text, rest = fitting(meaning(field, f"{path}.{name}"))
+        notes += [f"- `{name}`: {rest}"] if rest else []
+        yield f"| `{name}` | {type_of(field, f'{path}.{name}')} | {default} | {text} |"
+    yield from ["", "More of these fields:", "", *notes] if notes else []
     yield from rules(schema)
     for name, field in below.items():
         inner, inner_path = unwrapped(field, f"{path}.{name}")
@@ -166,6 +177,18 @@ def meaning(field: dict[str, Any], path: str) -> str:
     if inner is field or not own(inner):
         parts += [f"{message(rule)}" for rule in inner.get("x-kubernetes-validations", []) if not own(field)]
     return " ".join(parts)
+
+
+def fitting(text: str) -> tuple[str, str]:
+    """What a cell can hold of a text, sentence by sentence, and the rest, which stands below the table."""
+    if len(prose.seen(text)) <= prose.CELL:
+        return text, ""
+    kept, rest = "", text
+    while sentence := SENTENCE.match(rest):
+        if len(prose.seen(kept + sentence[0] + BELOW)) > prose.CELL:
+            break
+        kept, rest = kept + sentence[0], rest[sentence.end() :]
+    return kept + BELOW, rest
 
 
 def text_of(field: dict[str, Any], path: str) -> str:

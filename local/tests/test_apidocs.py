@@ -112,6 +112,12 @@ class Sections(unittest.TestCase):
         self.assertIn("| `a` | list of `Toleration` of Kubernetes |  | A text. |", lines)
         self.assertEqual([line for line in lines if line.startswith("#")], ["## spec"])
 
+    def test_a_text_that_no_cell_holds_goes_on_below_the_table(self) -> None:
+        sentences = [f"{'word ' * 20}`code. {number}`." for number in range(3)]
+        lines = self.rows({"a": field(description=" ".join(sentences), enum=["x"]), "b": field()})
+        self.assertIn(f"| `a` | string |  | {sentences[0]} See below. |", lines)
+        self.assertEqual(lines[-4:], ["", "More of these fields:", "", f"- `a`: {' '.join(sentences[1:])} One of `x`."])
+
     def test_a_field_without_a_text_of_its_own_is_an_error(self) -> None:
         for schema in ({"type": "string"}, field(description=f"{apidocs.FOREIGN} which supports")):
             with self.assertRaisesRegex(LabError, r"spec\.a has no text"):
