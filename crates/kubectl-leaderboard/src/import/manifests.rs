@@ -166,7 +166,7 @@ fn log_group(board: &Board) -> String {
     match &board.log_group {
         Some(name) => format!(
             "  # To decide: does a program on these nodes collect what containers print (FluentD, Fluent Bit, the CloudWatch agent)?\n  \
-             # Then each line is stored twice: docs/migrate.md, Logs twice.\n  \
+             # Then each line is stored twice: docs/import.md, Logs twice.\n  \
              logs:\n    cloudWatch:\n      name: {}\n      region: {}",
             quoted(name),
             quoted(&board.place.region)
