@@ -8,6 +8,7 @@ mod carla;
 #[cfg(feature = "client-errors")]
 pub mod client_errors;
 pub mod conditions;
+pub mod definitions;
 pub mod effective;
 mod evalai_mode;
 mod evalai_queue;
