@@ -17,6 +17,8 @@ from .settings import Settings
 from .toolsets import ENVTEST_TOOLS, KUBERNETES_VERSION, SETS, ToolSet, build_flags, cache_key, in_build_order
 
 LEAST_FREE_BYTES = 5 << 30
+# Go's own variables. The compiler collects its garbage less often: packages are small next to the machine's memory.
+GO_ENVIRONMENT = {"CGO_ENABLED": "0", "GOFLAGS": "", "GOWORK": "off", "GOGC": "400"}
 
 
 def ensure(settings: Settings, names: Iterable[str], assets: str | None = None) -> Path:
@@ -132,7 +134,7 @@ def build_one(settings: Settings, tool_set: ToolSet, name: str, label: str, held
     started = time.monotonic()
     argv = ["go", "build", *build_flags(tool_set), "-o", str(temporary), tool.package]
     nice = ["nice", "-n", "5"] if shutil.which("nice") else []
-    env = {**os.environ, "CGO_ENABLED": "0", "GOFLAGS": "", "GOWORK": "off"}
+    env = {**os.environ, **GO_ENVIRONMENT}
     module = settings.local / "tools" / tool_set.name
     try:
         run_long(

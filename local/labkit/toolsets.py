@@ -53,20 +53,21 @@ def containerd(program: str, seconds: int) -> Tool:
 SETS: dict[str, ToolSet] = {
     tool_set.name: tool_set
     for tool_set in (
-        ToolSet("etcd", "-s -w", {"etcd": Tool("go.etcd.io/etcd/server/v3", 50)}),
+        # etcd and helm share the greater part of their packages with Kubernetes, which are then compiled once.
         ToolSet(
             "kubernetes",
             kubernetes_ldflags(KUBERNETES_VERSION),
             {
+                "etcd": Tool("go.etcd.io/etcd/server/v3", 50),
                 "kube-apiserver": kubernetes("kube-apiserver", 387),
                 "kubectl": kubernetes("kubectl", 43),
                 "kube-scheduler": kubernetes("kube-scheduler", 37),
                 "kube-controller-manager": kubernetes("kube-controller-manager", 74),
                 "kubelet": kubernetes("kubelet", 29),
                 "kube-proxy": kubernetes("kube-proxy", 15),
+                "helm": Tool("helm.sh/helm/v4/cmd/helm", 40),
             },
         ),
-        ToolSet("helm", "-s -w", {"helm": Tool("helm.sh/helm/v4/cmd/helm", 179)}),
         ToolSet(
             "misc",
             "-s -w",
@@ -122,7 +123,9 @@ def in_build_order(names: Iterable[str]) -> list[tuple[ToolSet, str]]:
 def build_flags(tool_set: ToolSet) -> list[str]:
     """The arguments of `go build` besides output and package."""
     tags = ["-tags", tool_set.tags] if tool_set.tags else []
-    return ["-trimpath", "-buildvcs=false", "-mod=readonly", *tags, "-ldflags", tool_set.ldflags]
+    # The linker leaves out what debuggers read (-s -w): the compiler need not make it.
+    debug = "-gcflags=all=-dwarf=false"
+    return ["-trimpath", "-buildvcs=false", "-mod=readonly", debug, *tags, "-ldflags", tool_set.ldflags]
 
 
 def cache_key(module: Path, flags: Iterable[str], platform: str) -> str:

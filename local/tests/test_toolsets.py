@@ -8,7 +8,7 @@ from unittest import mock
 
 from labkit import build, cluster, console, demo, pythonenv, settings, tools
 from labkit.errors import LabError
-from labkit.toolsets import SETS, build_flags, cache_key, in_build_order, kubernetes_ldflags
+from labkit.toolsets import SETS, build_flags, cache_key, in_build_order, kubernetes_ldflags, set_of
 
 REPOSITORY = Path(__file__).resolve().parents[2]
 
@@ -48,6 +48,9 @@ class Sets(unittest.TestCase):
     def test_the_order_is_the_order_of_the_sets_without_repeats(self) -> None:
         order = [name for _, name in in_build_order(["crane", "kubectl", "etcd", "crane", "kube-apiserver"])]
         self.assertEqual(order, ["etcd", "kube-apiserver", "kubectl", "crane"])
+
+    def test_what_is_made_of_kubernetes_packages_is_in_its_module(self) -> None:
+        self.assertEqual({set_of(name).name for name in ("etcd", "helm", "kubectl")}, {"kubernetes"})
 
     def test_an_unknown_tool_is_refused_with_those_there_are(self) -> None:
         with self.assertRaisesRegex(LabError, "no tool is called kubeadm: choose from .*kubectl"):
