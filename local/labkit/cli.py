@@ -3,6 +3,7 @@
 import argparse
 import os
 import shlex
+import signal
 import sys
 from collections.abc import Sequence
 from pathlib import Path
@@ -191,8 +192,14 @@ def print_environment(settings: Settings) -> None:
     print(f'export PATH={shlex.quote(str(folder))}:"$PATH":{shlex.quote(str(built))}')
 
 
+def unwind(number: int, _: object) -> None:
+    """Ends the program by an exception, so that what it has started ends with it."""
+    raise SystemExit(128 + number)
+
+
 def main(repository: Path, argv: Sequence[str]) -> int:
-    """The program: 0 fine, 1 `status` of something that does not run, 2 an error with its next step, 130 interrupted."""
+    """The program: 0 fine, 1 `status` of something that does not run, 2 an error with its next step, 130 interrupted, 143 terminated."""
+    signal.signal(signal.SIGTERM, unwind)
     try:
         return run(load(repository), parser().parse_args(argv))
     except LabError as error:

@@ -15,6 +15,10 @@ HEARTBEAT_SECONDS = 30
 # On a terminal a bar moves that often.
 BAR_SECONDS = 1
 BAR_CELLS = 24
+# Of the log of a command that failed.
+LAST_LINES = 30
+LONGEST_LINE = 300
+LONGEST_REASON = 200
 NETWORK_WORDS = (
     "dial tcp",
     "no such host",
@@ -111,7 +115,15 @@ def run_long(
             if draws:
                 draw("")
     if code != 0:
+        show_end(log)
         raise LabError(failure_line(what, code, log))
+
+
+def show_end(log: Path) -> None:
+    """Prints the last lines of a failed command's log, as the log itself does not outlive every machine."""
+    lines = [line.rstrip() for line in log.read_text(errors="replace").splitlines() if line.strip()]
+    if lines:
+        say("\n".join([f"the end of {log}:", *(f"  | {line[:LONGEST_LINE]}" for line in lines[-LAST_LINES:])]))
 
 
 def draw(line: str) -> None:
@@ -132,4 +144,11 @@ def failure_line(what: str, code: int, log: Path) -> str:
     lines = [line.strip() for line in output.splitlines() if line.strip()]
     # A compiler says first what is wrong, everything else says it last.
     words = next((line for line in lines if line.startswith("error")), lines[-1] if lines else "no output")
-    return f"{what} failed with exit code {code} ({words[:200]}); the whole output is in {log}"
+    return f"{what} failed with exit code {code} ({both_ends(words)}); the whole output is in {log}"
+
+
+def both_ends(line: str) -> str:
+    """A line without its middle where it is long: an engine names the step first and the reason last."""
+    if len(line) <= LONGEST_REASON:
+        return line
+    return f"{line[: LONGEST_REASON // 2]} … {line[-LONGEST_REASON // 2 :]}"

@@ -8,10 +8,9 @@ the crates of others again; the operator's own are compiled each time.
 
 import hashlib
 import os
-import shutil
 import subprocess
 import time
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from pathlib import Path
 
 from . import build, elf, engine, enginecheck, image, layer, release
@@ -170,25 +169,32 @@ def rustc(settings: Settings, *arguments: str) -> str:
 
 def warm(settings: Settings, own: Engine, profile: str, mounts: Mapping[Path, str], work: Path) -> None:
     """Fills the caches of the build from cargo's folders of this machine, unless a build before has; of own crates nothing stays."""
-    key = cache_key(settings, profile)
     mark = own.caches / "key"
-    is_warm = mark.exists() and mark.read_text() == key
+    key = cache_key(settings, profile)
     target = image.target_folder(settings.repository, os.environ)
-    commands = []
-    if not is_warm:
-        shutil.rmtree(own.caches)
-        own.caches.mkdir()
-        built = [folder for folder in folders(profile) if (target / folder / "deps").is_dir()]
-        commands += seed(built)
-    commands += [f"rm -rf {TARGET}/*/.fingerprint/{OWN}* {TARGET}/*/*/.fingerprint/{OWN}*"]
-    context = work / "warm"
-    context.mkdir()
-    (context / "Dockerfile").write_text(f"FROM {BUILD}\nRUN {CACHES} {' && '.join(commands)}\n")
-    here = {cargo_home(os.environ) / "registry": "/warm/registry", target: "/warm/target"}
-    options = volumes({**mounts, **here})
-    log = settings.logs / "dockerfile-caches.log"
-    own.build(context / "Dockerfile", context, "localhost/warm:1", options, "filling the caches of the build", log)
+    options = volumes({**mounts, cargo_home(os.environ) / "registry": "/warm/registry", target: "/warm/target"})
+    if mark.exists() and mark.read_text() == key:
+        try:
+            in_caches(settings, own, [], options, work)
+            return
+        except LabError as error:
+            # They are copies: whatever broke them, new ones are as good.
+            say(f"the caches of the build are thrown away and filled anew: {error}")
+    engine.forget(own)
+    built = [folder for folder in folders(profile) if (target / folder / "deps").is_dir()]
+    in_caches(settings, own, seed(built), options, work)
     mark.write_text(key)
+
+
+def in_caches(settings: Settings, own: Engine, commands: Sequence[str], options: Sequence[str], work: Path) -> None:
+    """Runs commands in a build that has the caches, then removes there what cargo knows of own crates."""
+    clean = f"rm -rf {TARGET}/*/.fingerprint/{OWN}* {TARGET}/*/*/.fingerprint/{OWN}*"
+    context = work / "warm"
+    context.mkdir(exist_ok=True)
+    file = context / "Dockerfile"
+    file.write_text(f"FROM {BUILD}\nRUN {CACHES} {' && '.join([*commands, clean])}\n")
+    log = settings.logs / "dockerfile-caches.log"
+    own.build(file, context, "localhost/warm:1", options, "filling the caches of the build", log)
 
 
 def cache_key(settings: Settings, profile: str) -> str:

@@ -43,6 +43,8 @@ class Engine:
     storage: Path
     # Its temporary files. What `RUN --mount=type=cache` keeps is below it, and stays.
     caches: Path
+    # The lock's descriptor, which every command of the engine holds too: one that outlives us keeps the next run out.
+    held: tuple[int, ...] = ()
 
     def argv(self, command: str, *arguments: str) -> list[str]:
         places = ["--root", str(self.storage / "root"), "--runroot", str(self.storage / "run")]
@@ -53,8 +55,8 @@ class Engine:
 
     def run(self, command: str, *arguments: str) -> str:
         """A command of a few seconds; returns what it prints."""
-        argv = self.argv(command, *arguments)
-        done = subprocess.run(argv, env=self.environment(), capture_output=True, text=True, check=False)
+        argv, env = self.argv(command, *arguments), self.environment()
+        done = subprocess.run(argv, env=env, pass_fds=self.held, capture_output=True, text=True, check=False)
         if done.returncode != 0:
             raise LabError(f"{PROGRAM} {command} {arguments[-1]} failed: {done.stderr.strip()[-300:]}")
         return done.stdout.strip()
@@ -68,7 +70,7 @@ class Engine:
         places = ["--file", str(file), "--tag", tag, str(context)]
         argv = self.argv("bud", *ISOLATION, "--network", "host", "--pull-never", *options, *places)
         # A build goes on where only its engine is ended.
-        run_long(argv, what, log, env=self.environment(), group=True)
+        run_long(argv, what, log, env=self.environment(), keep=self.held, group=True)
 
     def output(self, image: str, argv: Sequence[str]) -> str:
         """What a program of an image prints, run as the image's user."""
@@ -93,8 +95,8 @@ def opened(settings: Settings) -> Iterator[Engine]:
     """An engine with an empty storage."""
     program = ensure(settings)
     home = settings.cache / "dockerfile"
-    with tools.lock(settings.cache / "dockerfile.lock", "the build of the Dockerfile"):
-        engine = Engine(program, home / "storage", home / "caches")
+    with tools.lock(settings.cache / "dockerfile.lock", "the build of the Dockerfile") as held:
+        engine = Engine(program, home / "storage", home / "caches", (held,))
         # Left by a run that was killed.
         clear(engine)
         engine.caches.mkdir(parents=True, exist_ok=True)
@@ -107,9 +109,19 @@ def opened(settings: Settings) -> Iterator[Engine]:
 
 def clear(engine: Engine) -> None:
     """Removes images and containers. A mount among them would be a folder of this machine, whose files are no engine's."""
-    storage = os.path.realpath(engine.storage)
-    mounts = leftovers.mounts_below(Path("/proc/self/mountinfo").read_text(), storage)
-    if mounts:
-        raise LabError(f"{mounts[0]} is still mounted: `umount` it, then run the same command again")
+    check_unmounted(engine.storage)
     if engine.storage.exists():
         shutil.rmtree(engine.storage)
+
+
+def forget(engine: Engine) -> None:
+    """Empties the caches."""
+    check_unmounted(engine.caches)
+    shutil.rmtree(engine.caches)
+    engine.caches.mkdir()
+
+
+def check_unmounted(folder: Path) -> None:
+    mounts = leftovers.mounts_below(Path("/proc/self/mountinfo").read_text(), os.path.realpath(folder))
+    if mounts:
+        raise LabError(f"{mounts[0]} is still mounted: `umount` it, then run the same command again")

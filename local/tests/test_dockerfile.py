@@ -1,8 +1,10 @@
 """The build of the Dockerfile: what it is given of the machine, what its image must be, and what is said where it can't run."""
 
+import fcntl
 import gzip
 import os
 import re
+import signal
 import struct
 import tempfile
 import unittest
@@ -170,6 +172,56 @@ class Machine(unittest.TestCase):
         self.assertEqual(engine.volumes({Path("/usr/lib"): "/usr/lib"}), ["--volume", "/usr/lib:/usr/lib:ro"])
 
 
+class Caches(unittest.TestCase):
+    """What a build keeps for the next one. The engine is a stand-in that fails as long as `broken` is among it."""
+
+    def warm(self, own: SimpleNamespace) -> list[str]:
+        """The Dockerfiles that were built."""
+        built: list[str] = []
+
+        def build(file: Path, *_: object) -> None:
+            built.append(file.read_text())
+            if (own.caches / "broken").exists():
+                raise LabError("rm: cannot remove")
+
+        own.build = build
+        work = own.caches.parent / "work"
+        work.mkdir(exist_ok=True)
+        settings = SimpleNamespace(repository=REPOSITORY, logs=work)
+        with (
+            patch.object(dockerfile, "cache_key", return_value="key"),
+            patch.dict(os.environ, {"CARGO_TARGET_DIR": str(own.caches.parent / "target")}),
+            redirect_stderr(StringIO()),
+        ):
+            dockerfile.warm(settings, own, "local", {}, work)
+        return built
+
+    def test_caches_that_fail_are_thrown_away_and_filled_anew(self) -> None:
+        with tempfile.TemporaryDirectory() as folder:
+            (Path(folder) / "target" / "local" / "deps").mkdir(parents=True)
+            own = SimpleNamespace(caches=Path(folder) / "caches")
+            own.caches.mkdir()
+            filled = self.warm(own)
+            self.assertEqual(len(filled), 1)
+            self.assertIn("cp -a .fingerprint", filled[0])
+            kept = self.warm(own)
+            self.assertEqual(len(kept), 1)
+            self.assertNotIn("cp -a", kept[0])
+            (own.caches / "broken").touch()
+            again = self.warm(own)
+            self.assertEqual(again, [*kept, *filled])
+            self.assertEqual((own.caches / "key").read_text(), "key")
+
+    def test_caches_that_can_not_be_filled_are_no_warm_ones(self) -> None:
+        with tempfile.TemporaryDirectory() as folder:
+            own = SimpleNamespace(caches=Path(folder) / "caches")
+            own.caches.mkdir()
+            with patch.object(engine, "forget"), self.assertRaises(LabError):
+                (own.caches / "broken").touch()
+                self.warm(own)
+            self.assertFalse((own.caches / "key").exists())
+
+
 class Engines(unittest.TestCase):
     settings = SimpleNamespace(logs=Path("/nowhere"))
 
@@ -209,6 +261,32 @@ class Engines(unittest.TestCase):
             self.assertTrue(own.storage.is_dir())
             engine.clear(own)
             self.assertFalse(own.storage.exists())
+
+
+    def test_one_that_outlives_its_run_keeps_the_next_one_out(self) -> None:
+        """As a run that is killed leaves it behind, at work on the caches."""
+        with tempfile.TemporaryDirectory() as folder:
+            said, may_end = Path(folder) / "said", Path(folder) / "may-end"
+            os.mkfifo(said)
+            os.mkfifo(may_end)
+            program = Path(folder) / "buildah"
+            program.write_text(f"#!/bin/sh\necho runs >{said}\nread line <{may_end}\n")
+            program.chmod(0o755)
+            run = os.fork()
+            if run == 0:
+                with patch.object(engine, "ensure", return_value=str(program)):
+                    with engine.opened(SimpleNamespace(cache=Path(folder))) as own:
+                        own.run("images", "--all")
+                os._exit(1)
+            self.assertEqual(said.read_text(), "runs\n")
+            os.kill(run, signal.SIGKILL)
+            os.waitpid(run, 0)
+            with (Path(folder) / "dockerfile.lock").open("w") as lock:
+                with self.assertRaises(BlockingIOError):
+                    fcntl.flock(lock, fcntl.LOCK_EX | fcntl.LOCK_NB)
+                may_end.write_text("\n")
+                # Waits for its end.
+                fcntl.flock(lock, fcntl.LOCK_EX)
 
 
 class NotRunLayers(unittest.TestCase):
