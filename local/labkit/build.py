@@ -1,8 +1,8 @@
 """Owns cargo: builds the programs that the demo, the images and the tests need, always with the same selection and profile.
 
 Called by `demo` and `testrun`. One selection (the whole workspace) matters: cargo chooses the features of shared dependencies by
-what is built together, so that another selection would compile half the tree again. A test program is part of it, as with tests
-cargo counts the dependencies of tests in.
+what is built together, so that another selection would compile half the tree again. What only tests depend on is not built with the
+programs, and `local/features` asks for the features that it asks for.
 """
 
 import os
@@ -19,10 +19,11 @@ from .settings import Settings
 
 PROFILE = "local"
 # From nothing on two cores.
-PROGRAMS_SECONDS, RUNNER_SECONDS, STAND_INS_SECONDS = 420, 45, 30
-# The test program that costs nearly nothing on top of what is built anyway.
-CHEAPEST_TEST = "programs"
-SELECTION = ("--workspace", "--test", CHEAPEST_TEST)
+PROGRAMS_SECONDS, STATIC_SECONDS, RUNNER_SECONDS = 420, 40, 45
+SELECTION = ("--workspace",)
+PROGRAMS = ("leaderboard-operator", "kubectl-leaderboard", "evalai-stand-in")
+# What goes into other images: the runner, the stand-ins of simulator and agent, and the probe.
+STATIC_PACKAGES = ("leaderboard-runner", "challenge-stand-in", "challenge-probe")
 STATIC = "-C target-feature=+crt-static"
 
 
@@ -37,25 +38,32 @@ def check_cargo() -> None:
 
 
 def programs(settings: Settings) -> None:
-    """Builds every program of the workspace: the operator and the stand-in of EvalAI among them."""
-    cargo(settings, ["build", *SELECTION, "--bins", "--profile", PROFILE], "building the programs", PROGRAMS_SECONDS)
+    """Builds what runs outside of other images: the operator, the plugin and EvalAI's stand-in."""
+    cargo(settings, program_arguments(), "building the programs", PROGRAMS_SECONDS)
+
+
+def program_arguments() -> list[str]:
+    return ["build", *SELECTION, *(f"--bin={name}" for name in PROGRAMS), "--profile", PROFILE]
 
 
 def static_programs(settings: Settings) -> None:
-    """Builds what goes into other images: the runner, small, the stand-ins of simulator and agent, and the probe."""
-    env = {"RUSTFLAGS": STATIC}
-    runner = ["build", "--release", "--target", triple(), "--package", "leaderboard-runner"]
-    cargo(settings, runner, "building the static runner", RUNNER_SECONDS, env)
-    challenge = ["build", "--profile", PROFILE, "--target", triple()]
-    challenge += ["--package", "challenge-stand-in", "--package", "challenge-probe"]
-    cargo(settings, challenge, "building the static stand-ins", STAND_INS_SECONDS, env)
+    """Builds what goes into other images."""
+    packages = [f"--package={name}" for name in STATIC_PACKAGES]
+    arguments = ["build", "--profile", PROFILE, "--target", triple(), *packages]
+    cargo(settings, arguments, "building the static programs", STATIC_SECONDS, {"RUSTFLAGS": STATIC})
+
+
+def released_runner(settings: Settings) -> None:
+    """Builds the runner as a release has it, small: for the image that the Dockerfile makes."""
+    arguments = ["build", "--release", "--target", triple(), "--package", "leaderboard-runner"]
+    cargo(settings, arguments, "building the released runner", RUNNER_SECONDS, {"RUSTFLAGS": STATIC})
 
 
 def cold_seconds(settings: Settings) -> int:
     """About how long cargo takes: nothing of note where it has built here before."""
     if (target_folder(settings.repository, os.environ) / PROFILE).is_dir():
         return 0
-    return PROGRAMS_SECONDS + RUNNER_SECONDS + STAND_INS_SECONDS
+    return PROGRAMS_SECONDS + STATIC_SECONDS
 
 
 def program(settings: Settings, name: str) -> Path:

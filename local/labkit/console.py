@@ -19,6 +19,8 @@ BAR_CELLS = 24
 LAST_LINES = 30
 LONGEST_LINE = 300
 LONGEST_REASON = 200
+# False in a process whose lines are shown next to those of others.
+draws_bars = True
 NETWORK_WORDS = (
     "dial tcp",
     "no such host",
@@ -81,7 +83,7 @@ def run_long(
     """
     log.parent.mkdir(parents=True, exist_ok=True)
     started = time.monotonic()
-    draws = usual > 0 and sys.stderr.isatty()
+    draws = draws_bars and usual > 0 and sys.stderr.isatty()
     with log.open("wb") as sink:
         child = subprocess.Popen(
             argv,

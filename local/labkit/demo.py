@@ -7,12 +7,12 @@ import json
 import os
 import shlex
 import time
-from collections.abc import Mapping
+from collections.abc import Collection, Mapping
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
-from . import aws, build, cluster, demo_check, evalai_server, image, packages, pki, pythonenv, tools
+from . import aws, build, cluster, demo_check, evalai_server, firstbuild, image, packages, pki, pythonenv, tools
 from .console import say, seconds
 from .demo_check import Findings
 from .errors import LabError
@@ -27,12 +27,19 @@ RELEASE = "leaderboard-operator"
 CHALLENGE, PHASE, SPLIT = 1, 1, 1
 PARTICIPANT, ORGANIZER = "local-team-a-token", "local-organizer-token"
 CONTENTS, SIMULATOR, AGENT = "challenge/contents:1", "challenge/simulator:1", "challenge/agent:standard"
+# Agents that the demo's last lines name.
+CRASHES, PRINTS = "challenge/agent:crash-once", "challenge/agent:print-routes"
 OPERATOR = "leaderboard-operator:dev"
+# The tests have more.
+IMAGES = (OPERATOR, CONTENTS, SIMULATOR, AGENT, CRASHES, PRINTS)
 CERTIFICATES = Path("/etc/ssl/certs/ca-certificates.crt")
 RUN_PATIENCE = 600
+# On two cores that do nothing else.
+FIRST_MINUTES = 11
 # Of the steps that are taken each time.
 RUN_SECONDS = 90
-STEPS = 9
+STEPS = 7
+TOOLS = (*cluster.CLUSTER_TOOLS, "helm")
 
 
 def run(settings: Settings) -> None:
@@ -44,8 +51,9 @@ def run(settings: Settings) -> None:
         say(other)
     folder = prepare(settings)
     kube = of_lab(settings, folder)
-    pinned = make_images(settings)
-    step(6, "EvalAI's stand-in", "1 s")
+    step(3, "images, made here and pushed to the AWS stand-in's registry", "10 s, or 2 s if they are there")
+    pinned = make_images(settings, IMAGES)
+    step(4, "EvalAI's stand-in", "1 s")
     evalai_server.ensure(settings, build.program(settings, "evalai-stand-in"))
     install(settings, kube, pinned)
     apply_leaderboard(settings, kube, pinned)
@@ -59,20 +67,19 @@ def run(settings: Settings) -> None:
 
 def forecast(settings: Settings) -> str:
     """How long it will take, and why."""
-    absent = tools.missing(settings, [*cluster.CLUSTER_TOOLS, "helm"], tools.fitting_assets(os.environ))
-    reasons = [
-        (
-            tools.cold_seconds(absent),
-            f"for {len(absent)} tools built from source, {tools.longest(absent)} first of all",
-        ),
-        (0 if pythonenv.home(settings).exists() else pythonenv.USUAL_SECONDS, "for the AWS stand-in's packages"),
-        (build.cold_seconds(settings), "for the operator and the stand-ins in Rust"),
-        (RUN_SECONDS, "for the cluster, the images and one submission"),
+    built = firstbuild.cold_seconds(settings, TOOLS)
+    total = f"this takes about {seconds(built + RUN_SECONDS)} on two cores"
+    run = f"{seconds(RUN_SECONDS)} for the cluster, the images and one submission"
+    if not built:
+        return f"{total}: {run}"
+    absent = firstbuild.absent(settings, TOOLS)
+    whats = [
+        f"{len(absent)} tools from source ({tools.longest(absent)} takes longest)" if absent else "",
+        "the operator and the stand-ins in Rust" if build.cold_seconds(settings) else "",
+        "" if pythonenv.is_whole(settings) else "the AWS stand-in's packages",
     ]
-    parts = [f"{seconds(each)} {why}" for each, why in reasons if each]
-    total = seconds(sum(each for each, _ in reasons))
-    kept = "; what is built is kept, so that the next time takes a minute or two" if len(parts) > 1 else ""
-    return f"this takes about {total} on two cores: {', '.join(parts)}{kept}"
+    parts = f"{seconds(built)} for {', '.join(filter(None, whats))}, and {run}"
+    return f"{total} that do nothing else: {parts}; what is built is kept, so that the next time takes a minute or two"
 
 
 def foreign_cluster(settings: Settings, env: Mapping[str, str]) -> str:
@@ -90,37 +97,38 @@ def step(number: int, what: str, usual: str) -> None:
 
 
 def prepare(settings: Settings) -> Path:
-    """Steps 1 to 4: everything that has to be built, and the cluster. Returns the folder of tools."""
-    step(1, "pinned tools: Kubernetes, etcd, helm", "14 min the first time, then nothing")
+    """Steps 1 and 2: everything that has to be built, and the cluster. Returns the folder of tools."""
+    what = "Kubernetes, etcd and helm in Go; next to them operator and stand-ins in Rust"
+    step(1, what, f"{FIRST_MINUTES} min the first time, then 2 s")
     tools.check_space(settings.state)
     packages.ensure(settings)
-    folder = tools.ensure(settings, [*cluster.CLUSTER_TOOLS, "helm"], tools.fitting_assets(os.environ))
-    step(2, "the operator and EvalAI's stand-in", "8 min the first time, then 1 s")
-    build.programs(settings)
-    step(3, "the programs that go into other images", "1 min the first time, then 1 s")
-    build.static_programs(settings)
-    step(4, "the cluster and the AWS stand-in", "15 s, or 1 s if they run")
+    firstbuild.ensure(settings, TOOLS)
+    folder = tools.ensure(settings, TOOLS, tools.fitting_assets(os.environ))
+    step(2, "the cluster and the AWS stand-in", "15 s, or 1 s if they run")
     cluster.up(settings)
     return folder
 
 
-def make_images(settings: Settings) -> dict[str, str]:
-    """Step 5: pushes all images; returns repository:tag → the reference with its digest."""
-    step(5, "images, made here and pushed to the AWS stand-in's registry", "20 s, or 5 s if they are there")
+def make_images(settings: Settings, names: Collection[str] = ()) -> dict[str, str]:
+    """Pushes the named images, or all; returns repository:tag → the reference with its digest."""
     if not CERTIFICATES.exists():
         raise LabError(
             f"{CERTIFICATES} is missing, which goes into the operator's image: apt-get install ca-certificates"
         )
     search = image.Search({}, image.target_folder(settings.repository, os.environ), build.PROFILE)
-    made = []
-    for name in ("operator-image.toml", "challenge/images.toml"):
-        made += image.make(settings, settings.local / name, search, None)
+    specs = [
+        spec
+        for file in ("operator-image.toml", "challenge/images.toml")
+        for spec in image.specs(settings.local / file)
+        if not names or spec.name in names
+    ]
+    made = image.push_all(settings, specs, search)
     return {reference.partition("@")[0].removeprefix(f"{settings.registry}/"): reference for reference in made}
 
 
 def install(settings: Settings, kube: Kube, pinned: dict[str, str]) -> None:
-    """Step 7: the chart, with the operator's image by its digest."""
-    step(7, f"the operator, by its Helm chart, in the namespace {SYSTEM}", "10 s")
+    """Step 5: the chart, with the operator's image by its digest."""
+    step(5, f"the operator, by its Helm chart, in the namespace {SYSTEM}", "10 s")
     for name in ("namespaces.yaml", "secrets.yaml"):
         apply(settings, kube, name, pinned)
     # The commands that README and the demo's last lines name are then short.
@@ -172,8 +180,8 @@ def words(text: str) -> str:
 
 
 def apply_leaderboard(settings: Settings, kube: Kube, pinned: dict[str, str]) -> None:
-    """Step 8: the Leaderboard; waits until the controller reports that it can serve."""
-    step(8, f"the Leaderboard {LEADERBOARD} in the namespace {NAMESPACE}", "3 s")
+    """Step 6: the Leaderboard; waits until the controller reports that it can serve."""
+    step(6, f"the Leaderboard {LEADERBOARD} in the namespace {NAMESPACE}", "3 s")
     apply(settings, kube, "leaderboard.yaml", pinned)
     wanted = ["wait", "--for=condition=Ready", f"leaderboard/{LEADERBOARD}", f"--namespace={NAMESPACE}"]
     done = kube.attempt("kubectl", *wanted, "--timeout=120s")
@@ -211,8 +219,8 @@ class Submitted:
 
 
 def submit_and_follow(settings: Settings, kube: Kube, agent: str) -> Submitted:
-    """Step 9: a participant pushes; EvalAI publishes into SQS; from there on nobody helps."""
-    step(9, "a participant of team-a submits to EvalAI, phase SENSORS", "30 s until the score is published")
+    """Step 7: a participant pushes; EvalAI publishes into SQS; from there on nobody helps."""
+    step(7, "a participant of team-a submits to EvalAI, phase SENSORS", "30 s until the score is published")
     row = evalai_server.submit(settings, PARTICIPANT, CHALLENGE, PHASE, agent)
     since = time.monotonic()
     submitted = Submitted(row["id"], row["participant_team"], f"submission-{row['id']}")
@@ -306,15 +314,14 @@ def next_steps(settings: Settings, found: Findings) -> str:
     """What a person may do now."""
     name, key = found.submission["metadata"]["name"], found.evalai["id"]
     stand_in = shlex.quote(os.path.relpath(build.program(settings, "evalai-stand-in")))
-    agents = f"{settings.registry}/challenge/agent"
     at = "" if settings.ports["evalai"] == PORTS["evalai"] else f" --server {settings.evalai_endpoint}"
     return f"""
 What to try next:
   eval "$(local/lab env)"                                   # kubectl with the plugin and this namespace, helm, AWS's variables
   kubectl describe submission {name}
   kubectl leaderboard dashboard                             # in a browser
-  {stand_in} submit {agents}:crash-once --phase 2{at}
-  {stand_in} submit {agents}:print-routes{at}
+  {stand_in} submit {settings.registry}/{CRASHES} --phase 2{at}
+  {stand_in} submit {settings.registry}/{PRINTS}{at}
   kubectl get submissions --watch
   {stand_in} show {key}{at}
   http://127.0.0.1:{settings.ports["evalai"]}/                                    # EvalAI's submissions and leaderboards

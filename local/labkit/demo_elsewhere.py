@@ -90,7 +90,7 @@ def forecast(settings: Settings) -> str:
     absent = tools.missing(settings, built_here())
     reasons = [
         (tools.cold_seconds(absent), f"for {' and '.join(name for _, name in absent)}, which this machine lacks"),
-        (0 if pythonenv.home(settings).exists() else pythonenv.USUAL_SECONDS, "for the AWS stand-in's packages"),
+        (0 if pythonenv.is_whole(settings) else pythonenv.USUAL_SECONDS, "for the AWS stand-in's packages"),
         (build.cold_seconds(settings), "for the operator and the stand-ins in Rust"),
         (RUN_SECONDS, "for pushes, pulls and one submission"),
     ]

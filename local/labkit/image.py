@@ -51,17 +51,22 @@ def make(settings: Settings, file: Path, search: Search, archive: Path | None) -
 
     Returns the pushed references, `registry/repository:tag@digest`.
     """
+    found = specs(file)
+    if archive is not None:
+        if len(found) != 1:
+            raise LabError(f"--tar takes a file with one image, and {file.name} has {len(found)}")
+        built = build(settings, found[0], search)
+        archive.write_bytes(layer.archive(built, found[0].name))
+        return [f"{found[0].name}@{built.digest}"]
+    return push_all(settings, found, search)
+
+
+def specs(file: Path) -> list[ImageSpec]:
+    """The images that a file describes."""
     try:
-        specs = parse(file.read_text(), file.name)
+        return list(parse(file.read_text(), file.name))
     except OSError as error:
         raise LabError(f"{file} can't be read: {error.strerror}") from error
-    if archive is not None:
-        if len(specs) != 1:
-            raise LabError(f"--tar takes a file with one image, and {file.name} has {len(specs)}")
-        built = build(settings, specs[0], search)
-        archive.write_bytes(layer.archive(built, specs[0].name))
-        return [f"{specs[0].name}@{built.digest}"]
-    return push_all(settings, specs, search)
 
 
 def push_all(settings: Settings, specs: Sequence[ImageSpec], search: Search) -> list[str]:

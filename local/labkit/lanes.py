@@ -1,6 +1,7 @@
 """Owns jobs that run at the same time: each in a process of its own, whose output is printed whole when it ends. Knows no layer of tests.
 
 So what a job prints can be read as if it had run alone. Until then its output is in a file, whose last line is shown every minute.
+Jobs of which each line names what it is of are not captured: their lines are printed as they come.
 """
 
 import multiprocessing
@@ -15,6 +16,7 @@ from multiprocessing.process import BaseProcess
 from pathlib import Path
 from typing import Any
 
+from . import console
 from .console import say, seconds
 from .process import tail
 
@@ -47,11 +49,13 @@ class Running:
     nice: int
     process: BaseProcess
     answer: Connection
-    log: Path
+    # None: its output is not captured.
+    log: Path | None
     began: float
 
     def far(self) -> str:
-        return f"{self.job.name} {seconds(time.monotonic() - self.began)} ({tail(self.log)[:MOST_OF_LINE]})"
+        line = tail(self.log)[:MOST_OF_LINE] if self.log else ""
+        return f"{self.job.name} {seconds(time.monotonic() - self.began)} ({line})"
 
     def end(self) -> Ended:
         """Waits for what is left of its process, and prints what it has printed."""
@@ -65,21 +69,21 @@ class Running:
         return Ended(self.job, time.monotonic() - self.began, value)
 
 
-def run(lanes: Sequence[Iterable[Job]], logs: Path) -> Iterator[Ended]:
+def run(lanes: Sequence[Iterable[Job]], logs: Path, captured: bool = True) -> Iterator[Ended]:
     """Runs the jobs of each lane one after the other, the lanes at the same time; gives the jobs as they end."""
     logs.mkdir(parents=True, exist_ok=True)
     running: list[Running] = []
     try:
         for number, lane in enumerate(lanes):
-            running += begin(iter(lane), logs, NICE if number else 0)
+            running += begin(iter(lane), logs if captured else None, NICE if number else 0)
         while running:
             ready = wait([one.answer for one in running], HEARTBEAT_SECONDS)
-            if not ready:
+            if not ready and captured:
                 say(f"still at work: {'; '.join(one.far() for one in running)}")
             for one in [one for one in running if one.answer in ready]:
                 running.remove(one)
                 ended = one.end()
-                running += begin(one.rest, logs, one.nice)
+                running += begin(one.rest, logs if captured else None, one.nice)
                 yield ended
     finally:
         for one in running:
@@ -88,13 +92,14 @@ def run(lanes: Sequence[Iterable[Job]], logs: Path) -> Iterator[Ended]:
             show(one.log)
 
 
-def begin(jobs: Iterator[Job], logs: Path, nice: int) -> list[Running]:
+def begin(jobs: Iterator[Job], logs: Path | None, nice: int) -> list[Running]:
     """Starts the next of a lane's jobs; none if there is none."""
     job = next(jobs, None)
     if job is None:
         return []
-    log = logs / f"test-{job.name}.log"
-    log.unlink(missing_ok=True)
+    log = logs / f"job-{job.name}.log" if logs else None
+    if log:
+        log.unlink(missing_ok=True)
     # What is still to be printed would be printed by both.
     sys.stdout.flush()
     sys.stderr.flush()
@@ -107,18 +112,21 @@ def begin(jobs: Iterator[Job], logs: Path, nice: int) -> list[Running]:
     return [Running(job, jobs, nice, process, answer, log, time.monotonic())]
 
 
-def work(job: Job, log: Path, nice: int, sender: Connection) -> None:
+def work(job: Job, log: Path | None, nice: int, sender: Connection) -> None:
     """In the child: all output goes to the file."""
-    with log.open("wb") as sink:
-        os.dup2(sink.fileno(), 1)
-        os.dup2(sink.fileno(), 2)
+    # Two of them would be drawn on one line.
+    console.draws_bars = False
+    if log:
+        with log.open("wb") as sink:
+            os.dup2(sink.fileno(), 1)
+            os.dup2(sink.fileno(), 2)
     os.nice(nice)
     sender.send(job.work())
 
 
-def show(log: Path) -> None:
+def show(log: Path | None) -> None:
     sys.stdout.flush()
-    if log.exists():
+    if log and log.exists():
         with log.open("rb") as source:
             shutil.copyfileobj(source, sys.stdout.buffer)
     sys.stdout.flush()

@@ -20,14 +20,21 @@ def ensure(settings: Settings) -> Path:
     """Makes the virtual environment if it is not there, and returns its folder of programs."""
     requirements = settings.local / "requirements.txt"
     folder = home(settings)
-    # Scripts in it hold its name, so it can't be renamed: the mark shows that it is whole.
-    mark = folder / ".complete"
-    if not mark.exists():
+    if not is_whole(settings):
         with lock(settings.cache / f"{folder.name}.lock", "the Python environment"):
-            if not mark.exists():
+            if not is_whole(settings):
                 build(folder, requirements, settings)
-                mark.touch()
+                mark(settings).touch()
     return folder / "bin"
+
+
+def is_whole(settings: Settings) -> bool:
+    return mark(settings).exists()
+
+
+def mark(settings: Settings) -> Path:
+    """Scripts in the environment hold its name, so it can't be renamed: this file shows that it is whole."""
+    return home(settings) / ".complete"
 
 
 def home(settings: Settings) -> Path:

@@ -10,7 +10,7 @@ import subprocess
 import sys
 import threading
 import time
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass, field, replace
 from typing import IO, Any
 
@@ -72,10 +72,10 @@ class Layer:
     about: str
     # Raises LabError if it fails, NotRun where this machine lacks what it needs.
     work: Callable[[Plan], None]
+    # It runs next to those of the other lane of its stage.
+    lane: str
     # Needs root: for a node, or to install what is missing.
     needs_root: bool = False
-    # One of LANES: it runs next to those of the other lane. Empty: it runs before them.
-    lane: str = ""
 
 
 @dataclass(frozen=True)
@@ -106,28 +106,28 @@ def run(settings: Settings, core: bool, name_filter: str, only: Sequence[str]) -
         raise LabError("no layer is left to run: the cluster's needs a node, so leave --core out")
     plan = Plan(settings, name_filter)
     results: list[Result] = []
-    in_turn, at_once = in_lanes(chosen)
-    for layer in in_turn:
-        results.append(run_layer(plan, layer, results))
-    if at_once:
-        results += side_by_side(plan, at_once, results)
+    for at_once in stages(chosen):
+        if len(at_once) > 1:
+            results += side_by_side(plan, at_once, results)
+        for layer in at_once[0] if len(at_once) == 1 else []:
+            results.append(run_layer(plan, layer, results))
     results.sort(key=lambda result: NAMES.index(result.name))
     print("\n".join([table(results, time.monotonic() - started), *plan.summary.lines()]), flush=True)
     return not any(result.failure for result in results)
 
 
-def in_lanes(chosen: Sequence[Layer]) -> tuple[list[Layer], list[list[Layer]]]:
-    """Of the layers those that run in turn, and then those that run at once: each lane in turn. No lanes where one would do."""
-    found = [[layer for layer in chosen if layer.lane == lane] for lane in LANES]
-    if not all(found):
-        return list(chosen), []
-    return [layer for layer in chosen if not layer.lane], found
+def stages(chosen: Sequence[Layer]) -> Iterator[list[list[Layer]]]:
+    """The layers of each stage, the stages in turn: those of a lane in turn, its lanes at once."""
+    for stage in STAGES:
+        lanes_of = [[layer for layer in chosen if layer.lane == lane] for lane in stage]
+        if found := [lane for lane in lanes_of if lane]:
+            yield found
 
 
 def side_by_side(plan: Plan, at_once: Sequence[Sequence[Layer]], before: Sequence[Result]) -> list[Result]:
     """Runs each lane next to the others; the results as the layers end."""
     names = " next to ".join(", ".join(layer.name for layer in lane) for lane in at_once)
-    say(f"{names}: each prints its output when it ends; until then it is in {plan.settings.logs}/test-*.log")
+    say(f"{names}: each prints its output when it ends; until then it is in {plan.settings.logs}/job-*.log")
     results = []
     for ended in lanes.run([[job(plan, layer, before) for layer in lane] for lane in at_once], plan.settings.logs):
         result, summary = ended.value or (
@@ -439,17 +439,19 @@ def require_target(settings: Settings, name: str) -> None:
         raise LabError(f"there is no test program {name}: tests/{name}.rs is missing")
 
 
-# The cluster waits most of its time: for the kubelet, for runs, for what dies. The others compute.
-WAITS, COMPUTES = LANES = ("waits", "computes")
+# The first build, of Go next to Rust. Then the cluster, which waits most of its time: for the kubelet, for runs, for what dies. The
+# others compute.
+GO, RUST, WAITS, COMPUTES = "go", "rust", "waits", "computes"
+STAGES = ((GO, RUST), (WAITS, COMPUTES))
 LAYERS = (
-    Layer("lab", "local/ itself, in Python", lab, lane=COMPUTES),
-    Layer("tools", "etcd, the API server and all others, kept from run to run", make_tools, needs_root=True),
-    Layer("build", "all tests, and the programs they run", compile_all),
-    Layer("unit", "pure logic, mock clients, and processes on this machine", unit, lane=COMPUTES),
-    Layer("api", "a real API server, without nodes", api, lane=COMPUTES),
-    Layer("page", "the operator's page, in a headless Chromium", page, needs_root=True, lane=COMPUTES),
-    Layer("chart", "the Helm chart, against an API server", chart, lane=COMPUTES),
-    Layer("image", "the Dockerfile, by a container engine", image, needs_root=True, lane=COMPUTES),
-    Layer("cluster", "a real node with containers", in_cluster, needs_root=True, lane=WAITS),
+    Layer("lab", "local/ itself, in Python", lab, COMPUTES),
+    Layer("tools", "etcd, the API server and all others, kept from run to run", make_tools, GO, needs_root=True),
+    Layer("build", "all tests, and the programs they run", compile_all, RUST),
+    Layer("unit", "pure logic, mock clients, and processes on this machine", unit, COMPUTES),
+    Layer("api", "a real API server, without nodes", api, COMPUTES),
+    Layer("page", "the operator's page, in a headless Chromium", page, COMPUTES, needs_root=True),
+    Layer("chart", "the Helm chart, against an API server", chart, COMPUTES),
+    Layer("image", "the Dockerfile, by a container engine", image, COMPUTES, needs_root=True),
+    Layer("cluster", "a real node with containers", in_cluster, WAITS, needs_root=True),
 )
 NAMES = tuple(layer.name for layer in LAYERS)

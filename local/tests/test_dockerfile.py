@@ -295,7 +295,7 @@ class NotRunLayers(unittest.TestCase):
             raise NotRun("no engine")
 
         with redirect_stderr(StringIO()):
-            result = testrun.run_layer(testrun.Plan(SimpleNamespace(), ""), testrun.Layer("image", "it", work), [])
+            result = testrun.run_layer(testrun.Plan(SimpleNamespace(), ""), testrun.Layer("image", "it", work, testrun.COMPUTES), [])
         self.assertEqual((result.failure, result.lacks), ("", "no engine"))
         lines = testrun.table([testrun.Result("lab", 1.0, ""), result], 1.0).splitlines()
         self.assertTrue(lines[2].endswith("   not run: no engine"))

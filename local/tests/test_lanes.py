@@ -10,7 +10,7 @@ from contextlib import redirect_stderr, redirect_stdout
 from pathlib import Path
 from unittest.mock import patch
 
-from labkit import lanes
+from labkit import console, lanes
 from labkit.lanes import Ended, Job
 
 
@@ -80,6 +80,21 @@ class Lanes(unittest.TestCase):
         with patch.object(lanes, "HEARTBEAT_SECONDS", 0.05), patch.object(lanes, "say", side_effect=heard) as said:
             run([Job("a", slow)])
         self.assertRegex(said.call_args.args[0], r"^still at work: a \S+ s \(test of_something \.\.\. ok\)$")
+
+    def test_what_is_not_captured_is_printed_as_it_comes(self) -> None:
+        reading, writing = os.pipe()
+
+        def a() -> bool:
+            os.write(writing, b"of a")
+            return console.draws_bars
+
+        with tempfile.TemporaryDirectory() as folder:
+            ended = list(lanes.run([[Job("a", a)]], Path(folder), captured=False))
+            self.assertEqual(list(Path(folder).iterdir()), [])
+        self.assertEqual((os.read(reading, 9), ended[0].value), (b"of a", False))
+        self.assertTrue(console.draws_bars)
+        os.close(reading)
+        os.close(writing)
 
     def test_all_but_the_first_lane_give_way(self) -> None:
         before = os.nice(0)

@@ -124,17 +124,20 @@ class SideBySide(unittest.TestCase):
     """Which layers run next to the cluster's, and what becomes of what they find."""
 
     def test_what_computes_runs_next_to_the_cluster_in_whole_runs_alone(self) -> None:
-        in_turn, at_once = testrun.in_lanes(testrun.LAYERS)
-        self.assertEqual([layer.name for layer in in_turn], ["tools", "build"])
-        names = [[layer.name for layer in lane] for lane in at_once]
-        self.assertEqual(names, [["cluster"], ["lab", "unit", "api", "page", "chart", "image"]])
-        for only in (["cluster"], ["build", "unit", "api", "chart"]):
-            chosen = [layer for layer in testrun.LAYERS if layer.name in only]
-            self.assertEqual(testrun.in_lanes(chosen), (chosen, []))
+        rest = ["lab", "unit", "api", "page", "chart", "image"]
+        for only, stages in (
+            (testrun.NAMES, [[["tools"], ["build"]], [["cluster"], rest]]),
+            (["cluster"], [[["cluster"]]]),
+            (["build", "unit", "api"], [[["build"]], [["unit", "api"]]]),
+        ):
+            with self.subTest(only):
+                chosen = [layer for layer in testrun.LAYERS if layer.name in only]
+                found = [[[layer.name for layer in lane] for lane in stage] for stage in testrun.stages(chosen)]
+                self.assertEqual(found, stages)
 
     def run_both(self, unit: Callable[[testrun.Plan], None]) -> tuple[list[testrun.Result], Summary]:
         """The results of `unit` and of a cluster's layer that passes."""
-        layers = [testrun.Layer("cluster", "it", lambda _: None), testrun.Layer("unit", "it", unit)]
+        layers = [testrun.Layer("cluster", "it", lambda _: None, "a"), testrun.Layer("unit", "it", unit, "b")]
         shown = io.TextIOWrapper(io.BytesIO())
         with tempfile.TemporaryDirectory() as folder, redirect_stdout(shown), redirect_stderr(io.StringIO()):
             plan = testrun.Plan(SimpleNamespace(logs=Path(folder)), "")

@@ -1,0 +1,1 @@
+//! Has no code: its dependencies ask for features.
