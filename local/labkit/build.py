@@ -19,7 +19,7 @@ from .settings import Settings
 
 PROFILE = "local"
 # From nothing on two cores.
-PROGRAMS_SECONDS, STATIC_SECONDS, RUNNER_SECONDS = 420, 40, 45
+PROGRAMS_SECONDS, STATIC_SECONDS, RUNNER_SECONDS = 230, 25, 45
 SELECTION = ("--workspace",)
 PROGRAMS = ("leaderboard-operator", "kubectl-leaderboard", "evalai-stand-in")
 # What goes into other images: the runner, the stand-ins of simulator and agent, and the probe.
