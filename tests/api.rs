@@ -47,6 +47,7 @@ mod api {
     mod scale;
     mod shared_queue;
     mod slots;
+    mod suspended;
     mod switch;
     mod table;
     mod token;

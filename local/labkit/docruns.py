@@ -60,6 +60,7 @@ NOT_TYPED = {
     'set -e\n: "${': "the command of an init container, which contractcheck.py compares with the Job",
     "kubectl logs -c private-contents": "named as what no longer works",
     "aws s3 sync": "the name of a command",
+    "kubectl describe workloads": "Kueue's own kind is not here",
     "helm upgrade --wait": "the name of an option",
 }
 # Answers to a line that is right, of a server without nodes and without the object.
@@ -193,7 +194,7 @@ def furnish(repository: Path, home: Path) -> None:
     shutil.copy(repository / docscene.EXAMPLE, home / "examples" / "aws" / "my-leaderboard-20.yaml")
     for name in ("charts", "Dockerfile"):
         (home / name).symlink_to(repository / name)
-    (home / "examples" / "aws" / "token.json").touch()
+    (home / "examples" / "aws" / "token.json").write_text('{"auth_token": "a-token"}')
     (home / "local").mkdir()
     (home / "local" / "quickstart").symlink_to(repository / "local" / "quickstart")
     for script in ("local/lab", "examples/contents/check.sh", "examples/participants/try.sh"):

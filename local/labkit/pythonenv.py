@@ -1,4 +1,7 @@
-"""Owns the virtual environment with the AWS stand-in, its client and cfn-lint; it lives in the tool cache, keyed by its requirements."""
+"""Owns the virtual environments, in the tool cache and keyed by their requirements.
+
+One has the AWS stand-in, its client and cfn-lint, and the other one what runs the files of examples.
+"""
 
 import hashlib
 import os
@@ -14,38 +17,43 @@ from .settings import Settings
 from .tools import lock
 
 USUAL_SECONDS = 40
+STAND_IN = "requirements.txt"
+EXAMPLES = "requirements-examples.txt"
+CONTENTS = {
+    STAND_IN: "the AWS stand-in (ministack), boto3 and cfn-lint",
+    EXAMPLES: "awscli, Lua, CEL, jsonschema and shellcheck",
+}
 
 
-def ensure(settings: Settings) -> Path:
-    """Makes the virtual environment if it is not there, and returns its folder of programs."""
-    requirements = settings.local / "requirements.txt"
-    folder = home(settings)
-    if not is_whole(settings):
+def ensure(settings: Settings, name: str = STAND_IN) -> Path:
+    """Makes the virtual environment of a file of requirements if it is not there, and returns its folder of programs."""
+    folder = home(settings, name)
+    if not is_whole(settings, name):
         with lock(settings.cache / f"{folder.name}.lock", "the Python environment"):
-            if not is_whole(settings):
-                build(folder, requirements, settings)
-                mark(settings).touch()
+            if not is_whole(settings, name):
+                build(folder, name, settings)
+                mark(settings, name).touch()
     return folder / "bin"
 
 
-def is_whole(settings: Settings) -> bool:
-    return mark(settings).exists()
+def is_whole(settings: Settings, name: str = STAND_IN) -> bool:
+    return mark(settings, name).exists()
 
 
-def mark(settings: Settings) -> Path:
+def mark(settings: Settings, name: str) -> Path:
     """Scripts in the environment hold its name, so it can't be renamed: this file shows that it is whole."""
-    return home(settings) / ".complete"
+    return home(settings, name) / ".complete"
 
 
-def home(settings: Settings) -> Path:
+def home(settings: Settings, name: str = STAND_IN) -> Path:
     """Where this very environment is, or will be."""
-    requirements = (settings.local / "requirements.txt").read_bytes()
+    requirements = (settings.local / name).read_bytes()
     key = hashlib.sha256(requirements + platform.python_version().encode()).hexdigest()[:16]
     return settings.cache / f"python-{key}"
 
 
-def build(folder: Path, requirements: Path, settings: Settings) -> None:
-    say(f"installing the AWS stand-in (ministack), boto3 and cfn-lint, usually {USUAL_SECONDS} s")
+def build(folder: Path, name: str, settings: Settings) -> None:
+    say(f"installing {CONTENTS[name]}, usually {USUAL_SECONDS} s")
     shutil.rmtree(folder, ignore_errors=True)
     made = subprocess.run([sys.executable, "-m", "venv", str(folder)], capture_output=True, text=True, check=False)
     if made.returncode != 0:
@@ -55,7 +63,7 @@ def build(folder: Path, requirements: Path, settings: Settings) -> None:
     pip = [str(folder / "bin" / "python"), "-m", "pip", "install", "--quiet", "--disable-pip-version-check"]
     log = settings.cache / f"{folder.name}.log"
     run_long(
-        [*pip, "--requirement", str(requirements)],
+        [*pip, "--requirement", str(settings.local / name)],
         "installing Python packages",
         log,
         env=dict(os.environ),

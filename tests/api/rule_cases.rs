@@ -66,6 +66,7 @@ pub fn all() -> Vec<Case> {
         server(),
         queue(),
         networks(),
+        labels(),
         identities_and_tables(),
         sizes_and_images(),
         endpoints(),
@@ -376,6 +377,19 @@ fn networks() -> Vec<Case> {
             &policy("Managed", "Require"),
             &policy("External", "Require"),
         ),
+    ]
+}
+
+/// A queue's label is the host's, and what the operator and the Job controller find their Jobs by is not.
+fn labels() -> Vec<Case> {
+    let labels = |key: &str| json!({"jobLabels": {key: "x"}});
+    let good = labels("kueue.x-k8s.io/queue-name");
+    let case = |message, key: &str| create(Leaderboard, message, &good, &labels(key));
+    vec![
+        case("by those labels the operator finds", "leaderboard.carla.org/run"),
+        case("by those labels the operator finds", "app.kubernetes.io/managed-by"),
+        case("those labels are the Job controller's", "job-name"),
+        case("those labels are the Job controller's", "batch.kubernetes.io/job-name"),
     ]
 }
 

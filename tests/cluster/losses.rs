@@ -6,7 +6,7 @@ use std::time::Duration;
 use k8s_openapi::api::batch::v1::Job;
 use k8s_openapi::api::core::v1::Pod;
 use kube::ResourceExt;
-use kube::api::{DeleteParams, EvictParams};
+use kube::api::{DeleteParams, EvictParams, Patch, PatchParams};
 use leaderboard_api::{Attempt, State, Submission};
 use serde_json::{Value, json};
 
@@ -17,6 +17,7 @@ use crate::scene::{Scene, done, lay_over, scenario, score, state};
 
 /// How the matrix has these cases.
 pub(super) const REPEATED: &str = "Finished; at most one route of a pair repeated";
+const SUSPENDED: &str = "Running Suspended; Finished; at most one route of a pair repeated";
 
 /// Six routes for two pairs, one in 9 s: when the status has two, the run is far from its end on a busy machine too.
 fn slow() -> Value {
@@ -95,6 +96,45 @@ async fn a_pod_deleted_by_hand_costs_one_route_of_each_pair() {
         case.close();
     })
     .await;
+}
+
+/// As Kueue does it when it admits a Job, takes its quota back, and admits it again.
+#[tokio::test]
+async fn a_job_suspended_in_mid_run_goes_on_and_costs_no_retry() {
+    scenario("job-suspended", async |scene: &Scene| {
+        let _controller = controller(scene);
+        half_way(scene, "held", 0).await;
+        let mut case = Case::open("Job suspended in mid-run", SUSPENDED);
+        case.cause();
+        suspend(scene, "held-1", true).await;
+        case.shows(scene, "held", "Suspended", "no deadline runs").await;
+        // The kubelet ends the Pod in its grace, and logcopy stores what was reached.
+        let is_empty = |job: Option<&Job>| {
+            let status = job.and_then(|job| job.status.as_ref());
+            status.is_some_and(|status| status.active.unwrap_or_default() + status.terminating.unwrap_or_default() == 0)
+        };
+        scene
+            .wait("held-1", "its Pod is gone", Duration::from_mins(3), is_empty)
+            .await;
+        suspend(scene, "held-1", false).await;
+        assert_finished(&mut case, scene, "held").await;
+        let status = scene.api::<Submission>().get("held").await.unwrap().status.unwrap();
+        assert_eq!((status.retry, status.recreated, status.interruptions), (0, 0, None));
+        assert!(
+            status.workers.iter().all(|pair| pair.crashes == 0),
+            "{:?}",
+            status.workers
+        );
+        assert_eq!(scene.jobs().await, ["held-1"], "the same Job makes the next Pod");
+        case.close();
+    })
+    .await;
+}
+
+async fn suspend(scene: &Scene, job: &str, suspended: bool) {
+    let patch = Patch::Merge(json!({"spec": {"suspend": suspended}}));
+    let jobs = scene.api::<Job>();
+    jobs.patch(job, &PatchParams::default(), &patch).await.unwrap();
 }
 
 /// What a run shows whose one Pod was taken away, where no failure of the infrastructure is retried.

@@ -30,6 +30,7 @@
 //! | `Evicted`, the words about a container's disk, and a new Pod of the same Job | evicted for disk by the agent |
 //! | `DisruptionTarget`, `EvictionByEvictionAPI` | Pod evicted |
 //! | a Pod that is deleted gets a successor from its Job | Pod deleted by hand |
+//! | the Pod of a suspended Job is deleted, and its Job makes one again when it is resumed | Job suspended in mid-run |
 //! | the Pod of a deleted Job stops by itself | Job deleted by hand |
 //! | the Pod of a node that is deleted is gone | node lost |
 //! | taints of nodes are seen while Pods run | node about to be taken away |

@@ -63,3 +63,17 @@ pub fn job_complete() -> Value {
         "conditions": [condition("SuccessCriteriaMet"), condition("Complete")],
     })
 }
+
+/// Status of a Job whose Pods are deleted, because it is suspended.
+pub fn job_suspended() -> Value {
+    let suspended =
+        json!({"type": "Suspended", "status": "True", "reason": "JobSuspended", "lastTransitionTime": now()});
+    json!({"active": null, "ready": 0, "startTime": null, "conditions": [suspended]})
+}
+
+/// Status of a Job that is resumed.
+pub fn job_resumed() -> Value {
+    let now = now();
+    let resumed = json!({"type": "Suspended", "status": "False", "reason": "JobResumed", "lastTransitionTime": now});
+    json!({"active": 1, "ready": 0, "startTime": now, "conditions": [resumed]})
+}

@@ -3,6 +3,8 @@
 //! Owns the top level of the spec, its cross-field rules and the status. The parts are in `leaderboard_parts`.
 //! What depends on another field has no schema default: `api::effective` computes it.
 
+use std::collections::BTreeMap;
+
 use jiff::Timestamp;
 use k8s_openapi::apimachinery::pkg::apis::meta::v1::Time;
 use kube::CustomResource;
@@ -72,6 +74,8 @@ use super::submission_use::{MAX_USING_TEAMS, TeamUse};
     validation = Rule::new("!has(self.gpu) || !has(self.gpu.resourceName) || !self.tracks.exists(t, (has(t.agent) && (has(t.agent.resources) && ((has(t.agent.resources.limits) && self.gpu.resourceName in t.agent.resources.limits) || (has(t.agent.resources.requests) && self.gpu.resourceName in t.agent.resources.requests)))))").message("the agent.resources of a track name gpu.resourceName too; leave it out there: the operator requests it as gpu.mode says"),
     validation = Rule::new("has(self.gpu) || !(has(self.agent.resources) && ((has(self.agent.resources.limits) && 'nvidia.com/gpu' in self.agent.resources.limits) || (has(self.agent.resources.requests) && 'nvidia.com/gpu' in self.agent.resources.requests)))").message("agent.resources names nvidia.com/gpu and gpu is missing, so the other container of a pair would have no GPU; write gpu.resourceName: nvidia.com/gpu in place of it, or gpu.mode: None if that is meant"),
     validation = Rule::new("self.evaluation.carla.version == 'V2' || !has(self.evaluation.carla.simulator.graphicsAdapter)").message("evaluation.carla.simulator.graphicsAdapter is for V2: the simulator of V1 draws with OpenGL, which takes no adapter; leave it out"),
+    validation = Rule::new("!has(self.jobLabels) || !self.jobLabels.exists(k, k == 'app.kubernetes.io/managed-by' || k.startsWith('leaderboard.carla.org/'))").message("jobLabels has app.kubernetes.io/managed-by or a key of leaderboard.carla.org/: by those labels the operator finds its own Jobs; take another key"),
+    validation = Rule::new("!has(self.jobLabels) || !self.jobLabels.exists(k, k in ['controller-uid', 'job-name'] || k.startsWith('batch.kubernetes.io/'))").message("jobLabels has controller-uid, job-name or a key of batch.kubernetes.io/: those labels are the Job controller's; take another key"),
     validation = Rule::new("self.deadlines.idleSeconds > self.syncPeriodSeconds").message("deadlines.idleSeconds must be longer than syncPeriodSeconds: an agent would be stopped before its first report")
 )]
 pub struct LeaderboardSpec {
@@ -130,6 +134,10 @@ pub struct LeaderboardSpec {
     #[serde(default, skip_serializing_if = "Option::is_none")]
     #[schemars(schema_with = "super::leaderboard_parts::raw_object")]
     pub pod_overrides: Option<serde_json::Value>,
+    /// Labels added to the Jobs of submissions, for example `kueue.x-k8s.io/queue-name`; those of the Pods are in podOverrides.metadata.labels.
+    #[serde(default, skip_serializing_if = "BTreeMap::is_empty")]
+    #[schemars(schema_with = "super::leaderboard_parts::label_map")]
+    pub job_labels: BTreeMap<String, String>,
     /// Time between two rounds of merging, uploading and reporting.
     #[serde(default = "defaults::sync_period_seconds")]
     #[schemars(range(min = 1, max = 600))]

@@ -286,6 +286,11 @@ pub(super) fn raw_object(_: &mut SchemaGenerator) -> Schema {
     json_schema!({ "type": "object", "nullable": true, "x-kubernetes-preserve-unknown-fields": true })
 }
 
+/// Labels, within the API server's own bounds of a value.
+pub(super) fn label_map(_: &mut SchemaGenerator) -> Schema {
+    json_schema!({ "type": "object", "maxProperties": 16, "additionalProperties": { "type": "string", "maxLength": 63 } })
+}
+
 mod defaults {
     use super::ByteQuantity;
 

@@ -45,6 +45,9 @@ pub const MANAGER_CHILDREN: &str = "leaderboard-operator/children";
 /// Field manager of finalizers.
 pub const MANAGER_FINALIZER: &str = "leaderboard-operator/finalizer";
 
+/// Label of Kueue on a Job: name of the LocalQueue that admits it.
+pub const LABEL_KUEUE_QUEUE: &str = "kueue.x-k8s.io/queue-name";
+
 /// Name of the init container with the private contents.
 pub const CONTAINER_CONTENTS: &str = "contents";
 /// Name of the init container that prepares the volumes.

@@ -6,6 +6,9 @@
 use crate::conditions::{self, Condition, FINISHED, RUNNING};
 use crate::{Attempt, Reason, ReasonName, State, SubmissionStatus};
 
+/// Reasons of `Running` being False for a run whose agents come back.
+const BETWEEN_PODS: [Reason; 2] = [Reason::Replacing, Reason::Suspended];
+
 impl SubmissionStatus {
     /// A condition, if it was ever set.
     pub fn condition(&self, type_: &str) -> Option<&Condition> {
@@ -63,7 +66,7 @@ impl SubmissionStatus {
             Some(_) if self.failure.is_some() => State::Failed,
             Some(_) => State::Cancelled,
             // Once its agents ran it is never Pending again while it has a Job.
-            None if running.is_some_and(|c| c.status == "True" || c.reason == Reason::Replacing) => {
+            None if running.is_some_and(|c| c.status == "True" || c.reason.is_one_of(&BETWEEN_PODS)) => {
                 if self.is_resumed() {
                     State::Resumed
                 } else {
@@ -123,6 +126,7 @@ mod tests {
                 false,
             ),
             (State::Running, 1, None, Some(("False", "Replacing")), false),
+            (State::Running, 1, None, Some(("False", "Suspended")), false),
             (State::Resumed, 2, None, Some(("True", "Running")), false),
             // The end counts, although its agents still run.
             (

@@ -89,10 +89,30 @@ pub struct JobView {
     pub name: String,
     pub uid: String,
     pub created: Option<Timestamp>,
+    /// When the Job controller began with it; a resume begins anew. None while it is suspended.
+    pub started: Option<Timestamp>,
+    /// None while its Pods may run.
+    pub suspension: Option<Suspension>,
     pub end: Option<JobEnd>,
     pub deleting: bool,
     /// The words of its last FailedCreate event, while it has no Pod.
     pub failed_create: Option<String>,
+}
+
+impl JobView {
+    /// When its Pod could first be made: of a Job that was suspended, when it was resumed last.
+    pub fn begun(&self) -> Option<Timestamp> {
+        self.created.max(self.started)
+    }
+}
+
+/// A Job that is to have no Pod: its `spec.suspend` is true.
+#[derive(Clone, Debug, PartialEq, Eq)]
+pub struct Suspension {
+    /// When the Job controller carried it out; None before.
+    pub since: Option<Timestamp>,
+    /// The queue of Kueue that its label names.
+    pub queue: Option<SharedText>,
 }
 
 /// How a Job ended; both wait for the end of its Pods.

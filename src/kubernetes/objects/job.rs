@@ -13,12 +13,21 @@ use super::watchable;
 #[serde(default)]
 pub struct Job {
     pub metadata: Meta,
+    pub spec: JobSpec,
     pub status: JobStatus,
 }
 
-#[derive(Deserialize, Clone, Debug, Default, PartialEq)]
+#[derive(Deserialize, Clone, Copy, Debug, Default, PartialEq)]
 #[serde(default)]
+pub struct JobSpec {
+    pub suspend: bool,
+}
+
+#[derive(Deserialize, Clone, Debug, Default, PartialEq)]
+#[serde(rename_all = "camelCase", default)]
 pub struct JobStatus {
+    /// A resume sets it anew.
+    pub start_time: Option<Time>,
     pub conditions: Box<[JobCondition]>,
 }
 
@@ -36,7 +45,7 @@ pub struct JobCondition {
 
 impl Job {
     fn is_same_as(&self, other: &Self) -> bool {
-        self.metadata.is_same(&other.metadata) && self.status == other.status
+        self.metadata.is_same(&other.metadata) && self.spec == other.spec && self.status == other.status
     }
 
     fn share_texts(&mut self, texts: &mut Texts) {

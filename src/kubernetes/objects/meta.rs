@@ -36,6 +36,8 @@ pub struct Labels {
     pub submission: Option<Box<str>>,
     #[serde(rename = "leaderboard.carla.org/leaderboard")]
     pub leaderboard: Option<Text>,
+    #[serde(rename = "kueue.x-k8s.io/queue-name")]
+    pub queue: Option<Text>,
 }
 
 /// The annotations of a Pod that are read.
@@ -83,6 +85,7 @@ impl Meta {
         let shared = [
             &mut self.namespace,
             &mut self.labels.leaderboard,
+            &mut self.labels.queue,
             &mut self.annotations.leaderboard_generation,
         ];
         shared.into_iter().flatten().for_each(|text| texts.share(text));
@@ -99,12 +102,13 @@ mod tests {
     #[test]
     fn labels_and_annotations_have_the_names_that_are_written() {
         let meta: Meta = serde_json::from_value(json!({
-            "labels": {names::LABEL_SUBMISSION: "s", names::LABEL_LEADERBOARD: "l", "app": "x"},
+            "labels": {names::LABEL_SUBMISSION: "s", names::LABEL_LEADERBOARD: "l", names::LABEL_KUEUE_QUEUE: "q", "app": "x"},
             "annotations": {names::ANNOTATION_STOP: "cancel", names::ANNOTATION_GENERATION: "3", "other": "y"},
         }))
         .unwrap();
         assert_eq!(meta.labels.submission.as_deref(), Some("s"));
         assert_eq!(meta.labels.leaderboard.as_deref(), Some("l"));
+        assert_eq!(meta.labels.queue.as_deref(), Some("q"));
         assert_eq!(meta.annotations.stop.as_deref(), Some("cancel"));
         assert_eq!(meta.annotations.leaderboard_generation.as_deref(), Some("3"));
     }

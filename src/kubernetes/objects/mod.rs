@@ -12,7 +12,7 @@ mod pod;
 mod texts;
 
 pub use event::{Event, Involved};
-pub use job::{Job, JobCondition, JobStatus};
+pub use job::{Job, JobCondition, JobSpec, JobStatus};
 pub use meta::{Annotations, Labels, Meta, Owner};
 pub use node::{Node, NodeCondition, NodeSpec, NodeStatus, Taint};
 pub use pod::{

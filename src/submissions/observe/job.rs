@@ -1,8 +1,9 @@
 //! A Job reduced to what decisions depend on. Pure.
 
-use crate::kubernetes::objects::{Job, Pod};
+use crate::kubernetes::objects::{Job, JobCondition, Pod};
+use leaderboard_api::SharedText;
 use leaderboard_api::text::{LONGEST_MESSAGE, one_line};
-use leaderboard_policy::view::{JobEnd, JobView};
+use leaderboard_policy::view::{JobEnd, JobView, Suspension};
 
 /// Reduces a Job. `pod` is its newest.
 pub fn view(job: &Job, pod: Option<&Pod>) -> JobView {
@@ -10,10 +11,22 @@ pub fn view(job: &Job, pod: Option<&Pod>) -> JobView {
         name: job.metadata.name.to_string(),
         uid: job.metadata.uid.to_string(),
         created: job.metadata.creation_timestamp.as_ref().map(|t| t.0),
+        started: job.status.start_time.as_ref().map(|t| t.0),
+        suspension: suspension(job),
         end: end(job).or_else(|| pod.and_then(completion)),
         deleting: job.metadata.deletion_timestamp.is_some(),
         failed_create: None,
     }
+}
+
+/// The label counts for a Job that the host's own webhook has given its queue, too.
+fn suspension(job: &Job) -> Option<Suspension> {
+    let is_done = |c: &&JobCondition| &*c.type_ == "Suspended" && &*c.status == "True";
+    let done = job.status.conditions.iter().find(is_done);
+    job.spec.suspend.then(|| Suspension {
+        since: done.and_then(|c| c.last_transition_time.as_ref()).map(|time| time.0),
+        queue: job.metadata.labels.queue.as_deref().map(SharedText::from),
+    })
 }
 
 /// A Pod that has succeeded completes its Job, which has one completion. The Job controller reports it some seconds later.
@@ -48,7 +61,7 @@ fn end(job: &Job) -> Option<JobEnd> {
 
 #[cfg(test)]
 mod tests {
-    use serde_json::json;
+    use serde_json::{Value, json};
 
     use super::*;
 
@@ -72,5 +85,29 @@ mod tests {
         let at = Some("2026-01-01T00:00:09Z".parse().unwrap());
         assert_eq!(end, Some(JobEnd::Complete { at }));
         assert_eq!(view(&job, None).end, None);
+    }
+
+    #[test]
+    fn a_job_is_suspended_by_its_spec_since_its_condition() {
+        let job = |suspend: bool, labels: Value| -> Job {
+            serde_json::from_value(json!({
+                "metadata": {"name": "a-1", "labels": labels}, "spec": {"suspend": suspend},
+                "status": {"conditions": [{"type": "Suspended", "status": "True",
+                                           "lastTransitionTime": "2026-01-01T00:00:09Z"}]},
+            }))
+            .unwrap()
+        };
+        let suspension = |job: &Job| view(job, None).suspension;
+        assert_eq!(suspension(&job(false, json!({}))), None);
+        let since = Some("2026-01-01T00:00:09Z".parse().unwrap());
+        let expected = |queue: Option<&str>| {
+            Some(Suspension {
+                since,
+                queue: queue.map(Into::into),
+            })
+        };
+        assert_eq!(suspension(&job(true, json!({}))), expected(None));
+        let labels = json!({"kueue.x-k8s.io/queue-name": "gpus"});
+        assert_eq!(suspension(&job(true, labels)), expected(Some("gpus")));
     }
 }

@@ -206,7 +206,7 @@ fn metadata(input: &JobInput<'_>) -> ObjectMeta {
     ObjectMeta {
         name: Some(names::job(input.submission_name(), input.number)),
         namespace: input.submission.metadata.namespace.clone(),
-        labels: Some(labels(input)),
+        labels: Some(job_labels(input)),
         annotations: Some(BTreeMap::from([(
             names::ANNOTATION_RETRY.into(),
             input.number.retry.to_string(),
@@ -214,6 +214,13 @@ fn metadata(input: &JobInput<'_>) -> ObjectMeta {
         owner_references: Some(vec![owner_reference(input.submission)]),
         ..ObjectMeta::default()
     }
+}
+
+/// The host's labels are on the Job alone: Kueue reads them there, and would queue a Pod with them by itself.
+fn job_labels(input: &JobInput<'_>) -> BTreeMap<String, String> {
+    let mut all = input.spec().job_labels.clone();
+    all.extend(labels(input));
+    all
 }
 
 fn labels(input: &JobInput<'_>) -> BTreeMap<String, String> {

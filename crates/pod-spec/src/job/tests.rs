@@ -272,3 +272,15 @@ fn kubernetes_keeps_a_finished_job_long_enough_for_its_end_to_be_read() {
         assert_eq!(job["spec"]["ttlSecondsAfterFinished"], kept);
     }
 }
+
+#[test]
+fn labels_of_the_host_are_on_the_job_alone_and_ours_stay() {
+    let labels = json!({"kueue.x-k8s.io/queue-name": "gpus", "leaderboard.carla.org/run": "forged"});
+    let job = Case::new("V2", json!({ "jobLabels": labels })).json();
+    let of = |object: &Value| object["metadata"]["labels"].clone();
+    assert_eq!(of(&job)["kueue.x-k8s.io/queue-name"], "gpus");
+    assert_eq!(of(&job)["leaderboard.carla.org/run"], "4711");
+    assert_eq!(of(&job["spec"]["template"])["kueue.x-k8s.io/queue-name"], Value::Null);
+    // Whoever suspends and resumes it is the only writer of that field.
+    assert_eq!(job["spec"]["suspend"], Value::Null);
+}

@@ -22,6 +22,7 @@ mod run;
 mod start;
 mod status;
 mod stop;
+mod suspend;
 #[cfg(test)]
 mod tests;
 mod waits;
@@ -125,6 +126,7 @@ fn with_job(draft: &mut PlanBuilder<'_>, job: &JobView) {
         Some(end) => end::decide(draft, Some(end)),
         None if end::of_complete_run(draft) => {}
         None if job.deleting => stop::being_deleted(draft),
+        None if suspend::holds(draft, job) => {}
         None if stop::leaves_lost_pod(draft, job) => {}
         None => under_way(draft, job),
     }

@@ -9,9 +9,9 @@ use jiff::Timestamp;
 use super::cause::{self, Cause, Trouble};
 use super::failure::{self, infrastructure};
 use super::plan::Action;
-use super::run;
 use super::status::PlanBuilder;
 use super::waits::{Wait, after};
+use super::{run, suspend};
 use crate::view::{ContainerView, JobView, ObservedJob, ObservedNode, PodView, ScaleUp};
 use leaderboard_api::conditions::{self, Truth};
 use leaderboard_api::text::sentence;
@@ -97,7 +97,7 @@ pub(super) fn watch(draft: &mut PlanBuilder<'_>, job: &JobView) {
     if let Some(words) = &pod.unschedulable {
         return unschedulable(draft, job, words, pod.scale_up.as_ref());
     }
-    let since = pod.scheduled.or(job.created).unwrap_or(draft.now());
+    let since = pod.scheduled.or(job.begun()).unwrap_or(draft.now());
     let found = cause::trouble_of(pod);
     let stalled = found
         .as_ref()
@@ -190,9 +190,19 @@ fn show_running(draft: &mut PlanBuilder<'_>) {
 /// Shows what a Pod waits for whose agents have not started.
 fn show_wait(draft: &mut PlanBuilder<'_>, reason: Reason, message: &str) {
     if draft.is_running() {
-        draft.replacing(&format!("The Pod was lost, and the new one waits. {message}"));
+        let what = what_went(draft);
+        draft.replacing(&format!("{what}, and the new Pod waits. {message}"));
     } else {
         draft.show(reason, message);
+    }
+}
+
+/// Why a run is between two Pods.
+fn what_went(draft: &PlanBuilder<'_>) -> &'static str {
+    if suspend::was_resumed(draft) {
+        "The Job was suspended and resumed"
+    } else {
+        "The Pod was lost"
     }
 }
 
@@ -223,7 +233,8 @@ fn show_preparing(draft: &mut PlanBuilder<'_>, pod: &PodView, since: Timestamp) 
         format!("The Pod is being prepared{node}: {}{long}.", stage(pod))
     };
     if draft.is_running() {
-        draft.replacing(&format!("The Pod was lost. {message}"));
+        let what = what_went(draft);
+        draft.replacing(&format!("{what}. {message}"));
     } else {
         draft.show(Reason::Preparing, message);
     }
@@ -255,8 +266,12 @@ fn without_pod(draft: &mut PlanBuilder<'_>, job: &JobView) {
             show_wait(draft, reason, &message);
         }
     } else if had_pod {
-        draft.replacing(LOST);
-    } else if let Some(at) = job.created.map(|at| Wait::POD.shown_at(at)) {
+        draft.replacing(if suspend::was_resumed(draft) {
+            suspend::RESUMED
+        } else {
+            LOST
+        });
+    } else if let Some(at) = job.begun().map(|at| Wait::POD.shown_at(at)) {
         if draft.now() < at {
             return draft.requeue_at(at);
         }
@@ -293,7 +308,7 @@ fn refused(what: &str, words: &str) -> (Reason, String) {
 
 /// Shows nothing yet of a Job that is new.
 fn settles(draft: &mut PlanBuilder<'_>, job: &JobView) -> bool {
-    let settled = job.created.map(|at| Wait::NODE.shown_at(at));
+    let settled = job.begun().map(|at| Wait::NODE.shown_at(at));
     let Some(settled) = settled.filter(|at| draft.now() < *at) else {
         return false;
     };
@@ -331,7 +346,7 @@ fn is_late(draft: &mut PlanBuilder<'_>, job: &JobView, reason: Reason, message: 
     let since = if had_pod {
         draft.blocked_since(reason)
     } else {
-        job.created
+        job.begun()
     };
     let deadline = after(since.unwrap_or(draft.now()), limit);
     if draft.now() >= deadline {

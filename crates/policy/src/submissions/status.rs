@@ -321,7 +321,18 @@ impl<'a> PlanBuilder<'a> {
     }
 
     pub(super) fn condition(&mut self, type_: &str, truth: Truth, reason: impl Into<ReasonName>, message: &str) {
-        let now = self.time();
+        self.condition_at(self.time(), type_, truth, reason, message);
+    }
+
+    /// Sets a condition that is what it is since this time.
+    pub(super) fn condition_at(
+        &mut self,
+        since: Time,
+        type_: &str,
+        truth: Truth,
+        reason: impl Into<ReasonName>,
+        message: &str,
+    ) {
         let generation = self.status.observed_generation;
         conditions::set(
             &mut self.status.conditions,
@@ -330,7 +341,7 @@ impl<'a> PlanBuilder<'a> {
             reason,
             message,
             generation,
-            &now,
+            &since,
         );
     }
 

@@ -40,6 +40,8 @@ impl Wait {
     pub(super) const RETRY: Self = row(NONE, 10, 10 << 8);
     /// A Job's Pod.
     pub(super) const POD: Self = row(45, NONE, NONE);
+    /// The resume of a suspended Job: a queue with a free quota admits it at once. After `longest` without a queue a person has to look.
+    pub(super) const SUSPENDED: Self = row(5, NONE, 15 * 60);
     /// A Pod's node, or a quota: the Pod whose slot it got may still be leaving. After `longest` without an autoscaler that adds a node a
     /// person has to look.
     pub(super) const NODE: Self = row(5, NONE, 15 * 60);

@@ -165,6 +165,8 @@ impl World {
             name: job_name("sub", &self.status()),
             uid: "job-uid".into(),
             created: Some(self.view.now),
+            started: None,
+            suspension: None,
             end: None,
             deleting: false,
             failed_create: None,

@@ -34,6 +34,7 @@ mod rules;
 mod run;
 mod start;
 mod stop;
+mod suspend;
 mod usage;
 mod waits;
 mod words;

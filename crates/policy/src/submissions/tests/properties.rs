@@ -11,7 +11,7 @@ use super::builders::*;
 use crate::submissions::job_name;
 use crate::view::{
     EvalaiEnd, EvalaiView, JobEnd, JobView, ObservedFence, ObservedJob, ObservedLog, ObservedNode, ObservedReport,
-    PodView, Stage, Standing, Turn,
+    PodView, Stage, Standing, Suspension, Turn,
 };
 use leaderboard_api::evalai_status::Status;
 use leaderboard_contract::report::Report;
@@ -55,6 +55,7 @@ enum JobCase {
         end: Option<JobEnd>,
         deleting: bool,
         refused: bool,
+        suspended: bool,
     },
     Earlier,
 }
@@ -73,13 +74,15 @@ fn job() -> impl Strategy<Value = JobCase> {
         Some(words("BackoffLimitExceeded")),
         Some(words("DeadlineExceeded")),
     ];
-    let present = (select(ends), any::<bool>(), any::<bool>());
+    let present = (select(ends), any::<bool>(), any::<bool>(), prop::bool::weighted(0.2));
     prop_oneof![
         2 => Just(JobCase::Absent),
         1 => Just(JobCase::Created),
         1 => Just(JobCase::Foreign),
         1 => Just(JobCase::Earlier),
-        8 => present.prop_map(|(end, deleting, refused)| JobCase::Present { end, deleting: deleting && refused, refused }),
+        8 => present.prop_map(|(end, deleting, refused, suspended)| {
+            JobCase::Present { end, deleting: deleting && refused, refused, suspended }
+        }),
     ]
 }
 
@@ -330,11 +333,16 @@ fn set_job(world: &mut World, case: JobCase) {
         JobCase::Earlier => "sub-1-r9".to_owned(),
         _ => job_name("sub", &world.status()),
     };
-    let ours = |end, deleting, refused: bool| {
+    let ours = |end, deleting, refused: bool, suspended: bool| {
         ObservedJob::Ours(JobView {
             name: name.clone(),
             uid: "job-uid".into(),
             created: Some(at(0)),
+            started: (!suspended).then(|| at(5)),
+            suspension: suspended.then(|| Suspension {
+                since: Some(at(20)),
+                queue: refused.then(|| "gpus".into()),
+            }),
             end,
             deleting,
             failed_create: refused.then(|| "exceeded quota".into()),
@@ -344,8 +352,13 @@ fn set_job(world: &mut World, case: JobCase) {
         JobCase::Absent => ObservedJob::Absent { refused: None },
         JobCase::Created => ObservedJob::Created,
         JobCase::Foreign => ObservedJob::Foreign,
-        JobCase::Earlier => ours(None, false, false),
-        JobCase::Present { end, deleting, refused } => ours(end, deleting, refused),
+        JobCase::Earlier => ours(None, false, false, false),
+        JobCase::Present {
+            end,
+            deleting,
+            refused,
+            suspended,
+        } => ours(end, deleting, refused, suspended),
     };
 }
 
