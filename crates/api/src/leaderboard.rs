@@ -134,7 +134,7 @@ pub struct LeaderboardSpec {
     #[serde(default, skip_serializing_if = "Option::is_none")]
     #[schemars(schema_with = "super::leaderboard_parts::raw_object")]
     pub pod_overrides: Option<serde_json::Value>,
-    /// Labels added to the Jobs of submissions, for example `kueue.x-k8s.io/queue-name`; those of the Pods are in podOverrides.metadata.labels.
+    /// Labels added to the Jobs of submissions, for example `kueue.x-k8s.io/queue-name`. Those of Pods are in podOverrides.metadata.labels.
     #[serde(default, skip_serializing_if = "BTreeMap::is_empty")]
     #[schemars(schema_with = "super::leaderboard_parts::label_map")]
     pub job_labels: BTreeMap<String, String>,

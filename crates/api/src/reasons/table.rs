@@ -46,11 +46,10 @@ reasons! {
              the message names the step.",
             "Nothing. If it lasts, check the node that the message names.";
         Suspended,
-            "The Job is suspended (`spec.suspend: true`), by Kueue or another admission, or by a person. A suspended Job has no Pod, so a \
-             submission that has not started is Pending. One that ran keeps its state, and no deadline runs meanwhile. Once the Job is \
-             resumed, a new Pod continues from the stored results, and no retry is used.",
-            "With Kueue, ask its Workload why it waits: `kubectl describe workloads`. Without Kueue, `kubectl get job --show-managed-fields` names \
-             who has set `spec.suspend`; set it to `false` to go on.";
+            "The Job is suspended (`spec.suspend`), by Kueue or by a person, and has no Pod. No deadline runs. After its resume a new Pod \
+             continues from the stored results, and no retry is used.",
+            "With Kueue look at its Workload: `kubectl describe workloads`. Else `kubectl get job NAME -o yaml --show-managed-fields` names who \
+             has suspended it.";
         Unschedulable,
             "No node has accepted the Pod for 5 s or longer. The message is the scheduler's, with what cluster-autoscaler or \
              Karpenter says of it.",

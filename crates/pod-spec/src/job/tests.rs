@@ -281,6 +281,6 @@ fn labels_of_the_host_are_on_the_job_alone_and_ours_stay() {
     assert_eq!(of(&job)["kueue.x-k8s.io/queue-name"], "gpus");
     assert_eq!(of(&job)["leaderboard.carla.org/run"], "4711");
     assert_eq!(of(&job["spec"]["template"])["kueue.x-k8s.io/queue-name"], Value::Null);
-    // Whoever suspends and resumes it is the only writer of that field.
+    // Its one writer is the program that suspends and resumes the Job.
     assert_eq!(job["spec"]["suspend"], Value::Null);
 }

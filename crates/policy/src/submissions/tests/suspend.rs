@@ -19,7 +19,7 @@ fn suspended(since: i64, queue: Option<&str>) -> Option<Suspension> {
     })
 }
 
-/// A run that may take `LIMIT` seconds and is retried after no failure. Its Job is suspended at second 90, and its Pod is ending.
+/// A run that may take `LIMIT` seconds and is retried after no failure. The Job is suspended at second 90, and the Pod is ending.
 fn suspended_in_mid_run() -> World {
     let mut world = World::evalai().running();
     world.leaderboard().deadlines.run_seconds = Some(LIMIT);
@@ -113,7 +113,7 @@ fn a_pod_is_missed_only_so_long_after_the_resume() {
 #[test]
 fn a_suspension_in_mid_run_takes_no_time_and_no_retry() {
     let mut world = suspended_in_mid_run();
-    // Its Pod has its grace, and longer.
+    // The Pod has its grace, and longer.
     for second in [100, 820, 10_000] {
         world.go_to(second);
         let plan = world.pass_to(Running, Reason::Suspended);
