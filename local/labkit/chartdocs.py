@@ -18,9 +18,16 @@ END = "<!-- end of the values -->"
 KEY = re.compile(r"^(?P<indent> *)(?P<name>[A-Za-z][A-Za-z0-9]*):(?: (?P<default>.+))?$")
 # A value without a comment is explained where it stands first.
 EXPLAINED_BY = {"bridge": "controller", "serviceMonitor": "podMonitor"}
+EXPLAINED_BY_BOTH = ("controller", "bridge")
 # Names that explain themselves, and groups that Kubernetes explains.
 PLAIN = {"enabled": "Whether it is made.", "labels": "Its labels.", "annotations": "Its annotations."}
-AS_IN = {"podSecurityContext": "a Pod", "securityContext": "a container", "resources": "a container"}
+AS_IN = {
+    "podSecurityContext": "a Pod",
+    "securityContext": "a container",
+    "resources": "a container",
+    "livenessProbe": "a container",
+    "readinessProbe": "a container",
+}
 
 
 @dataclass(frozen=True)
@@ -116,8 +123,9 @@ def same_schema(chart: Path) -> str:
     schema = json.loads((chart / "values.schema.json").read_text())
     documented = {value.path for value in values((chart / "values.yaml").read_text())}
     known = set(properties(schema, schema))
-    # Helm itself adds it to the values of a subchart.
-    unexplained = sorted(path for path in known - documented - {"global"} if ".resources." not in path)
+    # `controller` and `bridge` may have what both have.
+    shared = {f"{program}.{path}" for program in EXPLAINED_BY_BOTH for path in documented}
+    unexplained = sorted(path for path in known - documented - shared if ".resources." not in path)
     refused = sorted(path for path in documented - known if not below_open(path, known))
     if unexplained or refused:
         raise LabError(

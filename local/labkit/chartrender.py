@@ -12,7 +12,7 @@ from pathlib import Path
 from typing import Any
 
 from . import chartdocs, chartmetrics, chartshows
-from .chartcases import NOTES, RELEASE, SYSTEM
+from .chartcases import IMAGE, RELEASE, SET_IMAGE, SYSTEM
 from .chartshown import ABSENT, MONITORING, Case, Shown
 from .errors import LabError
 from .kube import Kube
@@ -30,7 +30,8 @@ def folder(repository: Path) -> Path:
 def template(kube: Kube, chart: Path, values: Mapping[str, Any], kinds: Sequence[str] = ()) -> str:
     """The objects of some values, as YAML. `kinds` are those that the cluster is to have, as group/version/kind."""
     argv = ["template", RELEASE, str(chart), f"--namespace={SYSTEM}", "--values=-"]
-    return kube.run("helm", *argv, *(f"--api-versions={kind}" for kind in kinds), given=json.dumps(nested(values)))
+    argv += (f"--api-versions={kind}" for kind in kinds)
+    return kube.run("helm", *argv, given=json.dumps(nested({**IMAGE, **values})))
 
 
 def nested(values: Mapping[str, Any]) -> dict[str, Any]:
@@ -41,21 +42,26 @@ def nested(values: Mapping[str, Any]) -> dict[str, Any]:
         place = result
         for group in groups:
             place = place.setdefault(group, {})
-        place[name] = value
+        place[name] = {**place.get(name, {}), **value} if isinstance(value, dict) else value
     return result
 
 
 def objects(kube: Kube, manifests: str) -> dict[str, dict[str, Any]]:
-    """The objects of a YAML text by kind/name. An empty patch that kubectl makes here gives them back as JSON."""
+    """The objects of a YAML text by kind/namespace/name, and by kind/name, which is the first of that name.
+
+    An empty patch that kubectl makes here gives them back as JSON.
+    """
     text = kube.run(
         "kubectl", "patch", "--local", "--filename=-", "--type=merge", "--patch={}", "--output=json", given=manifests
     )
     found: dict[str, dict[str, Any]] = {}
     for item in documents(text):
-        name = f"{item['kind']}/{item['metadata']['name']}"
+        kind, metadata = item["kind"], item["metadata"]
+        name = f"{kind}/{metadata.get('namespace', '')}/{metadata['name']}"
         if name in found:
             raise LabError(f"{name} is rendered twice")
         found[name] = item
+        found.setdefault(f"{kind}/{metadata['name']}", item)
     return found
 
 
@@ -133,21 +139,9 @@ def paths(values: Mapping[str, Any], prefix: str = "") -> Iterator[str]:
             yield from paths(value, f"{prefix}{name}.")
 
 
-def notes(kube: Kube, chart: Path) -> str:
-    """What people read after an installation."""
-    for values, present, missing in NOTES:
-        argv = ["install", RELEASE, str(chart), f"--namespace={SYSTEM}", "--dry-run=client", "--values=-"]
-        text = kube.run("helm", *argv, given=json.dumps(nested(values))).partition("\nNOTES:\n")[2]
-        wrong = [f"lacks {one!r}" for one in present if one not in text]
-        wrong += [f"has {one!r}" for one in missing if one in text]
-        if wrong:
-            raise LabError(f"with {json.dumps(values)} NOTES.txt {', '.join(wrong)}: {text}")
-    return f"{len(NOTES)} cases"
-
-
 def queries(kube: Kube, chart: Path, repository: Path) -> str:
     """Every metric, label and value that an alert or the dashboard asks for must be one that the operator exports."""
-    values = {"prometheusRule.enabled": True, "dashboard.enabled": True}
+    values = {"prometheusRule.enabled": True, "grafanaDashboard.enabled": True}
     kinds = [f"{MONITORING}/{kind}" for kind in MONITORING_KINDS]
     rendered = objects(kube, template(kube, chart, values, kinds))
     rules = rendered[f"PrometheusRule/{RELEASE}"]["spec"]
@@ -200,7 +194,7 @@ def one_file(kube: Kube, chart: Path, more: Sequence[str] = ()) -> str:
 def applied(kube: Kube, chart: Path) -> str:
     """The one file goes in, and out again."""
     with tempfile.NamedTemporaryFile("w", suffix=".yaml", prefix="leaderboard-") as file:
-        file.write(one_file(kube, chart, ['--set-json=leaderboards=[{"namespace":"other","secrets":["evalai"]}]']))
+        file.write(one_file(kube, chart, [SET_IMAGE, '--set-json=namespaces=[{"name":"other","secrets":["evalai"]}]']))
         file.flush()
         argv = [f"--filename={file.name}", "--output=name"]
         made = kube.run("kubectl", "apply", "--server-side", "--validate=strict", *argv).splitlines()

@@ -15,6 +15,14 @@ CRD = "CustomResourceDefinition/submissions.leaderboard.carla.org"
 ROLE = "arn:aws:iam::123456789012:role/one"
 POD = "spec.template.spec"
 CONTAINER = f"{POD}.containers.0"
+# The chart's own requirement of nodes.
+ARCHITECTURES = {
+    "requiredDuringSchedulingIgnoredDuringExecution": {
+        "nodeSelectorTerms": [
+            {"matchExpressions": [{"key": "kubernetes.io/arch", "operator": "In", "values": ["amd64"]}]}
+        ]
+    }
+}
 
 
 @dataclass(frozen=True)
@@ -53,11 +61,3 @@ def env(name: str, value: str) -> dict[str, str]:
 
 def key_of_secret(name: str, **more: bool) -> dict[str, Any]:
     return {"name": name, "valueFrom": {"secretKeyRef": {"name": "aws", "key": name, **more}}}
-
-
-def both(value: str, given: Any, path: str, holds: Any) -> list[Case]:
-    """A value of the Pods of both programs."""
-    return [
-        case({f"controller.{value}": given}, (CONTROLLER, path, holds), (BRIDGE, path, ABSENT)),
-        case({f"bridge.{value}": given}, (BRIDGE, path, holds), (CONTROLLER, path, ABSENT)),
-    ]

@@ -3,6 +3,7 @@
 Every value of values.yaml has a case here, and every template renders an object in one: `chartrender` refuses a gap.
 """
 
+from . import chartpods
 from .chartcases import RELEASE, SYSTEM
 from .chartshown import (
     ABSENT,
@@ -12,128 +13,14 @@ from .chartshown import (
     CRD,
     HOOK,
     POD,
-    ROLE,
     TEST,
     TESTED,
     Case,
-    both,
     case,
     env,
     key_of_secret,
     selector,
 )
-
-
-def of_program(component: str, deployment: str) -> list[Case]:
-    """Values that both programs have, with defaults in the rendering without them."""
-    return [*replicas(component, deployment), *placement(component, deployment), *own_objects(component, deployment)]
-
-
-def replicas(component: str, deployment: str) -> list[Case]:
-    budget = f"PodDisruptionBudget/{RELEASE}-{component}"
-    return [
-        case(
-            {f"{component}.replicas": 3},
-            (deployment, "spec.replicas", 3),
-            (deployment, "spec.strategy.rollingUpdate", {"maxSurge": 1, "maxUnavailable": 0}),
-            (budget, "spec.selector.matchLabels", selector(component)),
-        ),
-        case(
-            {f"{component}.replicas": 1},
-            (deployment, "spec.strategy.rollingUpdate", {"maxSurge": 0, "maxUnavailable": 1}),
-            # It would block the drain of the node.
-            (budget, "", ABSENT),
-        ),
-        case(
-            {
-                f"{component}.replicas": 3,
-                f"{component}.podDisruptionBudget": {"enabled": True, "maxUnavailable": "50%"},
-            },
-            (budget, "spec.maxUnavailable", "50%"),
-            (budget, "spec.unhealthyPodEvictionPolicy", "AlwaysAllow"),
-        ),
-        case(
-            {f"{component}.replicas": 3, f"{component}.podDisruptionBudget.enabled": False},
-            (budget, "", ABSENT),
-        ),
-    ]
-
-
-def placement(component: str, deployment: str) -> list[Case]:
-    affinity = {"nodeAffinity": {"preferredDuringSchedulingIgnoredDuringExecution": []}}
-    spread = {"maxSkew": 1, "topologyKey": "topology.kubernetes.io/zone", "whenUnsatisfiable": "ScheduleAnyway"}
-    own = {"matchLabels": selector(component)}
-    foreign = {"matchExpressions": [{"key": "app", "operator": "Exists"}]}
-    apart = f"{POD}.affinity.podAntiAffinity.preferredDuringSchedulingIgnoredDuringExecution.0.podAffinityTerm"
-    return [
-        case(
-            {},
-            (deployment, f"{apart}.topologyKey", "kubernetes.io/hostname"),
-            (deployment, f"{apart}.labelSelector.matchLabels", selector(component)),
-        ),
-        case(
-            {f"{component}.affinity": affinity},
-            (deployment, f"{POD}.affinity", affinity),
-            (deployment, f"{POD}.affinity.podAntiAffinity", ABSENT),
-        ),
-        case(
-            {f"{component}.topologySpreadConstraints": [{**spread, "labelSelector": foreign}, spread]},
-            (deployment, f"{POD}.topologySpreadConstraints.0", {**spread, "labelSelector": foreign}),
-            (deployment, f"{POD}.topologySpreadConstraints.0.labelSelector.matchLabels", ABSENT),
-            (deployment, f"{POD}.topologySpreadConstraints.1", {**spread, "labelSelector": own}),
-            (deployment, f"{POD}.topologySpreadConstraints.1.labelSelector.matchExpressions", ABSENT),
-        ),
-    ]
-
-
-def own_objects(component: str, deployment: str) -> list[Case]:
-    """Its account, what it may use, and what its Pods are marked with."""
-    name = f"{RELEASE}-{component}"
-    return [
-        case(
-            {
-                f"{component}.roleARN": ROLE,
-                f"{component}.serviceAccount": {"name": "own", "annotations": {"team": "one"}},
-            },
-            ("ServiceAccount/own", "metadata.annotations", {"eks.amazonaws.com/role-arn": ROLE, "team": "one"}),
-            (deployment, f"{POD}.serviceAccountName", "own"),
-            (f"RoleBinding/{name}", "subjects.0.name", "own"),
-        ),
-        case(
-            {f"{component}.resources": {"requests": {"cpu": "1"}, "limits": {"memory": "1Gi"}}},
-            (deployment, f"{CONTAINER}.resources", {"requests": {"cpu": "1"}, "limits": {"memory": "1Gi"}}),
-        ),
-        case(
-            {f"{component}.podAnnotations": {"team": "one"}},
-            (deployment, "spec.template.metadata.annotations", {"team": "one"}),
-            (deployment, "metadata.annotations", ABSENT),
-        ),
-        case(
-            {f"{component}.podLabels": {"team": "one"}},
-            (deployment, "spec.template.metadata.labels", {"team": "one", **selector(component)}),
-            (deployment, "metadata.labels.team", ABSENT),
-            (deployment, "spec.selector.matchLabels.team", ABSENT),
-        ),
-    ]
-
-
-POD_VALUES = [
-    *both("nodeSelector", {"pool": "system"}, f"{POD}.nodeSelector", {"pool": "system"}),
-    *both("tolerations", [{"operator": "Exists"}], f"{POD}.tolerations", [{"operator": "Exists"}]),
-    *both("priorityClassName", "system-cluster-critical", f"{POD}.priorityClassName", "system-cluster-critical"),
-    *both(
-        "extraVolumes",
-        [{"name": "ca", "configMap": {"name": "ca"}}],
-        f"{POD}.volumes",
-        [{"name": "ca", "configMap": {"name": "ca"}}],
-    ),
-    *both(
-        "extraVolumeMounts",
-        [{"name": "ca", "mountPath": "/etc/ca"}],
-        f"{CONTAINER}.volumeMounts",
-        [{"name": "ca", "mountPath": "/etc/ca"}],
-    ),
-]
 
 NAMES = [
     case(
@@ -167,7 +54,7 @@ NAMES = [
         (CRD, "metadata.labels", ABSENT),
     ),
     case(
-        {"commonAnnotations": {"team": "one"}, "leaderboards": [{"namespace": "a", "secrets": ["b"]}]},
+        {"commonAnnotations": {"team": "one"}, "namespaces": [{"name": "a", "secrets": ["b"]}]},
         (CONTROLLER, "metadata.annotations", {"team": "one"}),
         (CONTROLLER, "spec.template.metadata.annotations.team", ABSENT),
         (f"Role/{RELEASE}-secrets", "metadata.annotations", {"team": "one"}),
@@ -195,50 +82,65 @@ IMAGE = [
     ),
     case(
         {"image.digest": f"sha256:{'0' * 64}", "image.tag": "v1"},
-        (CONTROLLER, f"{CONTAINER}.image", f"leaderboard-operator:v1@sha256:{'0' * 64}"),
+        (CONTROLLER, f"{CONTAINER}.image", f"registry.example/leaderboard-operator:v1@sha256:{'0' * 64}"),
     ),
-    case({"imagePullSecrets": [{"name": "one"}]}, (BRIDGE, f"{POD}.imagePullSecrets", [{"name": "one"}])),
-    # The user is the platform's to choose.
+    # A mirror has the images of several charts; a registry of the chart's own goes before it.
     case(
-        {"podSecurityContext": {"runAsUser": None, "runAsGroup": None, "fsGroup": None}},
-        (CONTROLLER, f"{POD}.securityContext", {"runAsNonRoot": True, "seccompProfile": {"type": "RuntimeDefault"}}),
-        (CONTROLLER, f"{POD}.securityContext.runAsUser", ABSENT),
-    ),
-    case(
-        {"podSecurityContext": {"runAsNonRoot": True, "seccompProfile": {"type": "Unconfined"}}},
-        (BRIDGE, f"{POD}.securityContext", {"runAsUser": 60973, "seccompProfile": {"type": "Unconfined"}}),
+        {
+            "image": {"repository": "boards/operator", "tag": "1"},
+            "global": {"imageRegistry": "mirror.example", "other": 1},
+        },
+        (CONTROLLER, f"{CONTAINER}.image", "mirror.example/boards/operator:1"),
+        (TEST, f"{TESTED}.image", "mirror.example/boards/operator:1"),
     ),
     case(
         {
-            "securityContext": {
-                "allowPrivilegeEscalation": False,
-                "readOnlyRootFilesystem": False,
-                "capabilities": {"drop": ["NET_RAW"]},
-            }
+            "image": {"registry": "own.example", "repository": "operator", "tag": "1"},
+            "global.imageRegistry": "mirror.example",
         },
-        (
-            BRIDGE,
-            f"{CONTAINER}.securityContext",
-            {"readOnlyRootFilesystem": False, "capabilities": {"drop": ["NET_RAW"]}},
-        ),
+        (BRIDGE, f"{CONTAINER}.image", "own.example/operator:1"),
+        (CONTROLLER, f"{CONTAINER}.env", [env("LEADERBOARD_IMAGE", "own.example/operator:1")]),
+    ),
+    case(
+        {"global.imagePullSecrets": [{"name": "all"}], "imagePullSecrets": [{"name": "one"}, {"name": "all"}]},
+        (BRIDGE, f"{POD}.imagePullSecrets.0", {"name": "all"}),
+        (BRIDGE, f"{POD}.imagePullSecrets.1", {"name": "one"}),
+        (BRIDGE, f"{POD}.imagePullSecrets.2", ABSENT),
+        (TEST, "spec.imagePullSecrets.1", {"name": "one"}),
     ),
 ]
 
+LOGIN = {"name": "login", "image": "registry.example/oauth2-proxy:1"}
+# Every role and binding of an installation with the page.
+GRANTS = (
+    *((kind, name) for name in ("controller", "bridge", "lease", "secrets") for kind in ("Role", "RoleBinding")),
+    *(("Role", "page"), ("ClusterRole", "cluster"), ("ClusterRoleBinding", "cluster")),
+    *(("ClusterRole", name) for name in ("view", "edit", "host")),
+)
+ALLOWED = (
+    '{"buckets":["results/boards/*"],"logGroups":["logs"],"queues":["submissions*"],'
+    '"secretsManager":["evalai/*"],"tables":["rows"]}'
+)
+
 PROGRAMS = [
     case(
-        {"allNamespaces": True, "leaderboards": [{"namespace": "*", "queues": ["shared-*"]}]},
+        {"allNamespaces": True, "allow.queues": ["shared-*"], "namespaces": [{"name": "a", "queues": ["own"]}]},
         (CONTROLLER, f"{CONTAINER}.env", [env("LEADERBOARD_NAMESPACES", "")]),
         (
             BRIDGE,
             f"{CONTAINER}.env",
-            [env("LEADERBOARD_ALLOWED", '{"*":{"queues":["shared-*"]}}')],
+            [env("LEADERBOARD_ALLOWED", '{"*":{"queues":["shared-*"]},"a":{"queues":["shared-*","own"]}}')],
         ),
         (f"ClusterRoleBinding/{RELEASE}-bridge", "roleRef.kind", "ClusterRole"),
         (f"Role/{RELEASE}-controller", "", ABSENT),
     ),
     case(
         {},
-        (CONTROLLER, f"{CONTAINER}.env", [env("LEADERBOARD_NAMESPACES", SYSTEM), env("LEADERBOARD_ALLOWED", "{}")]),
+        (
+            CONTROLLER,
+            f"{CONTAINER}.env",
+            [env("LEADERBOARD_NAMESPACES", SYSTEM), env("LEADERBOARD_ALLOWED", f'{{"{SYSTEM}":{{}}}}')],
+        ),
         (f"Role/{RELEASE}-controller", "metadata.namespace", SYSTEM),
         (f"ClusterRole/{RELEASE}-controller", "", ABSENT),
     ),
@@ -249,39 +151,47 @@ PROGRAMS = [
         (f"ClusterRoleBinding/{RELEASE}-cluster", "", ABSENT),
         (CONTROLLER, f"{CONTAINER}.env", [env("LEADERBOARD_CLUSTER_RIGHTS", "false")]),
     ),
+    # A list of names, and what all of them may name.
     case(
         {
-            "leaderboards": [
-                {
-                    "namespace": "boards",
-                    "secrets": ["evalai"],
-                    "secretsManager": ["evalai/*"],
-                    "queues": ["submissions*"],
-                    "buckets": ["results/boards/*"],
-                    "tables": ["rows"],
-                    "logGroups": ["logs"],
-                }
-            ]
+            "namespaces": ["boards", "arena"],
+            "allow": {
+                "secrets": ["evalai"],
+                "secretsManager": ["evalai/*"],
+                "queues": ["submissions*"],
+                "buckets": ["results/boards/*"],
+                "tables": ["rows"],
+                "logGroups": ["logs"],
+            },
         },
         (
             CONTROLLER,
             f"{CONTAINER}.env",
             [
-                env("LEADERBOARD_NAMESPACES", "boards"),
+                env("LEADERBOARD_NAMESPACES", "arena,boards"),
                 env("LEADERBOARD_CLUSTER_RIGHTS", "true"),
-                env(
-                    "LEADERBOARD_ALLOWED",
-                    '{"boards":{"buckets":["results/boards/*"],"logGroups":["logs"],"queues":["submissions*"],'
-                    '"secretsManager":["evalai/*"],"tables":["rows"]}}',
-                ),
+                env("LEADERBOARD_ALLOWED", f'{{"arena":{ALLOWED},"boards":{ALLOWED}}}'),
             ],
         ),
-        (f"Role/{RELEASE}-controller", "metadata.namespace", "boards"),
-        (f"RoleBinding/{RELEASE}-bridge", "roleRef.kind", "Role"),
-        (f"RoleBinding/{RELEASE}-bridge", "metadata.namespace", "boards"),
-        (f"Role/{RELEASE}-secrets", "metadata.namespace", "boards"),
-        (f"Role/{RELEASE}-secrets", "rules.0.resourceNames", ["evalai"]),
-        (f"RoleBinding/{RELEASE}-secrets", "subjects.0.namespace", SYSTEM),
+        (f"Role/boards/{RELEASE}-controller", "rules.0.resources", ["leaderboards"]),
+        (f"RoleBinding/arena/{RELEASE}-bridge", "roleRef.kind", "Role"),
+        (f"Role/arena/{RELEASE}-secrets", "rules.0.resourceNames", ["evalai"]),
+        (f"RoleBinding/boards/{RELEASE}-secrets", "subjects.0.namespace", SYSTEM),
+        (f"Role/{SYSTEM}/{RELEASE}-controller", "", ABSENT),
+    ),
+    # An entry of its own adds to them, for its namespace alone.
+    case(
+        {
+            "namespaces": ["arena", {"name": "boards", "secrets": ["own"], "buckets": ["own", "shared"]}],
+            "allow": {"secrets": ["evalai"], "buckets": ["shared"]},
+        },
+        (
+            BRIDGE,
+            f"{CONTAINER}.env",
+            [env("LEADERBOARD_ALLOWED", '{"arena":{"buckets":["shared"]},"boards":{"buckets":["shared","own"]}}')],
+        ),
+        (f"Role/boards/{RELEASE}-secrets", "rules.0.resourceNames", ["evalai", "own"]),
+        (f"Role/arena/{RELEASE}-secrets", "rules.0.resourceNames.1", ABSENT),
     ),
     case(
         {"aws": {"region": "eu-central-1", "endpointURL": "http://aws.example:4566", "secretName": "aws"}},
@@ -313,23 +223,59 @@ PROGRAMS = [
         ),
     ),
     case(
-        {"controller.page.enabled": True},
+        {"webUI.enabled": True},
         (CONTROLLER, f"{CONTAINER}.env", [env("LEADERBOARD_DASHBOARD", "8081")]),
         (CONTROLLER, f"{CONTAINER}.ports.1", {"name": "page", "containerPort": 8081}),
         (BRIDGE, f"{CONTAINER}.ports.1", ABSENT),
         # It is read through the API server alone, on loopback of its Pod.
         (f"Service/{RELEASE}-controller", "spec.ports.1", ABSENT),
+        (f"Service/{RELEASE}-page", "", ABSENT),
+        (f"Ingress/{RELEASE}-page", "", ABSENT),
         (f"Role/{RELEASE}-page", "metadata.namespace", SYSTEM),
         (f"Role/{RELEASE}-page", "rules.1.resources", ["pods/portforward"]),
     ),
-    case({"controller.concurrency": 32}, (CONTROLLER, f"{CONTAINER}.env", [env("LEADERBOARD_CONCURRENCY", "32")])),
+    case({"webUI.enabled": False}, (f"Role/{RELEASE}-page", "", ABSENT), (CONTROLLER, f"{CONTAINER}.ports.1", ABSENT)),
+    # Only to a container that asks for a login.
     case(
-        {"revisionHistoryLimit": 3},
-        (CONTROLLER, "spec.revisionHistoryLimit", 3),
-        (BRIDGE, "spec.revisionHistoryLimit", 3),
+        {
+            "webUI": {
+                "enabled": True,
+                "service": {
+                    "enabled": True,
+                    "targetPort": "login",
+                    "type": "NodePort",
+                    "port": 8000,
+                    "labels": {"a": "b"},
+                    "annotations": {"c": "d"},
+                },
+                "ingress": {
+                    "enabled": True,
+                    "className": "nginx",
+                    "host": "board.example",
+                    "tlsSecretName": "board",
+                    "labels": {"e": "f"},
+                    "annotations": {"g": "h"},
+                },
+            },
+            "networkPolicy.enabled": True,
+            "controller.extraContainers": [{**LOGIN, "ports": [{"name": "login", "containerPort": 4180}]}],
+        },
+        (f"Service/{RELEASE}-page", "spec.ports", [{"name": "page", "port": 8000, "targetPort": "login"}]),
+        (f"Service/{RELEASE}-page", "spec.selector", selector("controller")),
+        (f"Service/{RELEASE}-page", "spec.type", "NodePort"),
+        (f"Service/{RELEASE}-page", "metadata", {"labels": {"a": "b"}, "annotations": {"c": "d"}}),
+        (f"Ingress/{RELEASE}-page", "metadata", {"labels": {"e": "f"}, "annotations": {"g": "h"}}),
+        (f"Ingress/{RELEASE}-page", "spec.ingressClassName", "nginx"),
+        (f"Ingress/{RELEASE}-page", "spec.tls.0", {"hosts": ["board.example"], "secretName": "board"}),
+        (f"Ingress/{RELEASE}-page", "spec.rules.0.host", "board.example"),
+        (
+            f"Ingress/{RELEASE}-page",
+            "spec.rules.0.http.paths.0",
+            {"path": "/", "backend": {"service": {"name": f"{RELEASE}-page", "port": {"name": "page"}}}},
+        ),
+        (f"NetworkPolicy/{RELEASE}", "spec.ingress.1.ports", [{"port": "login", "protocol": "TCP"}]),
     ),
-    case({"controller.extraEnv": [env("A", "1")]}, (CONTROLLER, f"{CONTAINER}.env", [env("A", "1")])),
-    case({"bridge.extraEnv": [env("A", "1")]}, (BRIDGE, f"{CONTAINER}.env", [env("A", "1")])),
+    case({"controller.concurrency": 32}, (CONTROLLER, f"{CONTAINER}.env", [env("LEADERBOARD_CONCURRENCY", "32")])),
     case(
         {"bridge.enabled": False},
         (BRIDGE, "", ABSENT),
@@ -341,9 +287,18 @@ PROGRAMS = [
         {"log": {"format": "text", "level": "debug"}},
         (CONTROLLER, f"{CONTAINER}.env", [env("LEADERBOARD_LOG_FORMAT", "text"), env("RUST_LOG", "debug")]),
     ),
-    case({"crds.install": False}, (CRD, "", ABSENT)),
+    case({"crds.enabled": False}, (CRD, "", ABSENT)),
     case({"crds.keep": True}, (CRD, "metadata.annotations", {"helm.sh/resource-policy": "keep"})),
     case({"crds.keep": False}, (CRD, "metadata.annotations", ABSENT)),
+    case(
+        {"rbac.create": False, "webUI.enabled": True, "allow.secrets": ["evalai"]},
+        *((f"{kind}/{RELEASE}-{name}", "", ABSENT) for kind, name in GRANTS),
+        (f"ServiceAccount/{RELEASE}-controller", "metadata.namespace", SYSTEM),
+    ),
+    case(
+        {"rbac.create": True, "webUI.enabled": True, "allow.secrets": ["evalai"]},
+        *((f"{kind}/{RELEASE}-{name}", "metadata.name", f"{RELEASE}-{name}") for kind, name in GRANTS),
+    ),
     case({"rbac.aggregate": False}, (f"ClusterRole/{RELEASE}-edit", "", ABSENT)),
     case(
         {"rbac.aggregate": True},
@@ -477,12 +432,34 @@ WATCHING = [
         kinds=("PrometheusRule",),
     ),
     case(
-        {"dashboard": {"enabled": True, "namespace": "grafana", "labels": {"grafana": "1"}, "annotations": {"a": "b"}}},
+        {
+            "grafanaDashboard": {
+                "enabled": True,
+                "namespace": "grafana",
+                "sidecarLabel": "boards",
+                "sidecarLabelValue": "yes",
+                "folder": "Leaderboards",
+                "folderAnnotation": "example.org/folder",
+                "labels": {"team": "one"},
+                "annotations": {"a": "b"},
+            }
+        },
         (f"ConfigMap/{RELEASE}-dashboard", "metadata.namespace", "grafana"),
-        (f"ConfigMap/{RELEASE}-dashboard", "metadata.labels", {"grafana": "1", "grafana_dashboard": "1"}),
-        (f"ConfigMap/{RELEASE}-dashboard", "metadata.annotations", {"a": "b"}),
+        (f"ConfigMap/{RELEASE}-dashboard", "metadata.labels", {"boards": "yes", "team": "one"}),
+        (f"ConfigMap/{RELEASE}-dashboard", "metadata.labels.grafana_dashboard", ABSENT),
+        (f"ConfigMap/{RELEASE}-dashboard", "metadata.annotations", {"a": "b", "example.org/folder": "Leaderboards"}),
     ),
-    case({"dashboard.enabled": True}, (f"ConfigMap/{RELEASE}-dashboard", "metadata.namespace", SYSTEM)),
+    # As kube-prometheus-stack's sidecar looks for it.
+    case(
+        {"grafanaDashboard.enabled": True},
+        (f"ConfigMap/{RELEASE}-dashboard", "metadata.namespace", SYSTEM),
+        (f"ConfigMap/{RELEASE}-dashboard", "metadata.labels", {"grafana_dashboard": "1"}),
+        (f"ConfigMap/{RELEASE}-dashboard", "metadata.annotations", ABSENT),
+    ),
+    case(
+        {"grafanaDashboard.enabled": True, "grafanaDashboard.folder": "Leaderboards"},
+        (f"ConfigMap/{RELEASE}-dashboard", "metadata.annotations", {"grafana_folder": "Leaderboards"}),
+    ),
     case(
         {
             "extraObjects": [
@@ -499,9 +476,7 @@ CASES: tuple[Case, ...] = (
     *NAMES,
     *IMAGE,
     *PROGRAMS,
-    *of_program("controller", CONTROLLER),
-    *of_program("bridge", BRIDGE),
-    *POD_VALUES,
+    *chartpods.CASES,
     *NETWORK,
     *WATCHING,
 )

@@ -19,7 +19,9 @@ from . import (
     chartalerts,
     chartcases,
     chartdocs,
+    chartnotes,
     chartrender,
+    chartsets,
     doccheck,
     docruns,
     kubeversions,
@@ -29,7 +31,7 @@ from . import (
     schemas,
     tools,
 )
-from .chartcases import RELEASE, SYSTEM, Access
+from .chartcases import RELEASE, SET_IMAGE, SYSTEM, Access
 from .chartrender import documents
 from .console import say, seconds
 from .errors import LabError
@@ -69,7 +71,8 @@ def run(settings: Settings, update: bool) -> None:
         check("helm lint --strict", lambda: lint(kube, chart))
         check("values that must be refused", lambda: refused_values(kube, chart))
         check("what each value shows in the objects", lambda: chartrender.every_value(kube, chart))
-        check("NOTES.txt", lambda: chartrender.notes(kube, chart))
+        check("what people of other charts type", lambda: chartsets.typed(kube, chart))
+        check("NOTES.txt", lambda: chartnotes.notes(kube, chart))
         check("alerts and dashboard", lambda: chartrender.queries(kube, chart, settings.repository))
         check("kubeconform -strict, with that server's schemas", lambda: conform(kube, chart, own_document(kube), jobs))
         for version in kubeversions.SUMS:
@@ -79,6 +82,7 @@ def run(settings: Settings, update: bool) -> None:
         check("one file without Helm", lambda: chartrender.applied(kube, chart))
         check("install, rights in one leaderboard's namespace", lambda: installed(kube, chart))
         check("rights of people", lambda: people(kube))
+        check("manifests of NOTES.txt", lambda: chartnotes.manifests(kube, chart))
         check("examples of Chart.yaml", lambda: examples(kube, chart))
         check("values of examples/aws", lambda: aws_values(kube, chart, settings.repository / "examples" / "aws"))
         check("manifests of demo and quickstart", lambda: manifests(kube, settings.repository / "examples"))
@@ -147,7 +151,7 @@ def values_files(chart: Path) -> list[Path | None]:
 
 
 def with_values(file: Path | None) -> list[str]:
-    return [] if file is None else [f"--values={file}"]
+    return [SET_IMAGE, *([] if file is None else [f"--values={file}"])]
 
 
 def lint(kube: Kube, chart: Path) -> str:
@@ -170,12 +174,12 @@ def aws_values(kube: Kube, chart: Path, examples: Path) -> str:
         role = account["eks.amazonaws.com/role-arn"]
         if role != f"arn:aws:iam::123456789012:role/leaderboard-{program}":
             raise LabError(f"the account of the {program} has the role {role}")
-    return f"{len(found)} objects"
+    return f"{len({id(one) for one in found.values()})} objects"
 
 
 def refused_values(kube: Kube, chart: Path) -> str:
     for settings, word in chartcases.REFUSED:
-        done = kube.attempt("helm", "template", "x", str(chart), *(f"--set-json={one}" for one in settings))
+        done = kube.attempt("helm", "template", "x", str(chart), SET_IMAGE, *(f"--set-json={one}" for one in settings))
         if done.returncode == 0:
             raise LabError(f"{' '.join(settings)} was taken")
         if word not in done.stderr:
@@ -244,11 +248,11 @@ def confined(deployment: dict[str, Any]) -> None:
 
 
 def helm(kube: Kube, chart: Path, *more: str) -> None:
-    kube.run("helm", "upgrade", "--install", RELEASE, str(chart), f"--namespace={SYSTEM}", *more)
+    kube.run("helm", "upgrade", "--install", RELEASE, str(chart), f"--namespace={SYSTEM}", SET_IMAGE, *more)
 
 
 def installed(kube: Kube, chart: Path) -> str:
-    helm(kube, chart, '--set-json=leaderboards=[{"namespace":"leaderboard","secrets":["evalai"]}]')
+    helm(kube, chart, '--set-json=namespaces=["leaderboard"]', '--set-json=allow.secrets=["evalai"]')
     return rights(kube, chartcases.DEFAULT)
 
 
@@ -371,7 +375,7 @@ def taken_over(kube: Kube, chart: Path) -> str:
     """The definitions that an uninstalled release leaves are still marked as its own."""
     helm(kube, chart)
     kube.run("helm", "uninstall", RELEASE, f"--namespace={SYSTEM}")
-    install = ("helm", "install", "other", str(chart), f"--namespace={SYSTEM}")
+    install = ("helm", "install", "other", str(chart), f"--namespace={SYSTEM}", SET_IMAGE)
     try:
         kube.run(*install)
     except LabError:

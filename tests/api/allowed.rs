@@ -56,7 +56,7 @@ async fn a_leaderboard_that_names_what_it_may_not_is_not_ready_until_it_does_not
         .leaderboard_with("lb", 1, "Hosts", &json!({"queue": {"sqs": {"url": QUEUE}}}))
         .await;
     let said = until_says(&world, Reason::NotAllowed, "").await;
-    for part in ["the queue", QUEUE, "leaderboards[]", "in queues"] {
+    for part in ["the queue", QUEUE, "allow.queues", "entry in namespaces"] {
         assert!(said.contains(part), "{said}");
     }
     let (_, name) = world.submit("lb", 1).await;

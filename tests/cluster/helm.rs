@@ -109,7 +109,7 @@ impl<'a> Quickstart<'a> {
         let (repository, tag) = image.rsplit_once(':').unwrap();
         let set = format!(
             "--set=image.repository={repository},image.tag={tag},image.digest={digest},fullnameOverride={RELEASE},\
-             leaderboards[0].namespace={}",
+             namespaces[0]={}",
             self.scene.namespace
         );
         // The definitions are in the cluster already, by another hand.

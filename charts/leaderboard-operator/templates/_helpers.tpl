@@ -48,38 +48,88 @@ annotations:
 {{- end }}
 {{- end -}}
 
-{{/* The digest decides where there is one; the tag stays for people to read. */}}
+{{/* Ends the rendering with the next step where no image is named. The digest decides where there is one; the tag stays for people to read. */}}
 {{- define "operator.image" -}}
+{{- if not .Values.image.repository -}}
+{{- fail "image.repository is empty, and no public image exists yet. Build and push one, `docker build --platform linux/amd64 -t REGISTRY/leaderboard-operator:TAG .` in the repository's root, then add --set image.repository=REGISTRY/leaderboard-operator,image.tag=TAG" -}}
+{{- end -}}
+{{- with .Values.image.registry | default .Values.global.imageRegistry -}}{{ . }}/{{- end -}}
 {{- printf "%s:%s" .Values.image.repository (.Values.image.tag | default .Chart.AppVersion) -}}
 {{- with .Values.image.digest -}}@{{ . }}{{- end -}}
 {{- end -}}
 
-{{- define "operator.account" -}}
-{{- $own := printf "%s-%s" (include "operator.fullname" .root) .component -}}
-{{- (index .root.Values .component).serviceAccount.name | default $own -}}
+{{/* What a program has of the values of Pods, as JSON: its own, and else those of both. Keys of a map are added. {root, component} */}}
+{{- define "operator.own" -}}
+{{- $own := index .root.Values .component -}}
+{{- $merged := dict -}}
+{{- range $key := list "serviceAccount" "deploymentAnnotations" "podAnnotations" "podLabels" "podSecurityContext" "securityContext" "imagePullSecrets" "nodeSelector" "tolerations" "affinity" "topologySpreadConstraints" "priorityClassName" "runtimeClassName" "schedulerName" "hostNetwork" "dnsPolicy" "dnsConfig" "hostAliases" "strategy" "livenessProbe" "readinessProbe" "podDisruptionBudget" "extraArgs" "extraEnv" "extraVolumes" "extraVolumeMounts" "extraContainers" "extraInitContainers" "revisionHistoryLimit" -}}
+{{- $value := index $.root.Values $key -}}
+{{- if and (hasKey $own $key) (kindIs "map" $value) -}}
+{{- $both := dict -}}
+{{- range $name, $one := $value }}{{ $_ := set $both $name $one }}{{ end -}}
+{{- range $name, $one := index $own $key }}{{ $_ := set $both $name $one }}{{ end -}}
+{{- $value = $both -}}
+{{- else if hasKey $own $key -}}
+{{- $value = index $own $key -}}
+{{- end -}}
+{{- $_ := set $merged $key $value -}}
+{{- end -}}
+{{- toJson $merged -}}
 {{- end -}}
 
-{{/* The namespaces that are served, by a space. */}}
+{{/* The name of a program's account. {root, component} */}}
+{{- define "operator.account" -}}
+{{- $default := printf "%s-%s" (include "operator.fullname" .root) .component -}}
+{{- (fromJson (include "operator.own" .)).serviceAccount.name | default $default -}}
+{{- end -}}
+
+{{/* The entries of `namespaces` as JSON objects with a name; without any, the release's own namespace, unless all are served. */}}
+{{- define "operator.entries" -}}
+{{- $entries := list -}}
+{{- $names := list -}}
+{{- range .Values.namespaces -}}
+{{- $entry := kindIs "string" . | ternary (dict "name" .) . -}}
+{{- if has $entry.name $names -}}
+{{- fail (printf "namespaces: %s is there twice: put what is allowed into one entry" $entry.name) -}}
+{{- end -}}
+{{- $names = append $names $entry.name -}}
+{{- $entries = append $entries $entry -}}
+{{- end -}}
+{{- if not (or $entries .Values.allNamespaces) -}}
+{{- $entries = list (dict "name" .Release.Namespace) -}}
+{{- end -}}
+{{- if and .Values.allow.secrets (not $entries) -}}
+{{- fail "allow.secrets: Secrets are read in namespaces that have a name, also with allNamespaces: list them in `namespaces`" -}}
+{{- end -}}
+{{- toJson $entries -}}
+{{- end -}}
+
+{{/* The namespaces that are named, by a space. */}}
 {{- define "operator.namespaces" -}}
 {{- $names := list -}}
-{{- range .Values.leaderboards }}{{- if ne .namespace "*" }}{{- $names = append $names .namespace -}}{{- end }}{{- end -}}
-{{- $names | default (list .Release.Namespace) | uniq | sortAlpha | join " " -}}
+{{- range fromJsonArray (include "operator.entries" .) }}{{- $names = append $names .name -}}{{- end -}}
+{{- $names | sortAlpha | join " " -}}
 {{- end -}}
 
-{{/* What Leaderboards may name, by namespace, as JSON. */}}
+{{/* What is allowed everywhere and by one entry, as JSON: {root, entry}. */}}
+{{- define "operator.both" -}}
+{{- $both := dict -}}
+{{- range $kind, $names := .root.Values.allow -}}
+{{- with concat ($names | default list) (index $.entry $kind | default list) | uniq -}}
+{{- $_ := set $both $kind . -}}
+{{- end -}}
+{{- end -}}
+{{- toJson $both -}}
+{{- end -}}
+
+{{/* What Leaderboards may name, by namespace, as JSON; * is any namespace without an entry. */}}
 {{- define "operator.allowed" -}}
 {{- $allowed := dict -}}
-{{- range .Values.leaderboards -}}
-{{- if hasKey $allowed .namespace -}}
-{{- fail (printf "leaderboards: the namespace %s is there twice: put its names into one entry" .namespace) -}}
+{{- if .Values.allNamespaces -}}
+{{- $_ := set $allowed "*" (omit (fromJson (include "operator.both" (dict "root" . "entry" dict))) "secrets") -}}
 {{- end -}}
-{{- if and (eq .namespace "*") (not $.Values.allNamespaces) -}}
-{{- fail "leaderboards: the namespace * needs allNamespaces: true; name the namespaces" -}}
-{{- end -}}
-{{- if and (eq .namespace "*") .secrets -}}
-{{- fail "leaderboards: Secrets are read in a namespace that has a name, and * is none: list the namespace" -}}
-{{- end -}}
-{{- $allowed = set $allowed .namespace (omit . "namespace" "secrets") -}}
+{{- range fromJsonArray (include "operator.entries" .) -}}
+{{- $_ := set $allowed .name (omit (fromJson (include "operator.both" (dict "root" $ "entry" .))) "secrets") -}}
 {{- end -}}
 {{- toJson $allowed -}}
 {{- end -}}
@@ -122,178 +172,6 @@ subjects:
   - kind: ServiceAccount
     name: {{ include "operator.account" . }}
     namespace: {{ .root.Release.Namespace }}
-{{- end -}}
-
-{{/* Environment that controller and bridge have in common. */}}
-{{- define "operator.env" -}}
-{{- $values := .root.Values -}}
-- name: POD_NAME
-  valueFrom: {fieldRef: {fieldPath: metadata.name}}
-- name: POD_NAMESPACE
-  valueFrom: {fieldRef: {fieldPath: metadata.namespace}}
-- name: POD_UID
-  valueFrom: {fieldRef: {fieldPath: metadata.uid}}
-- name: LEADERBOARD_NAMESPACES
-  value: {{ $values.allNamespaces | ternary "" (include "operator.namespaces" .root | replace " " ",") | quote }}
-# What Leaderboards may name, where the operator's own AWS identity is used.
-- name: LEADERBOARD_ALLOWED
-  value: {{ include "operator.allowed" .root | quote }}
-- name: LEADERBOARD_HTTP
-  value: 0.0.0.0:8080
-- name: LEADERBOARD_LOG_FORMAT
-  value: {{ $values.log.format }}
-- name: RUST_LOG
-  value: {{ $values.log.level | quote }}
-{{- with $values.aws.region }}
-- name: AWS_REGION
-  value: {{ . | quote }}
-{{- end }}
-{{- with $values.aws.endpointURL }}
-- name: AWS_ENDPOINT_URL
-  value: {{ . | quote }}
-{{- end }}
-{{- with $values.aws.secretName }}
-# The keys one by one: whatever else is in that Secret does not become a setting.
-- name: AWS_ACCESS_KEY_ID
-  valueFrom: {secretKeyRef: {name: {{ . }}, key: AWS_ACCESS_KEY_ID}}
-- name: AWS_SECRET_ACCESS_KEY
-  valueFrom: {secretKeyRef: {name: {{ . }}, key: AWS_SECRET_ACCESS_KEY}}
-- name: AWS_SESSION_TOKEN
-  valueFrom: {secretKeyRef: {name: {{ . }}, key: AWS_SESSION_TOKEN, optional: true}}
-{{- end }}
-{{- end -}}
-
-{{/* Own affinity, or: replicas prefer different nodes, so that the loss of one does not take both. {root, component} */}}
-{{- define "operator.affinity" -}}
-{{- with (index .root.Values .component).affinity }}
-{{- toYaml . }}
-{{- else -}}
-podAntiAffinity:
-  preferredDuringSchedulingIgnoredDuringExecution:
-    - weight: 100
-      podAffinityTerm:
-        topologyKey: kubernetes.io/hostname
-        labelSelector:
-          matchLabels:
-            {{- include "operator.selector" . | nindent 12 }}
-{{- end }}
-{{- end -}}
-
-{{/* The constraints as given; one without a labelSelector is about the replicas of this program. {root, component} */}}
-{{- define "operator.spread" -}}
-{{- $replicas := dict "matchLabels" (fromYaml (include "operator.selector" .)) -}}
-{{- $constraints := list -}}
-{{- range (index .root.Values .component).topologySpreadConstraints }}
-{{- $constraint := . -}}
-{{- if not (hasKey . "labelSelector") -}}
-{{- $constraint = merge (dict "labelSelector" $replicas) . -}}
-{{- end -}}
-{{- $constraints = append $constraints $constraint -}}
-{{- end }}
-{{- toYaml $constraints -}}
-{{- end -}}
-
-{{/* A Deployment of one of the two programs: {root, component, env}. */}}
-{{- define "operator.deployment" -}}
-{{- $root := .root -}}
-{{- $own := index $root.Values .component -}}
-apiVersion: apps/v1
-kind: Deployment
-metadata:
-  {{- $name := printf "%s-%s" (include "operator.fullname" $root) .component }}
-  {{- include "operator.metadata" (dict "root" $root "name" $name "namespace" $root.Release.Namespace "component" .component) | nindent 2 }}
-spec:
-  replicas: {{ $own.replicas }}
-  revisionHistoryLimit: {{ $root.Values.revisionHistoryLimit }}
-  strategy:
-    # Never Recreate: with the API server's defaults of the other type in place, no rollback could go back to it.
-    type: RollingUpdate
-    # One replica: a second one would only wait for the Lease, so the old one ends first. Several: one of them always stands by.
-    rollingUpdate: {{ gt (int $own.replicas) 1 | ternary "{maxSurge: 1, maxUnavailable: 0}" "{maxSurge: 0, maxUnavailable: 1}" }}
-  selector:
-    matchLabels:
-      {{- include "operator.selector" . | nindent 6 }}
-  template:
-    metadata:
-      labels:
-        {{- include "operator.labels" (dict "root" $root "component" .component "labels" $own.podLabels) | nindent 8 }}
-      annotations:
-        kubectl.kubernetes.io/default-container: {{ .component }}
-        {{- with $own.podAnnotations }}
-        {{- toYaml . | nindent 8 }}
-        {{- end }}
-    spec:
-      serviceAccountName: {{ include "operator.account" . }}
-      # Variables for every Service of the namespace could only be mistaken for settings.
-      enableServiceLinks: false
-      # What is in hand is finished within 20 s.
-      terminationGracePeriodSeconds: 30
-      {{- with $own.priorityClassName }}
-      priorityClassName: {{ . }}
-      {{- end }}
-      {{- with $root.Values.imagePullSecrets }}
-      imagePullSecrets:
-        {{- toYaml . | nindent 8 }}
-      {{- end }}
-      securityContext:
-        {{- toYaml $root.Values.podSecurityContext | nindent 8 }}
-      containers:
-        - name: {{ .component }}
-          image: {{ include "operator.image" $root | quote }}
-          imagePullPolicy: {{ $root.Values.image.pullPolicy }}
-          command: [leaderboard-operator, {{ .component }}]
-          env:
-            {{- include "operator.env" . | nindent 12 }}
-            {{- with .env }}
-            {{- . | trim | nindent 12 }}
-            {{- end }}
-            {{- with $own.extraEnv }}
-            {{- toYaml . | nindent 12 }}
-            {{- end }}
-          ports:
-            - name: http
-              containerPort: 8080
-            {{- if and (eq .component "controller") $own.page.enabled }}
-            # On 127.0.0.1 alone: `kubectl leaderboard dashboard` finds it by this name.
-            - name: page
-              containerPort: 8081
-            {{- end }}
-          # Liveness says that the program turns; what it waits for is readiness' to name.
-          livenessProbe:
-            httpGet: {path: /livez, port: http}
-            periodSeconds: 10
-            timeoutSeconds: 5
-            failureThreshold: 6
-          readinessProbe:
-            httpGet: {path: /readyz, port: http}
-            periodSeconds: 5
-            timeoutSeconds: 5
-          resources:
-            {{- toYaml $own.resources | nindent 12 }}
-          securityContext:
-            {{- toYaml $root.Values.securityContext | nindent 12 }}
-          {{- with $own.extraVolumeMounts }}
-          volumeMounts:
-            {{- toYaml . | nindent 12 }}
-          {{- end }}
-      {{- with $own.extraVolumes }}
-      volumes:
-        {{- toYaml . | nindent 8 }}
-      {{- end }}
-      {{- with $own.nodeSelector }}
-      nodeSelector:
-        {{- toYaml . | nindent 8 }}
-      {{- end }}
-      {{- with $own.tolerations }}
-      tolerations:
-        {{- toYaml . | nindent 8 }}
-      {{- end }}
-      affinity:
-        {{- include "operator.affinity" . | nindent 8 }}
-      {{- if $own.topologySpreadConstraints }}
-      topologySpreadConstraints:
-        {{- include "operator.spread" . | nindent 8 }}
-      {{- end }}
 {{- end -}}
 
 {{/* The programs that are installed, by a space. */}}

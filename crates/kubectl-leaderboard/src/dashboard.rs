@@ -191,7 +191,7 @@ fn replica(pods: &[Pod]) -> Result<Replica, String> {
     let mut serving: Vec<(&Pod, u16)> = pods.iter().filter_map(|pod| Some((pod, page_port(pod)?))).collect();
     if serving.is_empty() {
         return Err(
-            "the operator serves no page. Its host turns it on with the chart's value controller.page.enabled"
+            "the operator serves no page. Its host turns it on with the chart's value webUI.enabled"
                 .to_owned(),
         );
     }
@@ -272,7 +272,7 @@ mod tests {
             (vec![], "--operator-namespace"),
             (
                 vec![pod("a", "True", Some("http")), pod("b", "True", None)],
-                "controller.page.enabled",
+                "webUI.enabled",
             ),
             (vec![pod("a", "False", Some("page"))], "kubectl describe pod"),
         ] {

@@ -2,7 +2,7 @@
 //! and log groups. Pure.
 //!
 //! Who may edit Leaderboards in one namespace could otherwise have any entry sent to a server of their own, any queue emptied, and the
-//! results and rows of another namespace read and replaced. The chart hands in what `leaderboards[]` of its values has; without it, as on a
+//! results and rows of another namespace read and replaced. The chart hands in what `allow` and `namespaces[]` of its values have; without it, as on a
 //! person's machine, everything is allowed. Asked by the controller, which then reads no token, starts and records no run, and shows
 //! `NotAllowed`, and by the bridge, which then reads no queue.
 
@@ -70,7 +70,7 @@ impl fmt::Display for NotAllowed {
         write!(
             f,
             "Leaderboards of the namespace {namespace} may not name the {what} {name}: the operator's administrator allows it in the \
-             chart's values, under leaderboards[] of this namespace in {list}."
+             chart's values, in allow.{list} or in {list} of this namespace's entry in namespaces."
         )
     }
 }

@@ -46,7 +46,7 @@ async fn dashboard_prints_what_is_missing_before_a_browser_is_sent_anywhere() {
 
     replica(&terminal, "without", "http").await;
     let text = terminal.run(&["dashboard"]).await.refused();
-    assert_has(&text, &["serves no page", "controller.page.enabled"]);
+    assert_has(&text, &["serves no page", "webUI.enabled"]);
 
     replica(&terminal, "with", "page").await;
     let mut command = terminal.command(&["dashboard", "--operator-namespace", &terminal.namespace]);

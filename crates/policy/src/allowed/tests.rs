@@ -198,7 +198,7 @@ fn a_refusal_names_what_is_refused_and_the_next_step() {
     assert_eq!(
         refused.to_string(),
         "Leaderboards of the namespace ours may not name the entry of Secrets Manager payroll: the operator's administrator allows it \
-         in the chart's values, under leaderboards[] of this namespace in secretsManager."
+         in the chart's values, in allow.secretsManager or in secretsManager of this namespace's entry in namespaces."
     );
 }
 
