@@ -191,8 +191,7 @@ fn replica(pods: &[Pod]) -> Result<Replica, String> {
     let mut serving: Vec<(&Pod, u16)> = pods.iter().filter_map(|pod| Some((pod, page_port(pod)?))).collect();
     if serving.is_empty() {
         return Err(
-            "the operator serves no page. Its host turns it on with the chart's value webUI.enabled"
-                .to_owned(),
+            "the operator serves no page. Its host turns it on with the chart's value webUI.enabled".to_owned(),
         );
     }
     serving.retain(|(pod, _)| is_ready(pod));
