@@ -30,7 +30,8 @@ async fn why_shows_state_cause_and_next_step() {
             "crashed",
             failed("Participant", "AgentCrashed"),
             &[
-                "AgentCrashed in worker 2",
+                "Reason:      AgentCrashed: It has ended.",
+                "participant failure in worker 2",
                 "aws s3 cp s3://results/42/evalai/environment_log.txt -",
                 "agent/agent2/leaderboard.log",
             ],
@@ -39,14 +40,14 @@ async fn why_shows_state_cause_and_next_step() {
             "lost",
             failed("Infrastructure", "NodeLost"),
             &[
-                "NodeLost in worker 2",
+                "infrastructure failure in worker 2",
                 &format!("kubectl leaderboard resume lost -n {}", terminal.namespace),
             ],
         ),
         (
             "done",
             finished(),
-            &["20/20 routes done", "s3://results/42", "EvalAI:      Published"],
+            &["20/20 routes done", "s3://results/42", "Delivered:   EvalAI."],
         ),
     ] {
         terminal.submission(name, &json!({}), &status).await;
@@ -101,7 +102,7 @@ async fn cancel_is_requested_once_and_not_after_the_end() {
     terminal.leaderboard(&json!({"deadlines": {"cancelSeconds": 77}})).await;
     terminal.submission("runs", &json!({}), &running()).await;
     let words = terminal.run(&["cancel", "runs"]).await.well();
-    assert_has(&words, &["Cancelling runs.", "77 s"]);
+    assert_has(&words, &["Cancelling runs.", "77s"]);
     assert_eq!(terminal.requested("runs").await, (1, true));
     let words = terminal.run(&["cancel", "runs"]).await.well();
     assert_has(&words, &["already"]);
@@ -172,14 +173,14 @@ async fn a_wait_for_a_cancel_prints_the_states_until_the_end() {
     let terminal = Terminal::new().await;
     terminal.submission("runs", &json!({}), &running()).await;
     let mut waits = terminal.waits(&["cancel", "runs", "--wait"]);
-    waits.until("runs is Running (Running): 12/20 routes done.").await;
+    waits.until("runs is Running: 12/20 routes done.").await;
     let stopping = json!({"reason": "Stopping", "message": "Stopping as requested."});
     terminal.status(Kind::Submission, "runs", &stopping).await;
     waits.until("runs is Running (Stopping): Stopping as requested.").await;
     terminal
         .status(Kind::Submission, "runs", &end("Cancelled", "Cancelled"))
         .await;
-    waits.until("runs is Cancelled (Cancelled): It has ended.").await;
+    waits.until("runs is Cancelled: It has ended.").await;
     assert_eq!(waits.code().await, Some(0));
 }
 
@@ -201,6 +202,33 @@ async fn a_wait_for_a_resume_ends_with_whether_it_finished() {
         terminal.status(Kind::Submission, name, &last).await;
         assert_eq!(waits.code().await, Some(code), "{name}");
     }
+}
+
+#[tokio::test]
+async fn pause_and_unpause_change_the_leaderboard_and_name_what_goes_on() {
+    let terminal = Terminal::new().await;
+    terminal.leaderboard(&json!({})).await;
+    let counts = json!({"counts": {"pending": 2, "running": 1, "finished": 0, "failed": 0, "cancelled": 0}});
+    terminal.status(Kind::Leaderboard, "local", &counts).await;
+    for (command, is_paused, parts) in [
+        (
+            "pause",
+            true,
+            &[
+                "is paused: nothing new starts",
+                "Running:     1, on",
+                "resume --all --restart",
+            ][..],
+        ),
+        ("pause", true, &["was paused already"]),
+        ("unpause", false, &["goes on", "Waiting:     2"]),
+    ] {
+        assert_has(&terminal.run(&[command, "local"]).await.well(), parts);
+        let stored = terminal.api(Kind::Leaderboard).get("local").await.unwrap();
+        assert_eq!(stored.data["spec"]["paused"], is_paused, "{command}");
+    }
+    let text = terminal.run(&["pause", "lokal"]).await.refused();
+    assert_has(&text, &["there is no Leaderboard lokal"]);
 }
 
 #[tokio::test]

@@ -1,10 +1,24 @@
 //! Commands about a run's objects in its bucket, for people to copy: the plugin itself reads no bucket.
 
+use std::path::Path;
+
 use leaderboard_api::S3Bucket;
 
 /// Prints one object.
 pub fn print(object: &str, storage: Option<&S3Bucket>) -> String {
     format!("aws s3 cp {} -{}", word(object), flags(storage))
+}
+
+/// Lists what a run has stored, or copies it into a folder.
+pub fn folder(results: &str, folder: Option<&Path>, storage: Option<&S3Bucket>) -> String {
+    let (from, flags) = (word(&format!("{results}/")), flags(storage));
+    match folder {
+        Some(folder) => format!(
+            "aws s3 cp --recursive {from} {}{flags}",
+            word(&folder.display().to_string())
+        ),
+        None => format!("aws s3 ls --recursive {from}{flags}"),
+    }
 }
 
 /// A word of a command that people copy: an imported address is a text of a table's row, and no shell may run any part of it.

@@ -20,9 +20,18 @@ const TRIES: usize = 4;
 /// `resume`.
 pub async fn resume(cluster: &Cluster, wanted: &resume::Resume) -> Result<ExitCode, Error> {
     if !wanted.names.is_empty() {
+        if !wanted.filter.is_empty() {
+            let text =
+                "--leaderboard, --track and --team choose among all. Use them with --all or -l, and without names";
+            return Err(Error::Unfit(text.to_owned()));
+        }
         return resume_named(cluster, wanted).await;
     }
-    let scope = of_labels(wanted.selector.as_ref());
+    let scope = Scope {
+        selector: wanted.selector.clone(),
+        filter: wanted.filter.clone(),
+        ..Scope::default()
+    };
     let submissions = cluster.submissions(&scope).await?;
     if submissions.is_empty() {
         print(&nothing(cluster, &scope).await);
@@ -62,13 +71,6 @@ fn code(is_fulfilled: bool) -> ExitCode {
         ExitCode::SUCCESS
     } else {
         ExitCode::FAILURE
-    }
-}
-
-fn of_labels(selector: Option<&String>) -> Scope {
-    Scope {
-        selector: selector.cloned(),
-        ..Scope::default()
     }
 }
 
@@ -135,7 +137,7 @@ async fn send(cluster: &Cluster, request: Request, name: &str) -> Result<Attempt
         let leaderboard = cluster.leaderboard(&submission.spec.leaderboard_name).await?;
         let plan = change::plan(request, &submission, leaderboard.observed(), frame()).map_err(Error::Unfit)?;
         if let Some(patch) = &plan.patch {
-            match cluster.patch(name, patch).await? {
+            match cluster.patch::<Submission>(name, patch).await? {
                 Ok(_) => {}
                 Err(kube::Error::Api(status)) if status.is_conflict() => continue,
                 Err(error) => return Err(refusal(request, &submission, error)),

@@ -8,6 +8,7 @@ use std::path::PathBuf;
 use std::time::Duration;
 
 use clap::Args;
+use clap::builder::PossibleValuesParser;
 use futures::{Stream, StreamExt, TryFutureExt, TryStreamExt};
 use k8s_openapi::api::core::v1::Pod;
 use k8s_openapi::api::events::v1::Event;
@@ -21,9 +22,10 @@ use serde_json::Value;
 
 use super::board::Observed;
 use super::error::{Error, of_kubeconfig, of_log};
+use super::help::GLOBAL;
 use super::{lines, near};
 use leaderboard_api::names::LABEL_SUBMISSION;
-use leaderboard_api::{Leaderboard, Submission};
+use leaderboard_api::{Leaderboard, State, Submission, SubmissionStatus};
 
 /// Field manager of what people change.
 const MANAGER: &str = "kubectl-leaderboard";
@@ -36,13 +38,13 @@ const LIMIT: Duration = Duration::from_secs(30);
 #[derive(Args, Debug, Default)]
 pub struct Target {
     /// Kubeconfig file [default: $KUBECONFIG, else ~/.kube/config].
-    #[arg(long, global = true, value_name = "FILE")]
+    #[arg(long, global = true, value_name = "FILE", help_heading = GLOBAL)]
     kubeconfig: Option<PathBuf>,
     /// Context of the kubeconfig [default: the current one].
-    #[arg(long, global = true)]
+    #[arg(long, global = true, help_heading = GLOBAL)]
     context: Option<String>,
     /// Namespace [default: the context's].
-    #[arg(short, long, global = true)]
+    #[arg(short, long, global = true, help_heading = GLOBAL)]
     pub namespace: Option<String>,
 }
 
@@ -55,6 +57,84 @@ pub struct Scope {
     /// Only objects with these labels, such as `leaderboard.carla.org/phase=7`.
     #[arg(short = 'l', long, value_name = "LABELS")]
     pub selector: Option<String>,
+    /// Only these states, such as Pending,Failed.
+    #[arg(long, value_name = "STATES", value_delimiter = ',', ignore_case = true, value_parser = PossibleValuesParser::new(STATES), hide_possible_values = true)]
+    pub state: Vec<String>,
+    #[command(flatten)]
+    pub filter: Filter,
+}
+
+/// All states of a submission.
+const STATES: [&str; 6] = ["Pending", "Running", "Resumed", "Finished", "Failed", "Cancelled"];
+
+/// Whose submissions.
+#[derive(Args, Clone, Debug, Default)]
+pub struct Filter {
+    /// Only this Leaderboard.
+    #[arg(long, value_name = "NAME")]
+    pub leaderboard: Option<String>,
+    /// Only this track.
+    #[arg(long, value_name = "NAME")]
+    pub track: Option<String>,
+    /// Only this team, by its id or its name.
+    #[arg(long, value_name = "TEAM")]
+    pub team: Option<String>,
+}
+
+impl Filter {
+    /// Whether nothing is left out.
+    pub fn is_empty(&self) -> bool {
+        self.leaderboard.is_none() && self.track.is_none() && self.team.is_none()
+    }
+
+    fn takes(&self, one: &Submission) -> bool {
+        let is =
+            |wanted: &Option<String>, known: Option<&str>| wanted.as_deref().is_none_or(|wanted| known == Some(wanted));
+        let status = one.status.as_ref();
+        let track = status
+            .and_then(|status| status.track.as_deref())
+            .or(one.spec.track.as_deref());
+        let ids = [
+            one.spec.team.as_ref().and_then(|team| team.id.as_ref()),
+            status.and_then(|status| status.team.as_ref()?.id.as_ref()),
+        ];
+        let is_team = |wanted: &String| {
+            let has_name = one.team_name().is_some_and(|name| name.eq_ignore_ascii_case(wanted));
+            has_name || ids.contains(&Some(wanted))
+        };
+        is(&self.leaderboard, Some(&one.spec.leaderboard_name))
+            && is(&self.track, track)
+            && self.team.as_ref().is_none_or(is_team)
+    }
+}
+
+impl Scope {
+    /// Whether a submission fits; a new one is Pending.
+    fn takes(&self, one: &Submission) -> bool {
+        let state = one
+            .status
+            .as_ref()
+            .and_then(SubmissionStatus::known_state)
+            .unwrap_or(State::Pending);
+        let is_state = |wanted: &String| wanted.eq_ignore_ascii_case(state.as_str());
+        (self.state.is_empty() || self.state.iter().any(is_state)) && self.filter.takes(one)
+    }
+
+    /// What it leaves only, in words; none if it leaves all.
+    pub fn words(&self) -> Option<String> {
+        let (filter, states) = (&self.filter, self.state.join(" or "));
+        let parts = [
+            ("the labels", self.selector.as_deref()),
+            ("the state", Some(states.as_str()).filter(|states| !states.is_empty())),
+            ("the Leaderboard", filter.leaderboard.as_deref()),
+            ("the track", filter.track.as_deref()),
+            ("the team", filter.team.as_deref()),
+        ];
+        let parts = parts
+            .into_iter()
+            .filter_map(|(what, value)| Some(format!("{what} {}", value?)));
+        Some(parts.collect::<Vec<_>>().join(" and ")).filter(|text| !text.is_empty())
+    }
 }
 
 /// A namespace of a cluster.
@@ -107,7 +187,9 @@ impl Cluster {
 
     /// All submissions of a scope.
     pub async fn submissions(&self, scope: &Scope) -> Result<Vec<Submission>, Error> {
-        list(self, &self.api_of(scope), labels(scope.selector.as_deref())).await
+        let mut found: Vec<Submission> = list(self, &self.api_of(scope), labels(scope.selector.as_deref())).await?;
+        found.retain(|one| scope.takes(one));
+        Ok(found)
     }
 
     /// Namespaces with submissions, and how many; none if this person may not list them.
@@ -184,20 +266,28 @@ impl Cluster {
 
     /// All Leaderboards of a scope; none if this person has no right to read them.
     pub async fn leaderboards(&self, scope: &Scope) -> Result<Option<Vec<Leaderboard>>, Error> {
-        match list(self, &self.api_of(scope), ListParams::default()).await {
-            Ok(found) => Ok(Some(found)),
+        match list::<Leaderboard>(self, &self.api_of(scope), ListParams::default()).await {
+            Ok(mut found) => {
+                let wanted = scope.filter.leaderboard.as_ref();
+                found.retain(|board| wanted.is_none_or(|wanted| board.name_any() == *wanted));
+                Ok(Some(found))
+            }
             Err(Error::Forbidden(_)) => Ok(None),
             Err(error) => Err(error),
         }
     }
 
-    /// Changes a submission by a merge patch. The caller judges the API server's answer.
-    pub async fn patch(&self, name: &str, patch: &Value) -> Result<kube::Result<Submission>, Error> {
+    /// Changes an object by a merge patch. The caller judges the API server's answer.
+    pub async fn patch<K>(&self, name: &str, patch: &Value) -> Result<kube::Result<K>, Error>
+    where
+        K: kube::Resource<Scope = kube::core::NamespaceResourceScope> + Clone + DeserializeOwned + std::fmt::Debug,
+        K::DynamicType: Default,
+    {
         let params = PatchParams {
             field_manager: Some(MANAGER.to_owned()),
             ..PatchParams::default()
         };
-        let api = self.api::<Submission>();
+        let api = self.api::<K>();
         self.in_time(api.patch(name, &params, &Patch::Merge(patch))).await
     }
 

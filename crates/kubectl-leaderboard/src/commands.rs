@@ -12,7 +12,7 @@ use crate::cluster::{Cluster, Fetched, Scope};
 use crate::error::{self, Error};
 use crate::output::{self, Format, Screen, note, print};
 use crate::text::Frame;
-use crate::{Show, facts, overview, status, top, why};
+use crate::{Watched, facts, overview, status, top, why};
 use leaderboard_api::Submission;
 use leaderboard_api::client_errors::watch as watch_error;
 
@@ -69,12 +69,12 @@ pub async fn nothing(cluster: &Cluster, scope: &Scope) -> Vec<String> {
     } else {
         cluster.elsewhere().await
     };
-    overview::nothing(place(cluster, scope), scope.selector.as_deref(), &elsewhere, frame())
+    overview::nothing(place(cluster, scope), scope.words().as_deref(), &elsewhere, frame())
 }
 
 /// `status`.
-pub async fn show_status(cluster: &Cluster, show: &Show, watch: bool) -> Result<ExitCode, Error> {
-    let format = show.output.format;
+pub async fn show_status(cluster: &Cluster, show: &Watched) -> Result<ExitCode, Error> {
+    let format = show.format;
     let Some(name) = &show.name else {
         let submissions = cluster.submissions(&show.scope).await?;
         let value = Value::Array(submissions.iter().map(status::value).collect());
@@ -88,7 +88,7 @@ pub async fn show_status(cluster: &Cluster, show: &Show, watch: bool) -> Result<
         return Ok(ExitCode::SUCCESS);
     };
     let submission = cluster.submission(name).await?;
-    if watch {
+    if show.watch {
         follow(cluster, name, |one, board| screen(one, board, format)).await?;
         return Ok(ExitCode::SUCCESS);
     }

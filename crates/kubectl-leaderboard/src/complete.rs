@@ -11,8 +11,9 @@ pub const SCRIPT: &str = "\
 # kubectl runs this to complete `kubectl leaderboard`: put it on the PATH as kubectl_complete-leaderboard.
 exec kubectl-leaderboard complete -- \"$@\"
 ";
-/// cobra's directive: offer no files.
+/// cobra's directives: offer no files, or as usual.
 pub const NO_FILES: &str = ":4";
+pub const FILES: &str = ":0";
 
 /// What fits.
 #[derive(Clone, Debug, PartialEq, Eq)]
@@ -22,6 +23,8 @@ pub enum Offer {
     Submissions,
     /// Names of Leaderboards.
     Leaderboards,
+    /// Names of files, which the shell knows.
+    Files,
 }
 
 /// What fits in place of the last word, which may be empty.
@@ -52,9 +55,8 @@ pub fn offer(command: &Command, words: &[String]) -> Offer {
             fitting(verbs.map(|verb| verb.get_name().to_owned()), last)
         }
         Some(verb) if verb.get_positionals().next().is_none() => Offer::Words(Vec::new()),
-        // These name files.
-        Some(verb) if ["import", "man"].contains(&verb.get_name()) => Offer::Words(Vec::new()),
-        Some(verb) if verb.get_name() == "check" => Offer::Leaderboards,
+        Some(verb) if ["import", "lint", "man"].contains(&verb.get_name()) => Offer::Files,
+        Some(verb) if ["check", "pause", "unpause"].contains(&verb.get_name()) => Offer::Leaderboards,
         Some(_) => Offer::Submissions,
     }
 }
@@ -101,6 +103,7 @@ fn takes_value(flag: &Arg) -> bool {
 fn value_of(flag: &Arg, last: &str) -> Offer {
     match flag.get_long() {
         Some("leaderboard") => Offer::Leaderboards,
+        Some("download" | "file" | "kubeconfig") => Offer::Files,
         _ => fitting(
             flag.get_possible_values()
                 .iter()
@@ -131,7 +134,13 @@ mod tests {
             (&["check", ""], Offer::Leaderboards),
             (&["submit", "--leaderboard", ""], Offer::Leaderboards),
             (&["top", ""], words(&[])),
-            (&["import", ""], words(&[])),
+            (&["status", "--leaderboard", ""], Offer::Leaderboards),
+            (&["pause", ""], Offer::Leaderboards),
+            (&["status", "--state", "F"], words(&["Failed", "Finished"])),
+            (&["import", ""], Offer::Files),
+            (&["lint", "lead"], Offer::Files),
+            (&["get", "sub"], Offer::Submissions),
+            (&["get", "mine", "--download", ""], Offer::Files),
         ] {
             let line: Vec<String> = line.iter().map(|word| (*word).to_owned()).collect();
             assert_eq!(offer(&crate::Cli::command(), &line), expected, "{line:?}");

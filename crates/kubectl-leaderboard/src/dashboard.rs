@@ -79,8 +79,17 @@ pub async fn dashboard(cluster: &Cluster, wanted: &Dashboard) -> Result<(), Erro
     }
 }
 
+/// The controller's replicas in a namespace.
+pub async fn replicas(cluster: &Cluster, namespace: &str) -> Result<Vec<Pod>, Error> {
+    let pods: Api<Pod> = Api::namespaced(cluster.client.clone(), namespace);
+    let found = pods.list(&ListParams::default().labels(SELECTOR)).await;
+    Ok(found
+        .map_err(|error| Error::Unfit(of_rights(&error, "list pods")))?
+        .items)
+}
+
 /// Namespace of the operator that drives the Leaderboards here.
-async fn operator_namespace(cluster: &Cluster) -> Result<String, Error> {
+pub async fn operator_namespace(cluster: &Cluster) -> Result<String, Error> {
     let boards = cluster.leaderboards(&Scope::default()).await?.unwrap_or_default();
     let operators = boards
         .iter()

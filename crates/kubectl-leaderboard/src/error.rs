@@ -11,6 +11,14 @@ use kube::runtime::watcher;
 use super::text::clean;
 use leaderboard_api::client_errors as text;
 
+/// Where this version's documents are.
+pub const DOCS: &str = concat!(
+    env!("CARGO_PKG_REPOSITORY"),
+    "/blob/v",
+    env!("CARGO_PKG_VERSION"),
+    "/docs/"
+);
+
 /// Why a command could not be carried out.
 #[derive(thiserror::Error, Debug)]
 pub enum Error {
@@ -24,7 +32,7 @@ pub enum Error {
     Credentials(String),
     /// The person lacks a right.
     #[error(
-        "missing right: {0}. Check namespace and context, or ask for the right: docs/plugin.md has a Role with all that the plugin needs"
+        "missing right: {0}. Check namespace and context, or ask for the right: {DOCS}plugin.md#rights has a Role with all that the plugin needs"
     )]
     Forbidden(String),
     /// The cluster does not have the kind.
@@ -66,6 +74,9 @@ pub enum Error {
     /// A file cannot be written.
     #[error("cannot write {0}: {1}. Name another file")]
     File(String, std::io::Error),
+    /// A file cannot be read.
+    #[error("cannot read {0}: {1}. Name another file")]
+    Unread(String, std::io::Error),
     /// The person ended the command.
     #[error("interrupted before the check had ended, so nothing is known. Run it again")]
     Interrupted,
@@ -151,6 +162,14 @@ pub(super) fn of_log(error: kube::Error) -> Error {
         kube::Error::Api(status) if status.is_not_found() => Error::Api(message(&error)),
         _ => error.into(),
     }
+}
+
+/// Why a bucket was not read.
+pub(super) fn of_bucket(address: &str, why: &str) -> Error {
+    Error::Unfit(format!(
+        "cannot read {}: {why}. Check that it was stored, and that your AWS credentials may read the bucket",
+        clean(address)
+    ))
 }
 
 /// Why no cluster is configured. The text of a parser may show a part of the file, and with it perhaps a token.

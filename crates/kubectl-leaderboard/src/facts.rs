@@ -6,8 +6,8 @@ use jiff::Timestamp;
 use k8s_openapi::apimachinery::pkg::apis::meta::v1::Time;
 use kube::ResourceExt;
 
-use super::text::{Frame, when};
-use leaderboard_api::{Attempt, FailureClass, ReasonName, State, Submission, SubmissionStatus, conditions};
+use super::text::{Frame, join, span, when};
+use leaderboard_api::{Attempt, FailureClass, ReasonName, State, Submission, SubmissionStatus, Waiting, conditions};
 
 /// The state as people read it.
 pub(super) fn shown(submission: &Submission) -> &'static str {
@@ -38,6 +38,33 @@ pub(super) fn since(submission: &Submission) -> Option<Timestamp> {
     found.or_else(|| submission.creation_timestamp().map(|t| t.0))
 }
 
+/// Why it is in its state: the reason, unless it is the state's own name, and a message about it. Where the reason is the state's name and
+/// the progress is shown, that progress is the message.
+pub(super) fn reason(status: &SubmissionStatus, message: &str) -> String {
+    let state = status.known_state().map(State::as_str);
+    match status
+        .reason
+        .as_ref()
+        .map(ReasonName::as_str)
+        .filter(|reason| Some(*reason) != state)
+    {
+        Some(reason) => join(&[&format!("{reason}:"), message]).trim_end_matches(':').to_owned(),
+        None if status.progress.is_some() => String::new(),
+        None => message.to_owned(),
+    }
+}
+
+/// How long the wait in line may take.
+pub(super) fn eta(waiting: &Waiting) -> Option<String> {
+    let eta = waiting.eta()?;
+    let (least, most) = (span(eta.min_seconds), span(eta.max_seconds));
+    Some(if least == most {
+        least
+    } else {
+        format!("{least}-{most}")
+    })
+}
+
 /// The state of a submission in a sentence.
 pub(super) fn headline(submission: &Submission, now: Timestamp) -> String {
     let name = submission.name_any();
@@ -60,12 +87,14 @@ pub(super) fn headline(submission: &Submission, now: Timestamp) -> String {
 /// the attempt has begun.
 pub(super) fn transition(submission: &Submission, attempt: Attempt, frame: Frame) -> Option<(String, Vec<String>)> {
     let status = submission.status.as_ref().filter(|s| s.attempt >= Some(attempt))?;
-    let reason = status.reason.as_ref().map(ReasonName::as_str).unwrap_or_default();
-    let state = format!(
-        "{} is {} ({reason})",
-        submission.name_any(),
-        status.state_of_conditions().as_str()
-    );
+    let shown = status.state_of_conditions().as_str();
+    let reason = status
+        .reason
+        .as_ref()
+        .map(ReasonName::as_str)
+        .filter(|reason| *reason != shown);
+    let reason = reason.map(|reason| format!(" ({reason})")).unwrap_or_default();
+    let state = format!("{} is {shown}{reason}", submission.name_any());
     let text = format!("{state}: {}", status.message.as_deref().unwrap_or_default());
     let mut page = frame.page();
     page.row(

@@ -5,6 +5,8 @@
 
 use std::env;
 
+use crate::error::Error;
+
 /// The ends of the names of AWS's own endpoints.
 const OF_AWS: [&str; 4] = [
     ".amazonaws.com",
@@ -16,9 +18,33 @@ const OF_AWS: [&str; 4] = [
 const OWN: [&str; 2] = ["AWS_ENDPOINT_URL", "AWS_ENDPOINT_URL_S3"];
 
 /// The endpoint, if it is neither AWS's nor one that the person's own variables name.
-pub fn endpoint(named: Option<&String>) -> Option<&str> {
+fn endpoint(named: Option<&String>) -> Option<&str> {
     let own: Vec<String> = OWN.into_iter().filter_map(|name| env::var(name).ok()).collect();
     named.map(String::as_str).filter(|named| is_foreign(named, &own))
+}
+
+/// Goes on only if the person trusts an endpoint that is not AWS's, by the flag `--endpoint` or by an answer.
+pub fn confirm(
+    name: &str,
+    named: Option<&String>,
+    trusted: Option<&str>,
+    ask: impl FnOnce(&str) -> Option<bool>,
+) -> Result<(), Error> {
+    let Some(endpoint) = endpoint(named).filter(|endpoint| trusted != Some(*endpoint)) else {
+        return Ok(());
+    };
+    let what = format!(
+        "{name} has its results at {endpoint}, which is no endpoint of AWS: `aws` would send it a request that your credentials sign"
+    );
+    match ask(&format!("{what}. Do you trust that server?")) {
+        Some(true) => Ok(()),
+        Some(false) => Err(Error::Unfit(format!(
+            "nothing was sent to {endpoint}. Nothing was read"
+        ))),
+        None => Err(Error::Unfit(format!(
+            "{what}. If you trust that server, add --endpoint={endpoint}"
+        ))),
+    }
 }
 
 fn is_foreign(endpoint: &str, own: &[String]) -> bool {
@@ -42,6 +68,22 @@ fn is_of_aws(endpoint: &str) -> bool {
 #[cfg(test)]
 mod tests {
     use super::*;
+
+    #[test]
+    fn a_server_that_is_not_awss_gets_no_credentials_unless_a_person_trusts_it() {
+        let endpoint = "https://minio.example".to_owned();
+        let confirmed = |answer, trusted| confirm("mine", Some(&endpoint), trusted, |_| answer);
+        assert!(confirmed(Some(true), None).is_ok() && confirmed(None, Some("https://minio.example")).is_ok());
+        for (answer, expected) in [
+            (Some(false), "nothing was sent to https://minio.example"),
+            (None, "add --endpoint=https://minio.example"),
+        ] {
+            let why = confirmed(answer, Some("https://other.example"))
+                .unwrap_err()
+                .to_string();
+            assert!(why.contains(expected), "{why}");
+        }
+    }
 
     #[test]
     fn an_endpoint_is_awss_by_its_name_or_the_persons_by_a_variable() {

@@ -8,12 +8,12 @@ use clap::{Args, ValueEnum};
 use futures::StreamExt;
 use k8s_openapi::api::core::v1::Pod;
 use kube::ResourceExt;
-use leaderboard_api::{Attempt, Submission, SubmissionStatus, names};
+use leaderboard_api::{Attempt, State, Submission, SubmissionStatus, names};
 
-use crate::bucket_log::{Unread, read};
+use crate::aws::{Unread, read};
 use crate::cluster::Cluster;
 use crate::commands::frame;
-use crate::error::Error;
+use crate::error::{Error, of_bucket};
 use crate::output::{ask, note, print, print_labelled};
 use crate::text::{Frame, log_line, wrap};
 use crate::{bucket, facts, foreign};
@@ -29,7 +29,7 @@ pub struct Logs {
     /// Only this worker, from 1.
     #[arg(long, value_name = "NUMBER")]
     worker: Option<usize>,
-    /// Whose log.
+    /// Containers: the agents, the simulators, workspace and contents (start), or logcopy, which stores results.
     #[arg(long, value_enum, default_value_t, value_name = "CONTAINERS")]
     of: Whose,
     /// Endpoint of the bucket, if it is not AWS's, that may get your AWS credentials once the Pod is gone.
@@ -43,9 +43,8 @@ pub(super) enum Whose {
     #[default]
     Agent,
     Simulator,
-    /// What prepares the Pod: workspace, then contents.
+    // The containers that prepare the Pod.
     Start,
-    /// What stores results and logs.
     Logcopy,
 }
 
@@ -143,11 +142,15 @@ pub(super) fn end(submission: &Submission) -> String {
     let reason = reason
         .filter(|reason| reason.as_str() != shown)
         .map(|reason| format!(" ({reason})"));
+    let next = if shown == State::Finished.as_str() {
+        String::new()
+    } else {
+        format!(" `{}` has the next step.", facts::command("why", submission))
+    };
     format!(
-        "{} is {shown}{}. `{}` has the next step.",
+        "{} is {shown}{}.{next}",
         submission.name_any(),
-        reason.unwrap_or_default(),
-        facts::command("why", submission)
+        reason.unwrap_or_default()
     )
 }
 
@@ -207,9 +210,7 @@ async fn from_bucket(submission: &Submission, wanted: &Logs, workers: usize) -> 
         .and_then(|status| status.plan.as_ref())
         .map(|plan| &plan.storage.s3);
     let named = storage.and_then(|storage| storage.endpoint.as_ref());
-    if let Some(endpoint) = foreign::endpoint(named).filter(|endpoint| wanted.endpoint.as_deref() != Some(*endpoint)) {
-        confirm(&submission.name_any(), endpoint, ask)?;
-    }
+    foreign::confirm(&submission.name_any(), named, wanted.endpoint.as_deref(), ask)?;
     let mut is_unread = false;
     for (stream, (label, key)) in keys.iter().enumerate() {
         let stream = label.parse().unwrap_or(stream);
@@ -221,8 +222,7 @@ async fn from_bucket(submission: &Submission, wanted: &Logs, workers: usize) -> 
                 return Ok(ExitCode::SUCCESS);
             }
             Err(Unread::Failed(why)) => {
-                let next = "Check that it was stored, and that your AWS credentials may read the bucket";
-                note(&format!("cannot read {results}/{key}: {why}. {next}"));
+                note(&of_bucket(&format!("{results}/{key}"), &why).to_string());
                 is_unread = true;
             }
         }
@@ -232,22 +232,6 @@ async fn from_bucket(submission: &Submission, wanted: &Logs, workers: usize) -> 
     } else {
         ExitCode::SUCCESS
     })
-}
-
-/// Goes on only if the person trusts an endpoint that is not AWS's.
-fn confirm(name: &str, endpoint: &str, ask: impl FnOnce(&str) -> Option<bool>) -> Result<(), Error> {
-    let what = format!(
-        "{name} has its logs at {endpoint}, which is no endpoint of AWS: `aws` would send it a request that your credentials sign"
-    );
-    match ask(&format!("{what}. Do you trust that server?")) {
-        Some(true) => Ok(()),
-        Some(false) => Err(Error::Unfit(format!(
-            "nothing was sent to {endpoint}. Nothing was read"
-        ))),
-        None => Err(Error::Unfit(format!(
-            "{what}. If you trust that server, add --endpoint={endpoint}"
-        ))),
-    }
 }
 
 /// The commands that read the logs once the Pod is gone, or why there is none, with the next step.
@@ -385,19 +369,6 @@ mod tests {
         ] {
             let why = in_bucket(submission, of).unwrap_err();
             assert!(why.starts_with(expected), "{why}");
-        }
-    }
-
-    #[test]
-    fn a_server_that_is_not_awss_gets_no_credentials_unless_a_person_trusts_it() {
-        let confirmed = |answer| confirm("mine", "https://minio.example", |_| answer);
-        assert!(confirmed(Some(true)).is_ok());
-        for (answer, expected) in [
-            (Some(false), "nothing was sent to https://minio.example"),
-            (None, "add --endpoint=https://minio.example"),
-        ] {
-            let why = confirmed(answer).unwrap_err().to_string();
-            assert!(why.contains(expected), "{why}");
         }
     }
 

@@ -1,12 +1,12 @@
-//! `kubectl leaderboard`: explains why a submission waits, runs or failed, and cancels or resumes it.
+//! `kubectl leaderboard`: shows and explains submissions, changes them, and checks Leaderboards and manifests.
 //!
 //! `why`, `status`, `overview`, `top`, `change`, `resume` and `facts` are pure and hold what is printed and decided; `cluster` talks to
-//! the API server; `commands` and `changes` bring both together. `import` makes text of text. The plugin shows what the status holds, and
+//! the API server; `commands` and `changes` bring both together. `import` and `lint` make text of text. The plugin shows what the status holds, and
 //! contacts neither EvalAI nor AWS; where that helps, it starts the person's own `aws` program.
 
+mod aws;
 mod board;
 mod bucket;
-mod bucket_log;
 mod change;
 mod changes;
 mod check;
@@ -17,13 +17,17 @@ mod dashboard;
 mod error;
 mod facts;
 mod foreign;
+mod get;
+mod help;
 mod import;
 mod lines;
+mod lint;
 mod logs;
 mod manual;
 mod near;
 mod output;
 mod overview;
+mod pause;
 mod report;
 mod resume;
 mod status;
@@ -31,6 +35,7 @@ mod submit;
 mod table;
 mod text;
 mod top;
+mod version;
 mod why;
 
 #[cfg(test)]
@@ -46,12 +51,13 @@ use kube::ResourceExt;
 use self::cluster::{Cluster, Scope, Target};
 use self::complete::Offer;
 use self::error::Error;
-use self::output::{Colour, Output, note, print};
+use self::help::GLOBAL;
+use self::output::{Colour, Format, Output, note, print};
 
 /// How long a shell waits for names.
 const COMPLETION: Duration = Duration::from_secs(3);
 
-/// Check Leaderboards; show, explain, cancel and resume submissions.
+/// Show and explain submissions, submit, stop and resume them, and check Leaderboards.
 #[derive(Parser, Debug)]
 #[command(name = "kubectl-leaderboard", bin_name = "kubectl leaderboard", version, long_about = None)]
 struct Cli {
@@ -59,19 +65,19 @@ struct Cli {
     command: Command,
     #[command(flatten)]
     target: Target,
-    /// When to color lines.
-    #[arg(long, global = true, value_enum, default_value_t, value_name = "WHEN")]
+    /// When to color lines; auto: on a terminal, unless NO_COLOR is set.
+    #[arg(long, global = true, value_enum, default_value_t, value_name = "WHEN", help_heading = GLOBAL)]
     color: Colour,
     /// The same as --color never.
-    #[arg(long, global = true, conflicts_with = "color")]
+    #[arg(long, global = true, conflicts_with = "color", help_heading = GLOBAL)]
     no_color: bool,
 }
 
 #[derive(Subcommand, Debug)]
 enum Command {
-    /// Explain a submission's state and the next step. Without NAME, list every submission that is waiting, failed or stuck.
+    /// Explain a submission's state and the next step; without NAME, list each that waits, has failed or is stuck.
     Why(Show),
-    /// Show one submission on one screen. Without NAME, list all.
+    /// Show one submission on one screen; without NAME, list all.
     Status(Watched),
     /// Show who uses the slots and who waits, by Leaderboard and team.
     Top {
@@ -80,6 +86,8 @@ enum Command {
         #[command(flatten)]
         output: Output,
     },
+    /// List what a submission has stored, or copy it into a folder.
+    Get(get::Get),
     /// Submit an image to a track, without EvalAI.
     #[command(
         override_usage = "kubectl leaderboard submit [OPTIONS] --leaderboard <LEADERBOARD>\n       --track <TRACK> --image <IMAGE>",
@@ -92,7 +100,7 @@ enum Command {
     Logs(logs::Logs),
     /// Drive one route with an agent of your own, and show whether the Leaderboard works.
     #[command(
-        after_help = "Exit code 0: its route is Finished and the Leaderboard Ready; 1: one of them is not, or an error. docs/check.md has more."
+        after_help = "Exit code 0: its route is Finished and the Leaderboard Ready; 1: one of them is not, or an error.\n\nMore: docs/check.md"
     )]
     Check(check::Check),
     /// Stop a submission. Completed routes are kept.
@@ -107,22 +115,27 @@ enum Command {
                       not finish, or an error."
     )]
     Resume(resume::Resume),
+    /// Let nothing new of a Leaderboard start. What runs goes on.
+    Pause(pause::Pause),
+    /// Let submissions of a paused Leaderboard start again.
+    Unpause(pause::Pause),
+    /// Check manifests by schema and rules, without a cluster.
+    #[command(after_help = "Exit code 0: no fault. 1: a fault, or a file that cannot be read.")]
+    Lint(lint::Lint),
     /// Collect a support bundle in one file, without Secrets, routes and names of teams.
     Report(report::Report),
     /// Print manifests for a pipeline of Step Functions that this operator takes over. It asks neither AWS nor a cluster.
     #[command(
         override_usage = "kubectl leaderboard import [OPTIONS] --challenge <ID> --queue <URL>\n       <FILE>...",
         after_help = "Without --namespace the objects are in `leaderboard`.\n\nExit code 0: the manifests are printed. 1: an entry or a file is \
-                      refused, and nothing is printed. docs/import.md explains them."
+                      refused, and nothing is printed.\n\nMore: docs/import.md"
     )]
     Import(import::Import),
     /// Print the program with which kubectl completes these commands in a shell.
-    #[command(
-        after_help = "Example: kubectl leaderboard completion > ~/bin/kubectl_complete-leaderboard; chmod +x ~/bin/kubectl_complete-leaderboard"
-    )]
     Completion,
+    /// Print the version of this program, and of the operator here.
+    Version(version::Version),
     /// Write a manual page of each command.
-    #[command(after_help = "Example: kubectl leaderboard man ~/.local/share/man/man1; man kubectl-leaderboard-why")]
     Man(manual::Man),
     /// What fits in place of the last word.
     #[command(hide = true)]
@@ -144,8 +157,13 @@ struct Show {
 
 #[derive(Args, Debug)]
 struct Watched {
+    /// Name of the submission.
+    name: Option<String>,
     #[command(flatten)]
-    show: Show,
+    scope: Scope,
+    /// Output format; wide: more columns.
+    #[arg(short = 'o', long = "output", value_enum, default_value_t, value_name = "FORMAT")]
+    format: Format,
     /// Print it again each time it changes, until it has ended.
     #[arg(short, long, requires = "name")]
     watch: bool,
@@ -192,7 +210,7 @@ fn command_line(words: &[OsString]) -> clap::Command {
     } else {
         ColorChoice::Auto
     };
-    Cli::command().color(colors).max_term_width(HELP_WIDTH)
+    help::dressed(Cli::command().color(colors).max_term_width(HELP_WIDTH))
 }
 
 async fn carry_out(cli: Cli) -> Result<ExitCode, Error> {
@@ -205,7 +223,9 @@ async fn carry_out(cli: Cli) -> Result<ExitCode, Error> {
             Box::pin(complete(&words)).await;
             Ok(ExitCode::SUCCESS)
         }
-        Command::Man(wanted) => manual::write(Cli::command(), &wanted),
+        Command::Man(wanted) => manual::write(help::dressed(Cli::command()), &wanted),
+        Command::Lint(wanted) => lint::lint(&wanted),
+        Command::Version(wanted) => version::version(cli.target, &wanted).await,
         Command::Import(wanted) => import::import(&wanted, cli.target.namespace),
         command => {
             let cluster = Cluster::connect(cli.target).await?;
@@ -218,7 +238,12 @@ async fn carry_out(cli: Cli) -> Result<ExitCode, Error> {
 /// Carries out what needs a cluster.
 async fn carry_out_there(command: Command, cluster: &Cluster) -> Result<ExitCode, Error> {
     match command {
-        Command::Completion | Command::Complete { .. } | Command::Man(_) | Command::Import(_) => Ok(ExitCode::SUCCESS),
+        Command::Completion
+        | Command::Complete { .. }
+        | Command::Man(_)
+        | Command::Import(_)
+        | Command::Lint(_)
+        | Command::Version(_) => Ok(ExitCode::SUCCESS),
         Command::Why(Show {
             name: Some(name),
             output,
@@ -229,7 +254,10 @@ async fn carry_out_there(command: Command, cluster: &Cluster) -> Result<ExitCode
             scope,
             output,
         }) => commands::survey(cluster, &scope, output.format).await,
-        Command::Status(Watched { show, watch }) => Box::pin(commands::show_status(cluster, &show, watch)).await,
+        Command::Status(wanted) => Box::pin(commands::show_status(cluster, &wanted)).await,
+        Command::Get(wanted) => Box::pin(get::get(cluster, &wanted)).await,
+        Command::Pause(wanted) => pause::pause(cluster, &wanted, true).await,
+        Command::Unpause(wanted) => pause::pause(cluster, &wanted, false).await,
         Command::Top { scope, output } => commands::top(cluster, &scope, output.format).await,
         Command::Submit(wanted) => changes::submit(cluster, &wanted).await,
         Command::Dashboard(wanted) => Box::pin(dashboard::dashboard(cluster, &wanted))
@@ -254,8 +282,10 @@ async fn complete(words: &[String]) {
     let matches = Cli::command().ignore_errors(true).try_get_matches_from(before);
     let target = matches.ok().and_then(|matches| Target::from_arg_matches(&matches).ok());
     let target = target.unwrap_or_default();
+    let is_file = offered == Offer::Files;
     let names = match offered {
         Offer::Words(words) => words,
+        Offer::Files => Vec::new(),
         of_cluster => {
             let found = tokio::time::timeout(COMPLETION, names_of(target, &of_cluster)).await;
             found.ok().and_then(Result::ok).unwrap_or_default()
@@ -264,7 +294,8 @@ async fn complete(words: &[String]) {
     if let Offer::Words(words) = complete::fitting(names, last) {
         print(&words);
     }
-    print(&[complete::NO_FILES.to_owned()]);
+    let directive = if is_file { complete::FILES } else { complete::NO_FILES };
+    print(&[directive.to_owned()]);
 }
 
 async fn names_of(target: Target, offered: &Offer) -> Result<Vec<String>, Error> {

@@ -5,12 +5,13 @@
 use std::io::{ErrorKind, IsTerminal as _, Write as _};
 use std::sync::OnceLock;
 
+use clap::builder::{PossibleValuesParser, TypedValueParser};
 use clap::{Args, ValueEnum};
 use leaderboard_api::text::is_harmful;
 use serde_json::Value;
 
 use super::table::{DONE, OPEN};
-use super::text::{WIDTH, clean, join, wrap};
+use super::text::{WIDTH, clean, hanging, join};
 
 /// The narrowest and the widest page. A text in longer lines is hard to read.
 const NARROWEST: usize = 60;
@@ -24,7 +25,6 @@ static COLOURS: OnceLock<bool> = OnceLock::new();
 pub enum Format {
     #[default]
     Text,
-    /// More columns.
     Wide,
     Json,
     Yaml,
@@ -34,14 +34,19 @@ pub enum Format {
 #[derive(Args, Clone, Copy, Debug)]
 pub struct Output {
     /// Output format.
-    #[arg(short = 'o', long = "output", value_enum, default_value_t, value_name = "FORMAT")]
+    #[arg(short = 'o', long = "output", value_name = "FORMAT", default_value = "text", value_parser = narrow())]
     pub format: Format,
+}
+
+/// The formats of a command without further columns.
+fn narrow() -> impl TypedValueParser<Value = Format> {
+    let parser = PossibleValuesParser::new(["text", "json", "yaml"]);
+    parser.map(|name| Format::from_str(&name, true).unwrap_or_default())
 }
 
 /// When lines are coloured.
 #[derive(ValueEnum, Clone, Copy, Debug, Default, PartialEq, Eq)]
 pub enum Colour {
-    /// On a terminal, unless NO_COLOR is set.
     #[default]
     Auto,
     Always,
@@ -213,16 +218,17 @@ pub(super) fn noted(text: &str, columns: Option<usize>) -> Vec<String> {
     let Some(columns) = columns else {
         return vec![text];
     };
-    let lines = wrap(&text, within_reason(columns).saturating_sub(NOTE_INDENT.len()));
-    let indents = std::iter::once("").chain(std::iter::repeat(NOTE_INDENT));
-    indents
-        .zip(lines)
-        .map(|(indent, line)| format!("{indent}{line}"))
-        .collect()
+    hanging(&text, within_reason(columns))
 }
 
-/// Before each further line of a note.
-const NOTE_INDENT: &str = "  ";
+/// Texts of one line each, which only a terminal breaks: a program reads lines.
+pub fn paragraphs(texts: &[String]) -> Vec<String> {
+    let width = terminal().map(|(columns, _)| within_reason(columns));
+    let lines = texts
+        .iter()
+        .map(|text| width.map_or_else(|| vec![clean(text)], |width| hanging(text, width)));
+    lines.flatten().collect()
+}
 
 /// Prints a line of the stream of this number behind its label. Each stream has its colour.
 pub fn print_labelled(stream: usize, label: &str, line: &str) {

@@ -46,16 +46,16 @@ impl Place<'_> {
     }
 }
 
-/// What is printed where there is no submission. `elsewhere` are the namespaces that have some, with their number.
-pub fn nothing(place: Place<'_>, selector: Option<&str>, elsewhere: &[(String, usize)], frame: Frame) -> Vec<String> {
+/// What is printed where there is no submission that has what `words` name. `elsewhere` are the namespaces that have some, with their number.
+pub fn nothing(place: Place<'_>, words: Option<&str>, elsewhere: &[(String, usize)], frame: Frame) -> Vec<String> {
     let namespace = place.namespace;
     let others: Vec<String> = elsewhere
         .iter()
         .map(|(name, count)| format!("{name} ({count})"))
         .collect();
-    let text = match selector {
-        Some(selector) if place.is_all => format!("No submission of any namespace has the labels {selector}."),
-        Some(selector) => format!("No submission of namespace {namespace} has the labels {selector}."),
+    let text = match words {
+        Some(words) if place.is_all => format!("No submission of any namespace has {words}."),
+        Some(words) => format!("No submission of namespace {namespace} has {words}."),
         None if place.is_all => {
             "No namespace has a submission. Check that the context is that of the right cluster.".to_owned()
         }
@@ -177,7 +177,8 @@ fn row(place: Place<'_>, submission: &Submission, now: Timestamp) -> Option<Row>
 
 /// Why a submission is in its state; nothing if it is running, has finished, or was cancelled as requested.
 fn own_reason(submission: &Submission, status: &SubmissionStatus) -> Option<String> {
-    let reason = status.reason.as_ref().map(ReasonName::as_str).unwrap_or_default();
+    let reason = status.present_reason();
+    let reason = reason.as_ref().map(ReasonName::as_str).unwrap_or_default();
     let message = status.message.as_deref().unwrap_or_default();
     if status.has_ended() && facts::is_attempt_requested(submission) {
         let wanted = submission.spec.attempt;
@@ -189,10 +190,8 @@ fn own_reason(submission: &Submission, status: &SubmissionStatus) -> Option<Stri
         None => Some("The operator has not processed it yet.".to_owned()),
         Some(State::Pending) => Some(match &status.waiting {
             Some(waiting) => {
-                let eta = waiting
-                    .eta()
-                    .map(|eta| format!(", starts in {eta}"))
-                    .unwrap_or_default();
+                let eta = facts::eta(waiting).map(|eta| format!(", starts in {eta}"));
+                let eta = eta.unwrap_or_default();
                 format!("{reason}: position {}{eta}", waiting.position)
             }
             None => format!("{reason}: {message}"),

@@ -6,6 +6,7 @@ use kube::ResourceExt;
 use leaderboard_api::{FailureClass, State, Submission, SubmissionStatus};
 
 use crate::change::Request;
+use crate::cluster::Filter;
 use crate::facts;
 use crate::table::table;
 use crate::text::{Frame, span, wrap};
@@ -24,6 +25,8 @@ pub struct Resume {
     /// Each Failed submission of the namespace.
     #[arg(long)]
     pub all: bool,
+    #[command(flatten)]
+    pub filter: Filter,
     /// Only what nodes, network or storage have failed.
     #[arg(long, conflicts_with = "names")]
     pub infrastructure: bool,
@@ -114,7 +117,7 @@ impl Resume {
 /// What is chosen, with the class of each failure.
 pub fn lines(chosen: &[&Submission], frame: Frame) -> Vec<String> {
     let rows: Vec<Vec<String>> = chosen.iter().map(|one| row(one, frame.now)).collect();
-    let head = ["NAME", "TEAM", "STATE", "REASON", "CLASS", "SINCE", "NODE", "SIMULATOR"];
+    let head = ["NAME", "TEAM", "REASON", "CLASS", "SINCE", "NODE", "SIMULATOR"];
     table(&head, &rows, frame.width)
 }
 
@@ -141,12 +144,8 @@ fn row(one: &Submission, now: Timestamp) -> Vec<String> {
         one.name_any(),
         one.team_name().unwrap_or_default(),
         status
-            .and_then(SubmissionStatus::known_state)
-            .map_or("", State::as_str)
-            .to_owned(),
-        status
-            .and_then(|status| status.reason.as_ref())
-            .map(ToString::to_string)
+            .and_then(SubmissionStatus::present_reason)
+            .map(|reason| reason.to_string())
             .unwrap_or_default(),
         class.to_owned(),
         since.unwrap_or_default(),

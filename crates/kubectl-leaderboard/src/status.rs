@@ -3,7 +3,7 @@
 use jiff::Timestamp;
 use kube::ResourceExt;
 use leaderboard_api::text::sentence;
-use leaderboard_api::{ReasonName, State, Submission, SubmissionStatus, Times, WorkerState, WorkerStatus, conditions};
+use leaderboard_api::{State, Submission, SubmissionStatus, Times, Waiting, WorkerState, WorkerStatus, conditions};
 use serde_json::{Value, json};
 
 use super::board::{self, Observed};
@@ -26,9 +26,8 @@ pub fn screen(submission: &Submission, leaderboard: Observed<'_>, frame: Frame) 
     }
     page.gap();
     page.row("Track", &facts::track(submission));
-    let reason = status.reason.as_ref().map(ReasonName::as_str).unwrap_or_default();
     let message = sentence(status.message.as_deref().unwrap_or_default());
-    page.row("Reason", join(&[&format!("{reason}:"), &message]).trim_matches(':'));
+    page.row("Reason", &facts::reason(status, &message));
     page.row("In line", &in_line(status));
     if let Some(progress) = &status.progress {
         let bar = bar(progress.done, progress.total, BAR);
@@ -53,7 +52,7 @@ fn in_line(status: &SubmissionStatus) -> String {
     let Some(waiting) = &status.waiting else {
         return String::new();
     };
-    let eta = waiting.eta().map(|eta| format!("; starts in about {eta}"));
+    let eta = facts::eta(waiting).map(|eta| format!("; starts in about {eta}"));
     format!("position {}{}.", waiting.position, eta.unwrap_or_default())
 }
 
@@ -155,7 +154,7 @@ pub fn lines(submissions: &[Submission], is_qualified: bool, is_wide: bool, fram
     let now = frame.now;
     let mut all: Vec<&Submission> = submissions.iter().collect();
     all.sort_by_key(|one| order(one, now));
-    let mut head = vec!["NAME", "STATE", "REASON", "PROGRESS", "SCORE", "QUEUE", "SINCE"];
+    let mut head = vec!["NAME", "STATE", "REASON", "PROGRESS", "SCORE", "SINCE", "QUEUE"];
     if is_qualified {
         head.insert(0, "NAMESPACE");
     }
@@ -195,11 +194,15 @@ fn row(submission: &Submission, is_qualified: bool, is_wide: bool, now: Timestam
     let mut row = vec![
         submission.name_any(),
         status.known_state().map_or("(new)", State::as_str).to_owned(),
-        text(status.reason.as_ref().map(ReasonName::as_str)),
+        facts::reason(status, "").trim_end_matches(':').to_owned(),
         text(status.progress.as_ref().map(|progress| progress.text.as_str())),
         text(status.score.as_ref().map(|score| score.text.as_str())),
-        text(status.waiting.as_ref().map(|waiting| waiting.text.as_str())),
         since.unwrap_or_default(),
+        status
+            .waiting
+            .as_ref()
+            .map(|waiting| place(waiting))
+            .unwrap_or_default(),
     ];
     if is_qualified {
         row.insert(0, submission.namespace().unwrap_or_default());
@@ -216,6 +219,12 @@ fn row(submission: &Submission, is_qualified: bool, is_wide: bool, now: Timestam
         ]);
     }
     row
+}
+
+/// `#3, 20m-35m`: the place in line, and how long it may take.
+fn place(waiting: &Waiting) -> String {
+    let eta = facts::eta(waiting).map(|eta| format!(", {eta}"));
+    format!("#{}{}", waiting.position, eta.unwrap_or_default())
 }
 
 /// The same for programs.

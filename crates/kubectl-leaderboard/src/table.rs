@@ -6,8 +6,10 @@ use crate::text::{clean, columns, cut, cut_start, padded};
 const GAP: usize = 2;
 /// The fewest columns to which a cell is cut.
 const LEAST: usize = 8;
-/// What is copied from a table, so it is not cut.
-const WHOLE: [&str; 2] = ["NAMESPACE", "NAME"];
+/// What is copied from a table or searched for, so it is not cut.
+const WHOLE: [&str; 4] = ["NAMESPACE", "NAME", "STATE", "REASON"];
+/// What `why`, `logs` and `-o wide` show as well, so that a narrow terminal may go without it.
+const SPARE: [&str; 4] = ["QUEUE", "CRASHES", "NODE", "SIMULATOR"];
 /// What is cut at its start: the tags of an image's versions differ at the end.
 const ENDS: [&str; 1] = ["SIMULATOR"];
 /// What a bar is made of: the part that is done, and the rest.
@@ -22,6 +24,7 @@ pub(super) fn table(head: &[&str], rows: &[Vec<String>], width: usize) -> Vec<St
         .iter()
         .map(|row| row.iter().map(|cell| clean(cell)).collect())
         .collect();
+    let (head, rows) = narrowed(head, rows, width);
     let widths = widths(&head, &rows, width);
     std::iter::once(&head)
         .chain(&rows)
@@ -31,6 +34,28 @@ pub(super) fn table(head: &[&str], rows: &[Vec<String>], width: usize) -> Vec<St
             cells.collect::<String>().trim_end().to_owned()
         })
         .collect()
+}
+
+/// A table that is too wide, without the columns in which no row has anything, and at last without those that other commands show.
+fn narrowed(mut head: Vec<String>, mut rows: Vec<Vec<String>>, width: usize) -> (Vec<String>, Vec<Vec<String>>) {
+    for only_empty in [true, false] {
+        for column in (0..head.len()).rev() {
+            let is_empty = rows.iter().all(|row| row.get(column).is_none_or(String::is_empty));
+            let is_spare = head.get(column).is_some_and(|title| SPARE.contains(&title.as_str()));
+            // Cutting comes before leaving out, but for what is empty.
+            let wanted = if only_empty { usize::MAX } else { width };
+            if (is_empty || is_spare && !only_empty) && total(&widths(&head, &rows, wanted)) > width {
+                head.remove(column);
+                rows.iter_mut().for_each(|row| drop(row.remove(column)));
+            }
+        }
+    }
+    (head, rows)
+}
+
+/// Columns of a line.
+fn total(widths: &[usize]) -> usize {
+    widths.iter().sum::<usize>() + GAP * widths.len().saturating_sub(1)
 }
 
 fn cell_of(title: &str, cell: &str, width: usize) -> String {
@@ -52,7 +77,6 @@ fn widths(head: &[String], rows: &[Vec<String>], width: usize) -> Vec<usize> {
         .enumerate()
         .map(|(column, title)| widest(column).max(columns(title)))
         .collect();
-    let total = |widths: &[usize]| widths.iter().sum::<usize>() + GAP * widths.len().saturating_sub(1);
     while total(&widths) > width {
         let can_shrink = |(title, width): &(&String, &mut usize)| {
             !WHOLE.contains(&title.as_str()) && **width > columns(title).max(LEAST)
@@ -92,21 +116,29 @@ mod tests {
     }
 
     #[test]
-    fn a_narrow_table_cuts_its_widest_cells_and_never_a_name() {
-        let row = ["submission-4711", "WaitingForPreviousController", "チーム自動運転"];
+    fn a_narrow_table_leaves_out_empty_columns_and_cuts_its_widest_cells_and_never_a_name() {
+        let row = [
+            "submission-4711",
+            "",
+            "Waits for its previous controller",
+            "チーム自動運転",
+        ];
         let rows = [row.map(str::to_owned).to_vec()];
-        let head = ["NAME", "REASON", "TEAM"];
+        let head = ["NAME", "SCORE", "WHY", "TEAM"];
+        assert!(table(&head, &rows, 100)[0].contains("SCORE"));
         assert_eq!(
             table(&head, &rows, 50),
             [
-                "NAME             REASON             TEAM",
-                "submission-4711  WaitingForPrevio…  チーム自動運転",
+                "NAME             WHY                TEAM",
+                "submission-4711  Waits for its pr…  チーム自動運転",
             ]
         );
         assert_eq!(
             table(&head, &rows, 10),
-            ["NAME             REASON    TEAM", "submission-4711  Waiting…  チーム…"]
+            ["NAME             WHY       TEAM", "submission-4711  Waits f…  チーム…"]
         );
+        let rows = [["a", "WaitingForPreviousController"].map(str::to_owned).to_vec()];
+        assert!(table(&["NAME", "REASON"], &rows, 10)[1].ends_with("WaitingForPreviousController"));
     }
 
     #[test]

@@ -97,6 +97,14 @@ pub(super) fn wrap(text: &str, width: usize) -> Vec<String> {
     lines
 }
 
+/// A text whose further lines are indented.
+pub(super) fn hanging(text: &str, width: usize) -> Vec<String> {
+    const INDENT: &str = "  ";
+    let lines = wrap(text, width.saturating_sub(INDENT.len())).into_iter().enumerate();
+    let indented = |(number, line)| if number == 0 { line } else { format!("{INDENT}{line}") };
+    lines.map(indented).collect()
+}
+
 /// The words of a text. What stands between two backticks is one, with what touches it.
 fn words(text: &str) -> Vec<String> {
     let is_balanced = text.matches('`').count().is_multiple_of(2);
@@ -187,7 +195,7 @@ pub(super) fn join(parts: &[&str]) -> String {
     parts.join(" ")
 }
 
-/// `2026-11-01 10:00:00 UTC (3 min ago)`.
+/// `2026-11-01 10:00:00 UTC (3m20s ago)`.
 pub(super) fn when(at: Timestamp, now: Timestamp) -> String {
     let seconds = now.duration_since(at).as_secs();
     let distance = span(seconds);
@@ -199,14 +207,39 @@ pub(super) fn when(at: Timestamp, now: Timestamp) -> String {
     }
 }
 
-/// A length of time, rounded down to one unit.
+/// A length of time as kubectl writes ages: `18s`, `2m5s`, `60m`, `3h20m`, `4d`.
 pub(super) fn span(seconds: i64) -> String {
-    match seconds.unsigned_abs() {
-        s if s < 120 => format!("{s} s"),
-        s if s < 120 * 60 => format!("{} min", s / 60),
-        s if s < 48 * 3600 => format!("{} h", s / 3600),
-        s => format!("{} days", s / 86_400),
+    const MINUTE: u64 = 60;
+    const HOUR: u64 = 60 * MINUTE;
+    const DAY: u64 = 24 * HOUR;
+    let seconds = seconds.unsigned_abs();
+    let two = |unit: u64, one: &str, part: u64, other: &str| match seconds % unit / part {
+        0 => format!("{}{one}", seconds / unit),
+        rest => format!("{}{one}{rest}{other}", seconds / unit),
+    };
+    match seconds {
+        s if s < 2 * MINUTE => format!("{s}s"),
+        s if s < 10 * MINUTE => two(MINUTE, "m", 1, "s"),
+        s if s < 3 * HOUR => format!("{}m", s / MINUTE),
+        s if s < 8 * HOUR => two(HOUR, "h", MINUTE, "m"),
+        s if s < 2 * DAY => format!("{}h", s / HOUR),
+        s if s < 8 * DAY => two(DAY, "d", HOUR, "h"),
+        s => format!("{}d", s / DAY),
     }
+}
+
+/// A number of bytes as Kubernetes writes quantities: `512`, `12Ki`, `3Gi`, rounded down.
+pub(super) fn size(bytes: u64) -> String {
+    let units = ["", "Ki", "Mi", "Gi", "Ti"];
+    let power = (0..units.len())
+        .rev()
+        .find(|power| bytes >> (10 * power) > 0)
+        .unwrap_or(0);
+    format!(
+        "{}{}",
+        bytes >> (10 * power),
+        units.get(power).copied().unwrap_or_default()
+    )
 }
 
 #[cfg(test)]
@@ -279,18 +312,33 @@ mod tests {
     }
 
     #[test]
-    fn times_have_one_unit() {
+    fn ages_and_sizes_are_written_as_kubectl_writes_them() {
         let at = |second: i64| Timestamp::from_second(1_793_527_200 + second).unwrap();
-        assert_eq!(when(at(0), at(200)), "2026-11-01 10:00:00 UTC (3 min ago)");
-        assert_eq!(when(at(12), at(0)), "2026-11-01 10:00:12 UTC (in 12 s)");
+        assert_eq!(when(at(0), at(200)), "2026-11-01 10:00:00 UTC (3m20s ago)");
+        assert_eq!(when(at(12), at(0)), "2026-11-01 10:00:12 UTC (in 12s)");
         for (seconds, expected) in [
-            (0, "0 s"),
-            (119, "119 s"),
-            (120, "2 min"),
-            (7_200, "2 h"),
-            (4 * 86_400, "4 days"),
+            (0, "0s"),
+            (119, "119s"),
+            (120, "2m"),
+            (185, "3m5s"),
+            (600, "10m"),
+            (7_200, "120m"),
+            (3 * 3600 + 1200, "3h20m"),
+            (9 * 3600 + 1200, "9h"),
+            (4 * 86_400, "4d"),
+            (4 * 86_400 + 7200, "4d2h"),
+            (9 * 86_400 + 7200, "9d"),
         ] {
             assert_eq!(span(seconds), expected);
+        }
+        for (bytes, expected) in [
+            (0, "0"),
+            (1023, "1023"),
+            (1024, "1Ki"),
+            (3 << 30, "3Gi"),
+            (u64::MAX, "16777215Ti"),
+        ] {
+            assert_eq!(size(bytes), expected);
         }
     }
 }

@@ -9,18 +9,23 @@
 
 use std::process::{Command, Output};
 
-const COMMANDS: [&str; 12] = [
+const COMMANDS: [&str; 17] = [
     "why",
     "status",
     "top",
+    "get",
     "submit",
     "logs",
     "check",
     "cancel",
     "resume",
+    "pause",
+    "unpause",
+    "lint",
     "report",
     "import",
     "completion",
+    "version",
     "man",
 ];
 
@@ -63,12 +68,13 @@ fn every_command_has_a_manual_page_with_its_flags() {
     for command in COMMANDS {
         let text = page(&format!("kubectl-leaderboard-{command}"));
         assert!(
-            text.contains(".SH DESCRIPTION") && text.contains("\\-\\-namespace"),
+            text.contains(".SH DESCRIPTION") && text.contains("Examples:"),
             "{command}: {text}"
         );
     }
     assert!(page("kubectl-leaderboard-resume").contains("\\-\\-restart"));
-    assert!(page("kubectl-leaderboard").contains("resume"));
+    let page_of_all = page("kubectl-leaderboard");
+    assert!(page_of_all.contains("resume") && page_of_all.contains("\\-\\-namespace"));
     let hidden = man.join("kubectl-leaderboard-complete.1");
     assert!(!hidden.exists(), "what only shells call has no page");
     std::fs::remove_dir_all(folder).unwrap();

@@ -9,23 +9,22 @@
     reason = "clippy knows a test by its attribute; what tests call is a test too"
 )]
 
+#[cfg(unix)]
+mod bucket;
 mod stub;
 
 use std::path::Path;
 use std::process::{Command, Output, Stdio};
 
-use serde_json::{Value, json};
-
-use self::stub::{Stub, list, refusal};
+use self::stub::Stub;
+use self::stub::cluster::{cluster, forbidden};
 
 const PLUGIN: &str = env!("CARGO_BIN_EXE_kubectl-leaderboard");
-const GROUP: &str = "/apis/leaderboard.carla.org/v1alpha1";
-/// What is in the output of commands that ask for times.
-const TIME: &str = "2026-11-01T10:00:00Z";
 
 fn plugin(stub: &Stub, arguments: &[&str]) -> Output {
     let mut command = Command::new(PLUGIN);
     command.args(arguments).env("KUBECONFIG", &stub.kubeconfig);
+    command.current_dir(env!("CARGO_MANIFEST_DIR"));
     // No program of this machine is asked.
     command.env("PATH", "").stdin(Stdio::null()).output().unwrap()
 }
@@ -47,6 +46,8 @@ fn assert_printed(name: &str, stub: &Stub, commands: &[&[&str]]) {
         let line = format!("$ kubectl leaderboard {}", arguments.join(" "));
         text =
             format!("{text}{line}\n{out}--- errors, exit code {code}\n{err}\n").replace(&stub.address, "http://SERVER");
+        // `local/lab owner` changes the address.
+        text = text.replace(env!("CARGO_PKG_REPOSITORY"), "https://REPOSITORY");
     }
     let file = Path::new(env!("CARGO_MANIFEST_DIR")).join(format!("tests/printed/{name}.txt"));
     if std::env::var_os("UPDATE_GOLDEN").is_some() {
@@ -57,134 +58,6 @@ fn assert_printed(name: &str, stub: &Stub, commands: &[&[&str]]) {
         text, known,
         "{name} prints something else; set UPDATE_GOLDEN=1 and read the difference"
     );
-}
-
-fn condition(type_: &str, truth: &str, reason: &str) -> Value {
-    json!({"type": type_, "status": truth, "reason": reason, "message": "", "lastTransitionTime": TIME})
-}
-
-fn submission(name: &str, status: &Value) -> Value {
-    json!({
-        "apiVersion": "leaderboard.carla.org/v1alpha1", "kind": "Submission",
-        "metadata": {"name": name, "namespace": "carla", "creationTimestamp": TIME, "resourceVersion": "17"},
-        "spec": {"leaderboardName": "carla-20", "track": "sensors", "image": "registry.example/agent:1"}, "status": status,
-    })
-}
-
-fn failed(class: &str, reason: &str) -> Value {
-    json!({
-        "attempt": 1, "reason": reason, "message": "It has ended.", "track": "sensors", "resultsURL": "s3://results/v2/42",
-        "failure": {"class": class, "reason": reason, "message": "It has ended."},
-        "times": {"finished": TIME}, "plan": plan(), "conditions": [condition("Finished", "True", reason)],
-    })
-}
-
-fn plan() -> Value {
-    json!({"runId": "runs",
-        "carla": {"version": "V2", "codename": "S", "slices": [{"first": 0, "last": 9}, {"first": 10, "last": 19}],
-            "routes": 20, "repetitions": 1, "contentsImage": "c", "simulatorImage": "s"},
-        "track": "sensors",
-           "storage": {"s3": {"bucket": "results"}}, "image": "a"})
-}
-
-fn submissions() -> Vec<Value> {
-    let runs = json!({
-        "attempt": 1, "reason": "Running", "message": "12/20 routes done.", "track": "sensors", "jobName": "runs-1",
-        "times": {"started": TIME}, "plan": plan(), "resultsURL": "s3://results/v2/runs",
-        "conditions": [condition("Finished", "False", "Preparing"), condition("Running", "True", "Running")],
-    });
-    let waits =
-        json!({"attempt": 1, "reason": "WaitingForSlot", "conditions": [condition("Finished", "False", "Preparing")]});
-    vec![
-        submission("submission-41", &failed("Infrastructure", "NodeLost")),
-        submission("submission-42", &failed("Participant", "AgentCrashed")),
-        submission("submission-43", &runs),
-        submission("submission-44", &failed("Infrastructure", "SimulationCrashed")),
-        submission("submission-45", &waits),
-    ]
-}
-
-fn leaderboard() -> Value {
-    json!({
-        "apiVersion": "leaderboard.carla.org/v1alpha1", "kind": "Leaderboard",
-        "metadata": {"name": "carla-20", "namespace": "carla"},
-        "spec": {"tracks": [{"name": "sensors"}],
-                 "evaluation": {"carla": {
-                     "version": "V2", "contents": {"image": "contents:1"}, "simulator": {"image": "simulator:1"},
-                 }}, "storage": {"s3": {"bucket": "results"}}},
-        "status": {"conditions": [condition("Ready", "True", "Ready")]},
-    })
-}
-
-fn pod() -> Value {
-    let labels = json!({"leaderboard.carla.org/submission": "submission-43"});
-    json!({"apiVersion": "v1", "kind": "Pod", "status": {"phase": "Running"},
-           "metadata": {"name": "runs-1-abcde", "namespace": "carla", "creationTimestamp": TIME, "labels": labels}})
-}
-
-fn log(query: &str) -> (u16, String) {
-    let lines = match selected(query, "container=") {
-        Some("workspace") => "restored 12 files\n",
-        Some("contents") => "copied 3 folders\n",
-        Some("agent-1") => {
-            "Traceback (most recent call last):\n  File \"agent.py\", line 7\n\tred \u{1b}[31mtext\u{1b}[0m\nlast line"
-        }
-        Some("simulator-1") => return refusal(404, "NotFound", "pods \"runs-1-abcde\" not found"),
-        _ => {
-            let waits = "container \"agent-2\" in pod \"runs-1-abcde\" is waiting to start: ContainerCreating";
-            return refusal(400, "BadRequest", waits);
-        }
-    };
-    (200, lines.to_owned())
-}
-
-/// The value behind a key of a query.
-fn selected<'a>(query: &'a str, key: &str) -> Option<&'a str> {
-    let (_, rest) = query.split_once(key)?;
-    rest.split('&').next()
-}
-
-/// A cluster whose namespace `carla` has a Leaderboard and some submissions, of which one has a Pod. Events cannot be listed.
-fn cluster(method: &str, path: &str) -> (u16, String) {
-    let (place, query) = path.split_once('?').unwrap_or((path, ""));
-    let place = place.trim_start_matches(GROUP).trim_start_matches("/api/v1");
-    let words: Vec<&str> = place.split('/').skip(1).collect();
-    let (namespace, words) = match words.as_slice() {
-        ["namespaces", namespace, rest @ ..] => (Some(*namespace), rest),
-        rest => (None, rest),
-    };
-    let (kind, mut all) = match words.first().copied() {
-        Some("submissions") => ("Submission", submissions()),
-        Some("leaderboards") => ("Leaderboard", vec![leaderboard()]),
-        Some("pods") => ("Pod", vec![pod()]),
-        _ => {
-            let missing = "events.events.k8s.io is forbidden: User \"host\" cannot list resource \"events\" in API group \
-                           \"events.k8s.io\" in the namespace \"carla\"";
-            return refusal(403, "Forbidden", missing);
-        }
-    };
-    if method == "POST" {
-        return (201, submission("carla-20-x7k2p", &Value::Null).to_string());
-    }
-    let name = words.get(1).copied().or_else(|| selected(query, "metadata.name%3D"));
-    all.retain(|one| namespace.is_none_or(|namespace| one["metadata"]["namespace"] == namespace));
-    all.retain(|one| name.is_none_or(|name| one["metadata"]["name"] == name));
-    let of = selected(query, "submission%3D");
-    all.retain(|one| of.is_none_or(|of| one["metadata"]["labels"]["leaderboard.carla.org/submission"] == of));
-    match (words.len(), all.first()) {
-        (1, _) => list(kind, &all),
-        (2, Some(found)) => (200, found.to_string()),
-        (3, Some(_)) => log(query),
-        _ => refusal(404, "NotFound", "not found"),
-    }
-}
-
-/// A cluster where this person may do nothing.
-fn forbidden(method: &str, path: &str) -> (u16, String) {
-    let what = path.split('?').next().unwrap().rsplit('/').next().unwrap();
-    let verb = if method == "GET" { "get" } else { "change" };
-    let message = format!("{what} is forbidden: User \"participant\" cannot {verb} it in the namespace \"carla\"");
-    refusal(403, "Forbidden", &message)
 }
 
 #[test]
@@ -298,6 +171,85 @@ fn a_command_that_changes_something_prints_what_and_how_to_go_on() {
             &["resume", "submission-43", "--restart"],
         ],
     );
+}
+
+#[test]
+fn a_leaderboard_is_paused_with_what_becomes_of_its_submissions() {
+    let stub = Stub::start(cluster);
+    assert_printed(
+        "pause",
+        &stub,
+        &[&["pause", "carla-20"], &["unpause", "carla-20"], &["pause", "carla"]],
+    );
+}
+
+#[test]
+fn the_versions_of_both_programs_are_compared() {
+    let stub = Stub::start(cluster);
+    assert_printed(
+        "version",
+        &stub,
+        &[
+            &["version"],
+            &["version", "--client"],
+            &["version", "-o", "yaml"],
+            &["version", "--operator-namespace", "default"],
+            &["version", "-n", "default"],
+        ],
+    );
+}
+
+#[test]
+fn a_list_shows_what_fits_and_names_what_nothing_fits() {
+    let stub = Stub::start(cluster);
+    assert_printed(
+        "lists",
+        &stub,
+        &[
+            &["status", "--state", "running,pending", "-o", "json"],
+            &["status", "--state", "Finished", "--track", "sensors"],
+            &["top", "--leaderboard", "carla-10"],
+            &["resume", "submission-41", "--team", "7"],
+            &["resume", "--all", "--team", "7", "--dry-run"],
+            &["why", "-o", "wide"],
+        ],
+    );
+}
+
+#[test]
+fn manifests_are_checked_without_a_cluster() {
+    // Nothing listens there, and nothing is asked.
+    let stub = Stub::at("http://127.0.0.1:1".to_owned());
+    assert_printed(
+        "lint",
+        &stub,
+        &[
+            &["lint", "tests/manifests/good.yaml"],
+            &["lint", "tests/manifests/bad.yaml"],
+            &["lint", "tests/manifests/broken.yaml", "tests/manifests/good.yaml"],
+            &["lint", "tests/manifests/missing.yaml"],
+            &["lint", "-"],
+        ],
+    );
+}
+
+#[test]
+fn each_example_manifest_has_no_fault() {
+    let examples = Path::new(env!("CARGO_MANIFEST_DIR")).join("../../examples");
+    let mut files: Vec<String> = Vec::new();
+    for entry in std::fs::read_dir(examples).unwrap() {
+        let path = entry.unwrap().path();
+        if path.extension().is_some_and(|end| end == "yaml") {
+            files.push(path.display().to_string());
+        }
+    }
+    assert!(files.len() > 5, "{files:?}");
+    let stub = Stub::at("http://127.0.0.1:1".to_owned());
+    let arguments: Vec<&str> = std::iter::once("lint")
+        .chain(files.iter().map(String::as_str))
+        .collect();
+    let output = plugin(&stub, &arguments);
+    assert!(output.status.success(), "{}", String::from_utf8_lossy(&output.stdout));
 }
 
 #[test]

@@ -35,6 +35,26 @@ async fn status_and_top_show_all_of_a_namespace_and_one_on_a_screen() {
     assert_eq!(value.as_array().unwrap().len(), 3);
     let text = terminal.run(&["why", "waits", "-o", "yaml"]).await.out;
     assert_has(&text, &["\"reason\": \"WaitingForSlot\"", "\"nextSteps\":\n  - "]);
+    for (flags, expected) in [
+        (&["--state", "running,pending"][..], &["runs", "waits"][..]),
+        (&["--state", "Finished"], &["done"]),
+        (&["--team", "7"], &["runs", "done"]),
+        (&["--team", "team 8"], &["waits"]),
+        (
+            &["--leaderboard", "local", "--track", "sensors"],
+            &["runs", "waits", "done"],
+        ),
+    ] {
+        let text = terminal.run(&[&["status"], flags].concat()).await.well();
+        let names: Vec<&str> = text
+            .lines()
+            .skip(1)
+            .filter_map(|line| line.split_whitespace().next())
+            .collect();
+        assert_eq!(names, expected, "{flags:?}");
+    }
+    let text = terminal.run(&["status", "--team", "9", "--track", "map"]).await.well();
+    assert_has(&text, &["has the track map and the team 9."]);
     let text = terminal.run(&["status", "-l", "a=b"]).await.well();
     assert_has(
         &text,

@@ -64,7 +64,7 @@ pub fn import(wanted: &Import, namespace: Option<String>) -> Result<ExitCode, Er
 fn read(path: &Path) -> Result<Entries, Error> {
     let shown = path.display();
     let (text, is_open) =
-        text(path).map_err(|error| Error::Unfit(format!("cannot read {shown}: {error}. Name another file")))?;
+        text_of(path).map_err(|error| Error::Unfit(format!("cannot read {shown}: {error}. Name another file")))?;
     let entries = entries::answers(&text).map_err(|line| {
         Error::Unfit(format!(
             "{shown}, line {line}: this is no answer of `aws secretsmanager get-secret-value --output json`. Print the entry again"
@@ -79,7 +79,7 @@ fn read(path: &Path) -> Result<Entries, Error> {
 }
 
 /// The text of a file, and whether others than its owner may read or change the file.
-fn text(path: &Path) -> io::Result<(String, bool)> {
+pub(crate) fn text_of(path: &Path) -> io::Result<(String, bool)> {
     let mut text = String::new();
     if path == Path::new("-") {
         io::stdin().read_to_string(&mut text)?;

@@ -46,8 +46,8 @@ fn the_grace_is_the_leaderboards_of_this_moment() {
     let mut slow = leaderboard();
     slow.spec.deadlines.cancel_seconds = 900;
     for (leaderboard, expected) in [
-        (Observed::Found(&slow), " 900 s "),
-        (Observed::Missing, " 120 s "),
+        (Observed::Found(&slow), " 15m "),
+        (Observed::Missing, " 2m "),
         (Observed::Forbidden, "deadlines.cancelSeconds"),
     ] {
         let plan = plan(Request::Cancel, &submission(&running()), leaderboard, frame()).unwrap();

@@ -10,7 +10,7 @@ use super::{
 };
 use crate::board::Observed;
 use crate::submit::{Submit, object};
-use crate::{status, top, why};
+use crate::{pause, status, top, why};
 
 #[test]
 fn one_screen_has_progress_crashes_times_and_links() {
@@ -87,6 +87,13 @@ fn top_shows_slots_and_teams() {
         (&value[0]["team"], &value[0]["crashes"]),
         (&json!("Team Seven"), &json!(5))
     );
+}
+
+#[test]
+fn a_pause_names_what_becomes_of_runs_and_of_those_that_wait() {
+    let mut paused = leaderboard();
+    paused.spec.paused = true;
+    assert_documented(&pause::lines(&paused, false, frame()));
 }
 
 #[test]

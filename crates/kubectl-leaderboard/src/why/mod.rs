@@ -12,13 +12,13 @@ use serde_json::{Value, json};
 use self::next::{next_steps, of_worker, verb};
 use super::board::{self, Observed};
 use super::bucket;
-use super::facts::{class, command, has_ended, headline, is_attempt_requested, track};
+use super::facts::{self, class, command, has_ended, headline, is_attempt_requested, track};
 use super::text::{Frame, Page, join, span, when};
 use leaderboard_api::conditions::{self, Condition};
 use leaderboard_api::names::FAILURE_LOG_KEY;
 use leaderboard_api::text::sentence;
 use leaderboard_api::{
-    EndReason, FailureClass, LastEnd, Reason, ReasonName, Submission, SubmissionStatus, WorkerStatus, reasons,
+    Attempt, EndReason, FailureClass, LastEnd, Reason, ReasonName, Submission, SubmissionStatus, WorkerStatus, reasons,
 };
 
 /// What is known, and the lines about it so far.
@@ -28,6 +28,8 @@ struct Explanation<'a> {
     leaderboard: Observed<'a>,
     now: Timestamp,
     page: Page,
+    /// Next steps, which no other row repeats.
+    steps: Vec<String>,
 }
 
 /// The same for programs.
@@ -58,7 +60,9 @@ pub fn explain(submission: &Submission, leaderboard: Observed<'_>, frame: Frame)
         leaderboard,
         now: frame.now,
         page: frame.page(),
+        steps: Vec::new(),
     };
+    explanation.steps = next_steps(submission, explanation.status, leaderboard);
     explanation.headline();
     explanation.page.gap();
     explanation.page.row("Track", &track(submission));
@@ -88,36 +92,49 @@ impl Explanation<'_> {
     }
 
     fn reason(&mut self) {
-        let Some(reason) = &self.status.reason else { return };
-        let stalled = conditions::get(&self.status.conditions, conditions::STALLED).filter(|c| c.is_true());
-        let same = stalled.filter(|c| c.reason == *reason);
+        let status = self.status;
+        let stalled = conditions::get(&status.conditions, conditions::STALLED).filter(|c| c.is_true());
+        let same = stalled.filter(|c| status.present_reason().as_ref() == Some(&c.reason));
         let since = same.map(|c| format!("Since {}.", when(c.last_transition_time.0, self.now)));
-        let text = [&format!("{reason}:"), &meaning(reason), &since.unwrap_or_default()];
-        self.page.row("Reason", &join(&text.map(String::as_str)));
-        self.page
-            .row("Message", self.status.message.as_deref().unwrap_or_default());
-        if let Some(other) = stalled.filter(|c| c.reason != *reason) {
+        let mut message = self.without_steps(status.message.as_deref().unwrap_or_default());
+        if message.is_empty() {
+            message = status.reason.as_ref().map(meaning).unwrap_or_default();
+        }
+        let text = facts::reason(status, &message);
+        self.page.row("Reason", &join(&[&text, &since.unwrap_or_default()]));
+        if let Some(other) = stalled.filter(|c| status.present_reason().as_ref() != Some(&c.reason)) {
             let since = when(other.last_transition_time.0, self.now);
             let text = format!("{} since {since}: {}", other.reason, sentence(&other.message));
             self.page.row("Stalled", &text);
         }
     }
 
+    /// A message, without the next steps at its end.
+    fn without_steps(&self, message: &str) -> String {
+        let mut text = sentence(message);
+        for step in &self.steps {
+            if let Some(rest) = text.strip_suffix(step.as_str()) {
+                text = rest.trim_end().to_owned();
+            }
+        }
+        text
+    }
+
     fn failure(&mut self) {
         let Some(failure) = &self.status.failure else { return };
         let worker = failure.worker.map(|worker| format!(" in worker {worker}"));
-        let worker = worker.unwrap_or_default();
         let counts = match failure.class {
             FailureClass::Participant => "counts as an attempt",
             FailureClass::Infrastructure => "does not count as an attempt",
         };
-        let class = class(failure.class);
-        let text = format!("{}{worker}: {class}, {counts}.", failure.reason);
-        self.page.row("Failure", &text);
-        // While the run is being stopped, the message above is that of the stop.
-        if self.status.message.as_deref() != Some(failure.message.as_str()) {
-            self.page.row("", &failure.message);
+        let text = format!("{}{}, {counts}.", class(failure.class), worker.unwrap_or_default());
+        // While the run is being stopped, the reason above is that of the stop.
+        if self.status.present_reason().as_ref() == Some(&failure.reason) {
+            return self.page.row("Class", &text);
         }
+        self.page.row("Failure", &format!("{}: {text}", failure.reason));
+        let message = self.without_steps(&failure.message);
+        self.page.row("", &message);
     }
 
     /// The position in the line, and the limits of the Leaderboard.
@@ -127,7 +144,7 @@ impl Explanation<'_> {
             self.page.row("Next try", &text);
         }
         let Some(waiting) = &self.status.waiting else { return };
-        let eta = match waiting.eta() {
+        let eta = match facts::eta(waiting) {
             Some(eta) => format!("starts in about {eta}"),
             None if self.leaderboard.is_paused() => "no estimate while the Leaderboard is paused".to_owned(),
             None => "no estimate until runs of this track have ended".to_owned(),
@@ -147,11 +164,12 @@ impl Explanation<'_> {
         let status = self.status;
         let Some(attempt) = status.attempt else { return };
         let mut text = attempt.to_string();
+        let first = text.clone();
         if status.retry > 0 {
             let of = self.leaderboard.leaderboard();
             let of = of.map(|l| format!(" of {}", l.spec.retries.infrastructure));
             text = format!(
-                "{text}; {}{} retries after infrastructure failures, which do not count as attempts",
+                "{text}; {}{} retries after infrastructure failures",
                 status.retry,
                 of.unwrap_or_default()
             );
@@ -166,7 +184,9 @@ impl Explanation<'_> {
         if self.submission.spec.cancel && !has_ended(self.submission) {
             text = format!("{text}; its cancellation is requested");
         }
-        self.page.row("Attempt", &sentence(&text));
+        if text != first || attempt > Attempt::FIRST {
+            self.page.row("Attempt", &sentence(&text));
+        }
     }
 
     fn run(&mut self) {
@@ -196,10 +216,18 @@ impl Explanation<'_> {
     /// Which other systems have the result, and whether the scores can be trusted.
     fn systems(&mut self) {
         let logs = (conditions::LOGGED, "CloudWatch");
-        for (type_, system) in conditions::SYSTEMS.into_iter().chain([logs]) {
-            if let Some(condition) = conditions::get(&self.status.conditions, type_) {
-                self.page.row(system, &system_text(condition, system, self.now));
-            }
+        let all = conditions::SYSTEMS.into_iter().chain([logs]);
+        let all = all.filter_map(|(type_, system)| Some((system, conditions::get(&self.status.conditions, type_)?)));
+        let (have, open): (Vec<_>, Vec<_>) = all.partition(|(_, condition)| condition.is_true());
+        let (needless, open): (Vec<_>, Vec<_>) = open
+            .into_iter()
+            .partition(|(_, condition)| condition.reason == Reason::NotRequired);
+        for (label, systems) in [("Delivered", have), ("Not needed", needless)] {
+            let names: Vec<&str> = systems.into_iter().map(|(system, _)| system).collect();
+            self.page.row(label, &sentence(&names.join(", ")));
+        }
+        for (system, condition) in open {
+            self.page.row(system, &system_text(condition, system, self.now));
         }
         let plausible = conditions::get(&self.status.conditions, conditions::PLAUSIBLE);
         if let Some(doubt) = plausible.filter(|c| c.status == "False") {
@@ -214,12 +242,17 @@ impl Explanation<'_> {
             return;
         };
         let log = failure.reason.known().and_then(Reason::log);
-        let (Some(log), Some(results)) = (log, &self.status.results_url) else {
-            return self
-                .page
-                .row("Log", "no log explains it; the message has all that is known.");
+        let Some((log, results)) = log.zip(self.status.results_url.as_ref()) else {
+            return;
         };
         let log = of_worker(log, failure.worker);
+        let file = log.rsplit(", ").next().unwrap_or_default();
+        // The next step may name it.
+        let log = if self.steps.iter().any(|step| step.contains(file)) {
+            "it"
+        } else {
+            &log
+        };
         let text = format!("the last 10,000 characters of {log}. Hosts only: it may reveal private routes.");
         self.page.row("Log", &text);
         let storage = self.status.plan.as_ref().map(|plan| &plan.storage.s3);
@@ -230,8 +263,8 @@ impl Explanation<'_> {
     fn next(&mut self) {
         self.page.gap();
         let mut label = "Next";
-        for text in next_steps(self.submission, self.status, self.leaderboard) {
-            self.page.row(label, &text);
+        for text in &self.steps {
+            self.page.row(label, text);
             label = "";
         }
         if let Some(verb) = verb(self.submission, self.status) {

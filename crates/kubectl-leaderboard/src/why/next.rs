@@ -1,6 +1,6 @@
 //! The next steps of one submission: those of the table of reasons, and the command of this plugin that takes one.
 
-use leaderboard_api::{Failure, FailureClass, Reason, ReasonName, Submission, SubmissionStatus, conditions, reasons};
+use leaderboard_api::{Failure, FailureClass, Reason, Submission, SubmissionStatus, conditions, reasons};
 
 use crate::board::{self, Observed};
 use crate::facts::has_ended;
@@ -13,7 +13,11 @@ pub(super) fn of_worker(text: &str, worker: Option<i32>) -> String {
 
 /// What to do next; the step of the reason comes first.
 pub(super) fn next_steps(submission: &Submission, status: &SubmissionStatus, leaderboard: Observed<'_>) -> Vec<String> {
-    let mut reasons: Vec<Reason> = status.reason.as_ref().and_then(ReasonName::known).into_iter().collect();
+    let mut reasons: Vec<Reason> = status
+        .present_reason()
+        .and_then(|reason| reason.known())
+        .into_iter()
+        .collect();
     // While the run is being stopped, the reason is that of the stop.
     reasons.extend(status.failure.as_ref().and_then(|failure| failure.reason.known()));
     let doubt = conditions::get(&status.conditions, conditions::PLAUSIBLE).filter(|c| c.status == "False");
@@ -27,7 +31,12 @@ pub(super) fn next_steps(submission: &Submission, status: &SubmissionStatus, lea
     let worker = status.failure.as_ref().and_then(|failure| failure.worker);
     let mut steps: Vec<String> = Vec::new();
     let next = |reason| next_step(status.failure.as_deref(), reason);
-    for next in reasons.into_iter().map(next).map(|next| of_worker(next, worker)) {
+    let steps_of = |reason| match reason {
+        // The command stands below it.
+        Reason::Cancelled => "To continue it, resume it.".to_owned(),
+        reason => of_worker(next(reason), worker),
+    };
+    for next in reasons.into_iter().map(steps_of) {
         if !steps.contains(&next) {
             steps.push(next);
         }
@@ -60,7 +69,7 @@ pub(super) fn verb(submission: &Submission, status: &SubmissionStatus) -> Option
         return (is_resumable || status.shows(Reason::Cancelled)).then_some("resume");
     }
     let of_people = [Reason::TrackNotFound, Reason::ImageMissing, Reason::PhaseDiffers];
-    let reason = status.reason.as_ref();
+    let reason = status.present_reason();
     reason
         .is_some_and(|reason| reason.is_one_of(&of_people))
         .then_some("cancel")

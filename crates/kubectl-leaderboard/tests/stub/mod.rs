@@ -1,5 +1,7 @@
 //! An API server on a loopback port whose answers are given: nothing is stored.
 
+pub mod cluster;
+
 use std::io::{BufRead, BufReader, Read, Write};
 use std::net::{TcpListener, TcpStream};
 use std::path::PathBuf;

@@ -1,6 +1,6 @@
-//! Logs in the bucket, read with the person's own `aws` program and credentials: the plugin has no client of S3.
+//! The bucket, read with the person's own `aws` program and credentials: the plugin has no client of S3.
 //!
-//! Called by `logs` once the Pod is gone. A person without the program gets its commands.
+//! Called by `get`, and by `logs` once the Pod is gone. A person without the program gets its commands.
 
 use std::process::Stdio;
 
@@ -14,7 +14,7 @@ use crate::text::clean;
 /// Bytes of the program's errors that are read.
 const LONGEST_ERROR: u64 = 64 * 1024;
 
-/// Why a log was not read.
+/// Why the bucket was not read.
 #[derive(Debug, PartialEq, Eq)]
 pub enum Unread {
     /// There is no program `aws`.
@@ -23,28 +23,45 @@ pub enum Unread {
     Failed(String),
 }
 
-/// What `aws` is called with.
-fn arguments(object: &str, storage: Option<&S3Bucket>) -> Vec<String> {
-    let mut arguments = ["s3", "cp", "--only-show-errors"].map(str::to_owned).to_vec();
+/// The flags that name the place of a bucket.
+pub fn place(storage: Option<&S3Bucket>) -> Vec<String> {
     let places = [
         ("--region", storage.and_then(|storage| storage.region.as_ref())),
         ("--endpoint-url", storage.and_then(|storage| storage.endpoint.as_ref())),
     ];
-    for (flag, value) in places {
-        arguments.extend(value.map(|value| format!("{flag}={value}")));
-    }
-    arguments.extend([object.to_owned(), "-".to_owned()]);
+    let flags = places
+        .into_iter()
+        .filter_map(|(flag, value)| Some(format!("{flag}={}", value?)));
+    flags.collect()
+}
+
+/// What `aws` is called with for a copy, quiet but for errors.
+pub fn copy(from: &str, to: &str, storage: Option<&S3Bucket>) -> Vec<String> {
+    let mut arguments = ["s3", "cp", "--only-show-errors"].map(str::to_owned).to_vec();
+    arguments.extend(place(storage));
+    arguments.extend([from.to_owned(), to.to_owned()]);
     arguments
 }
 
 /// Hands each line of an object to `show`.
-pub async fn read(object: &str, storage: Option<&S3Bucket>, mut show: impl FnMut(&str)) -> Result<(), Unread> {
-    // An imported address is a text of a table's row: it must not become a flag, nor name a file of this machine.
-    if !object.starts_with("s3://") {
-        return Err(Unread::Failed(format!("{} is no address in a bucket", clean(object))));
+pub async fn read(object: &str, storage: Option<&S3Bucket>, show: impl FnMut(&str)) -> Result<(), Unread> {
+    is_address(object)?;
+    run(&copy(object, "-", storage), show).await
+}
+
+/// Refuses what is no address in a bucket. An imported address is a text of a table's row: it must not become a flag, nor name a file of
+/// this machine.
+pub fn is_address(object: &str) -> Result<(), Unread> {
+    if object.starts_with("s3://") {
+        return Ok(());
     }
+    Err(Unread::Failed(format!("{} is no address in a bucket", clean(object))))
+}
+
+/// Runs `aws`, and hands each line that it prints to `show`.
+pub async fn run(arguments: &[String], mut show: impl FnMut(&str)) -> Result<(), Unread> {
     let mut child = match Command::new("aws")
-        .args(arguments(object, storage))
+        .args(arguments)
         .stdin(Stdio::null())
         .stdout(Stdio::piped())
         .stderr(Stdio::piped())
@@ -105,7 +122,7 @@ mod tests {
         let storage = json!({"bucket": "b", "region": "eu-west-1", "endpoint": "https://s3.example"});
         let storage: S3Bucket = serde_json::from_value(storage).unwrap();
         assert_eq!(
-            arguments("s3://b/1/a.log", Some(&storage)),
+            copy("s3://b/1/a.log", "-", Some(&storage)),
             [
                 "s3",
                 "cp",

@@ -1,0 +1,237 @@
+//! `lint`: manifests checked by the schemas and the CEL rules of this version's definitions, without a cluster.
+//!
+//! `findings` is pure. What an API server alone knows, such as other objects and a change of an existing one, is not checked.
+
+mod manifest;
+mod schema;
+
+#[cfg(test)]
+mod tests;
+
+use std::path::PathBuf;
+use std::process::ExitCode;
+
+use clap::Args;
+use kube::CustomResourceExt;
+use kube_cel::{ErrorKind, Validator};
+use leaderboard_api::definitions::served;
+use leaderboard_api::text::sentence;
+use leaderboard_api::{GROUP, Leaderboard, Submission, VERSION};
+use serde_json::{Value, json};
+
+use self::manifest::Node;
+use self::schema::Fault;
+use crate::error::Error;
+use crate::import::text_of;
+use crate::near;
+use crate::output::{paragraphs, print};
+
+/// The manifests.
+#[derive(Args, Debug)]
+pub struct Lint {
+    /// Files with Leaderboards and Submissions in YAML or JSON, each with any number of objects; `-` is standard input.
+    #[arg(required = true, value_name = "FILE")]
+    files: Vec<PathBuf>,
+}
+
+/// A fault with its line.
+#[derive(Debug, PartialEq, Eq)]
+pub(super) struct Finding {
+    pub(super) line: u64,
+    pub(super) text: String,
+}
+
+/// Numbers of objects.
+#[derive(Debug, Default, PartialEq, Eq)]
+pub(super) struct Checked {
+    valid: usize,
+    faulty: usize,
+    /// Those of other groups.
+    others: usize,
+}
+
+/// Prints each fault with its file and line; the exit code shows whether there is one.
+pub fn lint(wanted: &Lint) -> Result<ExitCode, Error> {
+    let kinds = Kinds::new()?;
+    let mut is_well = true;
+    for path in &wanted.files {
+        let shown = if path.as_os_str() == "-" {
+            "standard input".to_owned()
+        } else {
+            path.display().to_string()
+        };
+        let (text, _) = text_of(path).map_err(|error| Error::Unread(shown.clone(), error))?;
+        let (findings, checked) = kinds.findings(&text);
+        // A pipe without an object has broken before this program.
+        is_well &= findings.is_empty() && checked != Checked::default();
+        print(&paragraphs(&lines(&shown, &findings, &checked)));
+    }
+    Ok(if is_well { ExitCode::SUCCESS } else { ExitCode::FAILURE })
+}
+
+/// What is printed of a file: each fault, and a sentence about all.
+pub(super) fn lines(file: &str, findings: &[Finding], checked: &Checked) -> Vec<String> {
+    let mut lines: Vec<String> = findings
+        .iter()
+        .map(|one| format!("{file}:{}: {}", one.line, one.text))
+        .collect();
+    let objects = |number: usize| format!("{number} object{}", if number == 1 { "" } else { "s" });
+    let mut parts = Vec::new();
+    match (checked.valid, checked.faulty, findings.len()) {
+        (0, 0, 0) if checked.others == 0 => parts.push("no object".to_owned()),
+        (0, 0, 0) => {}
+        (valid, 0, 0) => parts.push(format!("{} valid", objects(valid))),
+        (_, 0, _) => parts.push("not readable".to_owned()),
+        (valid, faulty, faults) => parts.push(format!(
+            "{faults} fault{} in {faulty} of {}",
+            if faults == 1 { "" } else { "s" },
+            objects(valid + faulty)
+        )),
+    }
+    if checked.others > 0 {
+        parts.push(format!("{} of other kinds not checked", objects(checked.others)));
+    }
+    lines.push(format!("{file}: {}.", parts.join(", ")));
+    lines
+}
+
+/// The schemas of both kinds, and what evaluates their rules.
+pub(super) struct Kinds {
+    schemas: [(&'static str, Value); 2],
+    rules: Validator,
+}
+
+impl Kinds {
+    pub(super) fn new() -> Result<Self, Error> {
+        let schema = |derived| {
+            let mut definition = served(derived).map_err(|error| Error::Malformed(error.to_string()))?;
+            Ok::<_, Error>(definition["spec"]["versions"][0]["schema"]["openAPIV3Schema"].take())
+        };
+        Ok(Self {
+            schemas: [
+                ("Leaderboard", schema(&Leaderboard::crd())?),
+                ("Submission", schema(&Submission::crd())?),
+            ],
+            rules: Validator::new(),
+        })
+    }
+
+    /// All faults of a file in the order of their lines.
+    pub(super) fn findings(&self, text: &str) -> (Vec<Finding>, Checked) {
+        let mut checked = Checked::default();
+        let nodes = match manifest::parse(text) {
+            Ok(nodes) => nodes,
+            Err((line, why)) => {
+                let text = format!("this is no YAML: {why}");
+                return (vec![Finding { line, text }], checked);
+            }
+        };
+        let mut findings = Vec::new();
+        for node in nodes {
+            let Some(faults) = self.faults(node.value()) else {
+                checked.others += 1;
+                continue;
+            };
+            if faults.is_empty() {
+                checked.valid += 1;
+            } else {
+                checked.faulty += 1;
+            }
+            findings.extend(faults.into_iter().map(|fault| finding(&node, fault)));
+        }
+        findings.sort_by_key(|finding| finding.line);
+        (findings, checked)
+    }
+
+    /// The faults of an object; none of one that another program defines.
+    fn faults(&self, mut object: Value) -> Option<Vec<Fault>> {
+        let (group, version) = object["apiVersion"].as_str().unwrap_or_default().split_once('/')?;
+        if group != GROUP {
+            return None;
+        }
+        let fault = |path: &str, text: String| {
+            Some(vec![Fault {
+                path: path.to_owned(),
+                text,
+            }])
+        };
+        if version != VERSION {
+            return fault(
+                "apiVersion",
+                format!("apiVersion is {group}/{version}. This program knows {GROUP}/{VERSION}"),
+            );
+        }
+        let kind = object["kind"].as_str().unwrap_or_default().to_owned();
+        let Some((_, schema)) = self.schemas.iter().find(|(known, _)| *known == kind) else {
+            let known = self.schemas.each_ref().map(|(known, _)| (*known).to_owned());
+            let near = near::names(&kind, &known);
+            let next = near.first().map_or_else(|| known.join(" or "), Clone::clone);
+            return fault("kind", format!("{GROUP} has no kind {kind:?}. Did you mean {next}?"));
+        };
+        let mut faults: Vec<Fault> = name_fault(&object["metadata"]).into_iter().collect();
+        // The API server leaves out a status that comes with a manifest.
+        let (mut spec, metadata) = (object["spec"].take(), named(object["metadata"].take()));
+        if spec.is_null() {
+            faults.extend(fault("", "spec is missing".to_owned())?);
+            return Some(faults);
+        }
+        schema::check(&schema["properties"]["spec"], &mut spec, "spec", &mut faults);
+        let whole = json!({"apiVersion": object["apiVersion"], "kind": kind, "metadata": metadata, "spec": spec});
+        faults.extend(self.broken_rules(schema, &whole, faults.is_empty()));
+        Some(faults)
+    }
+
+    /// The rules that an object breaks. Where the schema has faults already, a rule that cannot be evaluated is no fault of its own.
+    fn broken_rules(&self, schema: &Value, object: &Value, has_schema: bool) -> Vec<Fault> {
+        let broken = self.rules.validate(schema, object, None).err();
+        let broken = broken.into_iter().flat_map(kube_cel::ValidationErrors::into_vec);
+        let broken = broken.filter(|one| has_schema || one.kind == ErrorKind::ValidationFailure);
+        broken
+            .map(|one| Fault {
+                text: format!("{}: {}", one.field_path, one.message)
+                    .trim_start_matches(": ")
+                    .to_owned(),
+                path: one.field_path,
+            })
+            .collect()
+    }
+}
+
+fn finding(node: &Node, fault: Fault) -> Finding {
+    Finding {
+        line: node.line_of(&fault.path),
+        text: sentence(&fault.text),
+    }
+}
+
+/// Metadata with a name: the API server makes one of its start before it looks at the rules.
+fn named(mut metadata: Value) -> Value {
+    if metadata.is_object() && metadata["name"].is_null() {
+        let start = metadata["generateName"].as_str().unwrap_or_default();
+        metadata["name"] = json!(format!("{start}xxxxx"));
+    }
+    metadata
+}
+
+/// An object has a name that the API server takes, or the start of one.
+fn name_fault(metadata: &Value) -> Option<Fault> {
+    let (name, start) = (metadata["name"].as_str(), metadata["generateName"].as_str());
+    let (field, name) = match (name, start) {
+        (Some(name), _) => ("name", name),
+        (None, Some(start)) => ("generateName", start.trim_end_matches('-')),
+        (None, None) => {
+            let text = "metadata.name is missing".to_owned();
+            return Some(Fault {
+                path: "metadata".to_owned(),
+                text,
+            });
+        }
+    };
+    let is_plain = |c: char| c.is_ascii_lowercase() || c.is_ascii_digit() || "-.".contains(c);
+    let is_end = |c: char| !"-.".contains(c);
+    let is_well = name.len() <= 253 && name.chars().all(is_plain) && name.starts_with(is_end) && name.ends_with(is_end);
+    (!is_well).then(|| Fault {
+        path: format!("metadata.{field}"),
+        text: format!("metadata.{field} is {name:?}. It must be of small letters, digits, - and ., and begin and end with a letter or a digit"),
+    })
+}

@@ -1,0 +1,198 @@
+//! Faults of an object by the schema of its kind, as the API server finds them. Pure. The rules in CEL are `kube_cel`'s.
+
+use jiff::Timestamp;
+use regex::Regex;
+use serde_json::{Map, Value};
+
+use crate::near;
+
+/// A fault, with the path of the value that has it.
+#[derive(Debug, PartialEq, Eq)]
+pub struct Fault {
+    pub path: String,
+    pub text: String,
+}
+
+/// All faults of a value. A null that stands for a default is taken out, as the API server does.
+pub fn check(schema: &Value, value: &mut Value, path: &str, faults: &mut Vec<Fault>) {
+    let mut found = Vec::new();
+    if value.is_null() && schema["nullable"] == true {
+        return;
+    }
+    if !has_type(schema, value) {
+        found.push(format!("{path} must be {}, and is {}", type_of(schema), shown(value)));
+    } else if let Some(list) = schema["enum"].as_array().filter(|list| !list.contains(value)) {
+        let known: Vec<String> = list.iter().map(shown).collect();
+        found.push(format!("{path} is {}. It must be {}", shown(value), known.join(" or ")));
+    } else {
+        match value {
+            Value::Object(fields) => object(schema, fields, path, faults),
+            Value::Array(items) => {
+                faults.extend(list(schema, items, path));
+                for (index, item) in items.iter_mut().enumerate() {
+                    check(&schema["items"], item, &format!("{path}[{index}]"), faults);
+                }
+            }
+            Value::String(text) => {
+                found.extend(string(schema, text).map(|why| format!("{path} is {value}. It must {why}")))
+            }
+            Value::Number(number) => {
+                let number = number.as_f64().unwrap_or_default();
+                let below = schema["minimum"].as_f64().filter(|least| number < *least);
+                let above = schema["maximum"].as_f64().filter(|most| number > *most);
+                found.extend(below.map(|least| format!("{path} is {value}. It must be at least {least}")));
+                found.extend(above.map(|most| format!("{path} is {value}. It must be at most {most}")));
+            }
+            Value::Null | Value::Bool(_) => {}
+        }
+    }
+    faults.extend(found.into_iter().map(|text| Fault {
+        path: path.to_owned(),
+        text,
+    }));
+}
+
+fn has_type(schema: &Value, value: &Value) -> bool {
+    if schema["x-kubernetes-int-or-string"] == true {
+        return value.is_string() || value.is_i64() || value.is_u64();
+    }
+    match schema["type"].as_str() {
+        Some("object") => value.is_object(),
+        Some("array") => value.is_array(),
+        Some("string") => value.is_string(),
+        Some("boolean") => value.is_boolean(),
+        Some("integer") => value.is_i64() || value.is_u64(),
+        Some("number") => value.is_number(),
+        _ => true,
+    }
+}
+
+fn type_of(schema: &Value) -> &str {
+    match schema["type"].as_str() {
+        Some("object") => "a mapping",
+        Some("array") => "a list",
+        Some("string") => "a text",
+        Some("boolean") => "true or false",
+        Some("integer") => "a whole number",
+        Some(_) => "a number",
+        None => "a whole number or a text",
+    }
+}
+
+/// A value in few words.
+fn shown(value: &Value) -> String {
+    match value {
+        Value::Object(_) => "a mapping".to_owned(),
+        Value::Array(_) => "a list".to_owned(),
+        scalar => scalar.to_string(),
+    }
+}
+
+fn object(schema: &Value, fields: &mut Map<String, Value>, path: &str, faults: &mut Vec<Fault>) {
+    let nothing = Map::new();
+    let known = schema["properties"].as_object().unwrap_or(&nothing);
+    let at = |name: &str| join(path, name);
+    let is_default = |name: &String, value: &Value| {
+        let schema = known.get(name).filter(|_| value.is_null());
+        schema.is_some_and(|schema| schema["nullable"] != true && !schema["default"].is_null())
+    };
+    fields.retain(|name, value| !is_default(name, value));
+    let required = schema["required"]
+        .as_array()
+        .into_iter()
+        .flatten()
+        .filter_map(Value::as_str);
+    for name in required.filter(|name| !fields.contains_key(*name)) {
+        faults.push(Fault {
+            path: path.to_owned(),
+            text: format!("{} is missing", at(name)),
+        });
+    }
+    let most = schema["maxProperties"]
+        .as_u64()
+        .filter(|most| fields.len() as u64 > *most);
+    faults.extend(most.map(|most| Fault {
+        path: path.to_owned(),
+        text: format!("{path} has {} entries. It may have {most}", fields.len()),
+    }));
+    let names: Vec<String> = known.keys().cloned().collect();
+    for (name, value) in fields.iter_mut() {
+        let more = &schema["additionalProperties"];
+        if let Some(schema) = known.get(name) {
+            check(schema, value, &at(name), faults);
+        } else if more.is_object() {
+            check(more, value, &at(name), faults);
+        } else if more != true && schema["x-kubernetes-preserve-unknown-fields"] != true {
+            let near = near::names(name, &names);
+            let next = near.first().map(|near| format!(". Did you mean {near}?"));
+            faults.push(Fault {
+                path: at(name),
+                text: format!("there is no field {}{}", at(name), next.unwrap_or_default()),
+            });
+        }
+    }
+}
+
+/// A fault of a list itself: its length, or two items with one key.
+fn list(schema: &Value, items: &[Value], path: &str) -> Option<Fault> {
+    let fault = |path: String, text: String| Some(Fault { path, text });
+    let length = items.len() as u64;
+    if let Some(least) = schema["minItems"].as_u64().filter(|least| length < *least) {
+        return fault(
+            path.to_owned(),
+            format!("{path} has {length} items. It must have at least {least}"),
+        );
+    }
+    if let Some(most) = schema["maxItems"].as_u64().filter(|most| length > *most) {
+        return fault(
+            path.to_owned(),
+            format!("{path} has {length} items. It may have at most {most}"),
+        );
+    }
+    let keys = schema["x-kubernetes-list-map-keys"].as_array()?;
+    let key_of = |item: &Value| {
+        keys.iter()
+            .map(|key| item[key.as_str()?].as_str().map(str::to_owned))
+            .collect::<Vec<_>>()
+    };
+    let keyed: Vec<_> = items.iter().map(key_of).collect();
+    let mut twice = keyed.iter().enumerate();
+    let (index, key) = twice.find(|(index, key)| keyed.iter().take(*index).any(|one| one == *key))?;
+    let key: Vec<&str> = key.iter().flatten().map(String::as_str).collect();
+    let path = format!("{path}[{index}]");
+    let text = format!("{path} has the name of another item: {}", key.join(", "));
+    fault(path, text)
+}
+
+/// What a text must do and does not.
+fn string(schema: &Value, text: &str) -> Option<String> {
+    let length = text.chars().count() as u64;
+    if let Some(least) = schema["minLength"].as_u64().filter(|least| length < *least) {
+        return Some(format!("have at least {}", characters(least)));
+    }
+    if let Some(most) = schema["maxLength"].as_u64().filter(|most| length > *most) {
+        return Some(format!("have at most {}", characters(most)));
+    }
+    if schema["format"] == "date-time" && text.parse::<Timestamp>().is_err() {
+        return Some("be a time such as 2026-11-01T10:00:00Z".to_owned());
+    }
+    let pattern = schema["pattern"].as_str()?;
+    let is_match = Regex::new(pattern).is_ok_and(|pattern| pattern.is_match(text));
+    (!is_match).then(|| format!("match {pattern}"))
+}
+
+fn characters(number: u64) -> String {
+    if number == 1 {
+        "1 character".to_owned()
+    } else {
+        format!("{number} characters")
+    }
+}
+
+fn join(path: &str, name: &str) -> String {
+    if path.is_empty() {
+        name.to_owned()
+    } else {
+        format!("{path}.{name}")
+    }
+}

@@ -1,0 +1,128 @@
+//! `version`: this program's version, and that of the operator that drives the Leaderboards of the namespace. `lines` is pure.
+
+use std::collections::BTreeMap;
+use std::process::ExitCode;
+
+use clap::Args;
+use k8s_openapi::api::core::v1::Pod;
+use kube::ResourceExt;
+use serde_json::{Value, json};
+
+use crate::cluster::{Cluster, Target};
+use crate::commands::frame;
+use crate::dashboard::{operator_namespace, replicas};
+use crate::error::Error;
+use crate::output::{self, Output, print};
+use crate::text::Frame;
+
+/// This program's version.
+const OWN: &str = env!("CARGO_PKG_VERSION");
+/// Where the program of a version is.
+const RELEASES: &str = concat!(env!("CARGO_PKG_REPOSITORY"), "/releases/tag/v");
+/// The label by which the chart marks a Pod with the version.
+const LABEL: &str = "app.kubernetes.io/version";
+
+/// Whose version.
+#[derive(Args, Debug)]
+pub struct Version {
+    /// Only this program's: no cluster is asked.
+    #[arg(long)]
+    client: bool,
+    /// The operator's namespace [default: that of the operator which drives the Leaderboards of this namespace].
+    #[arg(long, value_name = "NAMESPACE")]
+    operator_namespace: Option<String>,
+    #[command(flatten)]
+    output: Output,
+}
+
+/// What runs: version and image, with the number of replicas.
+pub(super) type Running = BTreeMap<(String, String), usize>;
+
+/// Prints the versions. Without a cluster the own one is printed all the same.
+pub async fn version(target: Target, wanted: &Version) -> Result<ExitCode, Error> {
+    let asked = if wanted.client {
+        None
+    } else {
+        Some(ask(target, wanted).await)
+    };
+    let (operator, failed) = match asked {
+        None => (None, None),
+        Some(Ok(operator)) => (Some(operator), None),
+        Some(Err(error)) => (None, Some(error)),
+    };
+    let found = operator
+        .as_ref()
+        .map(|(namespace, running)| (namespace.as_str(), running));
+    let lines_of_it = output::document(wanted.output.format, &value(found));
+    print(&lines_of_it.unwrap_or_else(|| lines(OWN, found, frame())));
+    failed.map_or(Ok(ExitCode::SUCCESS), Err)
+}
+
+async fn ask(target: Target, wanted: &Version) -> Result<(String, Running), Error> {
+    let cluster = Cluster::connect(target).await?;
+    let asked = async {
+        let namespace = match &wanted.operator_namespace {
+            Some(namespace) => namespace.clone(),
+            None => operator_namespace(&cluster).await?,
+        };
+        let pods = replicas(&cluster, &namespace).await?;
+        Ok((namespace, running(&pods)))
+    };
+    asked.await.map_err(|error: Error| error.naming(&cluster.server))
+}
+
+/// The versions and images of the replicas.
+pub(super) fn running(pods: &[Pod]) -> Running {
+    let mut running = Running::new();
+    for pod in pods {
+        let version = pod.labels().get(LABEL).cloned().unwrap_or_else(|| "unknown".to_owned());
+        let container = pod.spec.as_ref().and_then(|spec| spec.containers.first());
+        let image = container
+            .and_then(|container| container.image.clone())
+            .unwrap_or_default();
+        *running.entry((version, image)).or_default() += 1;
+    }
+    running
+}
+
+fn value(operator: Option<(&str, &Running)>) -> Value {
+    let operator = operator.map(|(namespace, running)| {
+        let all = running
+            .iter()
+            .map(|((version, image), replicas)| json!({"version": version, "image": image, "replicas": replicas}));
+        json!({"namespace": namespace, "running": all.collect::<Vec<_>>()})
+    });
+    json!({"client": {"version": OWN}, "operator": operator})
+}
+
+/// Both versions, and what to do where they differ.
+pub(super) fn lines(own: &str, operator: Option<(&str, &Running)>, frame: Frame) -> Vec<String> {
+    let mut page = frame.page();
+    page.row("Client", own);
+    let Some((namespace, running)) = operator else {
+        return page.into_lines();
+    };
+    if running.is_empty() {
+        page.row("Operator", &format!("has no replica in namespace {namespace}."));
+    }
+    for ((version, image), replicas) in running {
+        let many = if *replicas == 1 { "replica" } else { "replicas" };
+        page.row(
+            "Operator",
+            &format!("{version}, {replicas} {many} in namespace {namespace}"),
+        );
+        page.whole("Image", image);
+    }
+    let others: Vec<&str> = running
+        .keys()
+        .map(|(version, _)| version.as_str())
+        .filter(|version| *version != own)
+        .collect();
+    if let Some(other) = others.first() {
+        page.gap();
+        page.paragraph(&format!(
+            "The versions differ, so this program may show less than the operator knows. Install version {other} of it: {RELEASES}{other}"
+        ));
+    }
+    page.into_lines()
+}
