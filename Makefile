@@ -17,10 +17,10 @@ BENCH_FLAGS ?=
 help: ## Explain every target
 	@awk -F ':.*## ' '/^[a-z-]+:.*## / { printf "  %-14s %s\n", $$1, $$2 }' $(MAKEFILE_LIST)
 
-demo: ## Start everything on this machine, run one submission from SQS message to score, and check it (30 min the first time); REGISTRY=NAME: on the cluster of KUBECONFIG
+demo: ## Start everything on this machine, run one submission from SQS message to score, and check it (about 13 min the first time); REGISTRY=NAME: on the cluster of KUBECONFIG
 	$(LAB) demo $(if $(REGISTRY),--registry $(REGISTRY))
 
-test: ## Run all tests: formats, pure logic, API server, the real cluster (root, Linux; 35 min the first time)
+test: ## Run all tests: formats, pure logic, API server, the real cluster (root, Linux; about 30 min the first time)
 	$(LAB) test
 
 test-core: ## Run the tests that need neither root nor a node
@@ -54,7 +54,7 @@ status: ## Say what of the cluster is up
 	$(LAB) status
 
 build: ## Build the operator
-	cargo build --profile $(PROFILE) --workspace --bins --test programs
+	cargo build --profile $(PROFILE) --workspace --bin leaderboard-operator --bin kubectl-leaderboard --bin evalai-stand-in
 
 static: ## Build the programs that go into other images, statically
 	$(STATIC) cargo build --release --target x86_64-unknown-linux-gnu -p leaderboard-runner

@@ -40,7 +40,7 @@ def is_whole(settings: Settings, name: str = STAND_IN) -> bool:
     return mark(settings, name).exists()
 
 
-def mark(settings: Settings, name: str) -> Path:
+def mark(settings: Settings, name: str = STAND_IN) -> Path:
     """Scripts in the environment hold its name, so it can't be renamed: this file shows that it is whole."""
     return home(settings, name) / ".complete"
 

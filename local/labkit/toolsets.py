@@ -84,12 +84,12 @@ SETS: dict[str, ToolSet] = {
             "-s -w",
             {
                 "promtool": Tool("github.com/prometheus/prometheus/cmd/promtool", 70),
-                "prometheus": Tool("github.com/prometheus/prometheus/cmd/prometheus", 30),
+                "prometheus": Tool("github.com/prometheus/prometheus/cmd/prometheus", 38),
             },
             tags="remove_all_sd",
         ),
-        ToolSet("otelcol", "-s -w", {"otelcol": Tool(".", 60)}),
-        ToolSet("gpu", "-s -w", {"fake-gpu": Tool(".", 30)}),
+        ToolSet("otelcol", "-s -w", {"otelcol": Tool(".", 56)}),
+        ToolSet("gpu", "-s -w", {"fake-gpu": Tool(".", 3)}),
         ToolSet(
             "containerd",
             "-s -w",

@@ -1,6 +1,7 @@
 """The keys of the tool cache, the order of building, and whose binaries win."""
 
 import os
+import re
 import tempfile
 import unittest
 from pathlib import Path
@@ -11,6 +12,11 @@ from labkit.errors import LabError
 from labkit.toolsets import SETS, build_flags, cache_key, in_build_order, kubernetes_ldflags, set_of
 
 REPOSITORY = Path(__file__).resolve().parents[2]
+
+
+def modules(file: Path) -> dict[str, str]:
+    """What a go.mod requires: module -> version."""
+    return dict(re.findall(r"^\s+(\S+\.\S+) (v\S+)", file.read_text(), re.MULTILINE))
 
 
 class Keys(unittest.TestCase):
@@ -51,6 +57,12 @@ class Sets(unittest.TestCase):
 
     def test_what_is_made_of_kubernetes_packages_is_in_its_module(self) -> None:
         self.assertEqual({set_of(name).name for name in ("etcd", "helm", "kubectl")}, {"kubernetes"})
+
+    def test_the_gpus_have_the_modules_of_kubernetes(self) -> None:
+        """Of another version Go would compile each package once more."""
+        wanted, found = (modules(REPOSITORY / "local" / "tools" / name / "go.mod") for name in ("kubernetes", "gpu"))
+        self.assertGreater(len(found), 40)
+        self.assertEqual({name: version for name, version in found.items() if wanted.get(name, version) != version}, {})
 
     def test_an_unknown_tool_is_refused_with_those_there_are(self) -> None:
         with self.assertRaisesRegex(LabError, "no tool is called kubeadm: choose from .*kubectl"):
