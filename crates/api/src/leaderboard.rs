@@ -21,6 +21,7 @@ use super::leaderboard_parts::{
     PodIdentity, Queue, Retries, SqsQueue, Storage, Table, Track,
 };
 use super::retention::Retention;
+use super::standings::{MAX_STANDINGS, Ranking, Standing};
 use super::submission_use::{MAX_USING_TEAMS, TeamUse};
 
 /// One leaderboard version: its tracks, the images that run it, and the services its results go to.
@@ -289,6 +290,14 @@ pub struct TrackStatus {
     pub name: String,
     /// The numbers of CARLA's evaluation.
     pub carla: CarlaShape,
+    /// Metric by which its results rank, and in which direction: as the leaderboard of its phase in EvalAI has them, else those of the
+    /// evaluation.
+    #[serde(default, skip_serializing_if = "Option::is_none")]
+    pub ranking: Option<Ranking>,
+    /// Best result of each team, the leader first, at most 20. Rows stay when their Submissions are deleted.
+    #[serde(default, skip_serializing_if = "Vec::is_empty")]
+    #[schemars(length(max = MAX_STANDINGS))]
+    pub standings: Vec<Standing>,
 }
 
 /// Submissions of a Leaderboard by state; `resumed` counts as running.

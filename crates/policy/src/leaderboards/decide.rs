@@ -305,6 +305,8 @@ fn tracks(leaderboard: &Leaderboard) -> Vec<TrackStatus> {
                 routes: number(shape.routes),
                 repetitions: number(shape.repetitions),
             },
+            ranking: None,
+            standings: Vec::new(),
         }
     };
     leaderboard.spec.tracks.iter().map(status).collect()
