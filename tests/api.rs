@@ -48,6 +48,7 @@ mod api {
     mod shared_queue;
     mod slots;
     mod suspended;
+    mod standings;
     mod switch;
     mod table;
     mod token;

@@ -12,6 +12,7 @@ mod priority;
 pub mod probe;
 mod reach;
 pub mod standing;
+mod standings;
 pub mod state;
 pub mod token;
 mod tried_pods;
@@ -37,9 +38,10 @@ use leaderboard_policy::ask::Service;
 use leaderboard_policy::census::Census;
 use leaderboard_policy::leaderboards::decide::{LeaderboardPlan, LeaderboardView, decide};
 use leaderboard_policy::leaderboards::refusal;
+use leaderboard_policy::leaderboards::standings::Results;
 use leaderboard_policy::leaderboards::view::Policy;
 use probe::{Asks, Looked};
-use state::{COUNTS_EVERY, LeaderboardState, RESYNC, SOONEST};
+use state::{LeaderboardState, Made, RESYNC, SOONEST};
 
 /// The first look at a spec gets so long before the status shows that it is under way: mostly it takes less, and saves a write.
 const FIRST_LOOK: Duration = Duration::from_secs(2);
@@ -96,10 +98,11 @@ async fn drive(leaderboard: Arc<Leaderboard>, uses: Uses<'_>) -> Result<Duration
         Some(_) => Looked::default(),
         None => uses.asks.ask(&leaderboard, is_refused(uses, &leaderboard)),
     };
+    let (view, made) = observe(uses, &leaderboard, policy, &looked, now);
     let view = LeaderboardView {
         is_looked_at: looked.waits().is_none(),
         refusal,
-        ..observe(uses, &leaderboard, policy, &looked, now)
+        ..view
     };
     let plan = decide(&view);
     if let Some(found) = &view.measured {
@@ -116,7 +119,10 @@ async fn drive(leaderboard: Arc<Leaderboard>, uses: Uses<'_>) -> Result<Duration
     let left = looked.waits().map(|waited| FIRST_LOOK.saturating_sub(waited));
     let again = match left.filter(|left| !left.is_zero()) {
         Some(left) => left,
-        None => write_status(writer, state, &leaderboard, version.as_deref(), &plan, now).await?,
+        None => {
+            let shown = (&plan, &made);
+            write_status(writer, state, &leaderboard, version.as_deref(), shown, now).await?
+        }
     };
     let patience = looked.reach.patience().unwrap_or(RESYNC);
     let policy = isolation::again(&view.policy, stores.shows_policy(&view.leaderboard));
@@ -160,18 +166,30 @@ fn observe(
     policy: Policy,
     looked: &Looked,
     now: Timestamp,
-) -> LeaderboardView {
+) -> (LeaderboardView, Made) {
     let (stores, hub) = (uses.policies.stores, &uses.external.hub);
     let key = key_of(leaderboard.as_ref());
     let submissions = stores.submissions_for(&ObjectRef::from_obj(leaderboard.as_ref()));
     let tried = looked.pods();
     let census = Census::of(submissions.iter().map(AsRef::as_ref));
-    LeaderboardView {
+    let made = Made {
+        results: census.results,
+        named: hub.labels(&key).0.map(|labels| labels.rankings),
+        generation: leaderboard.metadata.generation,
+        cancelled: standings::cancelled(hub, &key, leaderboard),
+    };
+    let is_new = uses.policies.state.is_news(&uid_of(leaderboard.as_ref()), &made);
+    let view = LeaderboardView {
         now,
         leaderboard: Arc::clone(leaderboard),
         all: stores.leaderboards.state(),
         counts: census.counts,
         gpu_use: census.gpu_use(),
+        named: made.named.clone(),
+        results: is_new.then(|| Results {
+            submissions,
+            cancelled: made.cancelled.clone(),
+        }),
         in_use: census.in_use,
         image_note: census.image_note(),
         pods: isolation::pods_left(stores, leaderboard),
@@ -188,7 +206,8 @@ fn observe(
         evalai_writes_from: hub.writes_from(),
         usage: hub.usage(&key).map(standing::evalai_use),
         rows_waiting: rows_waiting(uses, leaderboard),
-    }
+    };
+    (view, made)
 }
 
 /// None without a table.
@@ -205,7 +224,7 @@ async fn write_status(
     state: &LeaderboardState,
     leaderboard: &Leaderboard,
     version_now: Option<&str>,
-    plan: &LeaderboardPlan,
+    (plan, made): (&LeaderboardPlan, &Made),
     now: Timestamp,
 ) -> Result<Duration, CallError> {
     let uid = uid_of(leaderboard);
@@ -213,25 +232,18 @@ async fn write_status(
         return Ok(SOONEST);
     }
     let old = leaderboard.status.clone().unwrap_or_default();
+    let has_new_standings = old.tracks != plan.status.tracks;
     if old == plan.status {
+        state.note_made(&uid, made);
         return Ok(RESYNC);
     }
-    let only_numbers = leaderboard_api::LeaderboardStatus {
-        counts: old.counts,
-        evalai: old.evalai.clone(),
-        table: old.table.clone(),
-        gpu_use: old.gpu_use.clone(),
-        ..plan.status.clone()
-    } == old;
-    if only_numbers && !state.is_older(&uid, now, COUNTS_EVERY) {
-        return Ok(COUNTS_EVERY);
+    let left = state.time_to_write(&uid, &old, &plan.status, now);
+    if !left.is_zero() {
+        return Ok(left);
     }
-    // The number of requests moves with each of them; alone it is worth a write a minute.
-    if only_numbers && old.counts == plan.status.counts && !state.is_older(&uid, now, RESYNC) {
-        return Ok(RESYNC);
-    }
-    let made = apply_status(writer, leaderboard, version_now, &plan.status).await?;
-    state.change(&uid, |entry| entry.written = Some((now, version_number(&made))));
+    let written = apply_status(writer, leaderboard, version_now, &plan.status).await?;
+    state.note_written(&uid, now, version_number(&written), has_new_standings);
+    state.note_made(&uid, made);
     Ok(RESYNC)
 }
 

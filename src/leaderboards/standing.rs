@@ -102,6 +102,7 @@ mod tests {
         let labels = |problems| Labels {
             at: Timestamp::UNIX_EPOCH,
             problems,
+            rankings: std::collections::BTreeMap::new(),
         };
         let ends = || Some("EvalAI's token ends on 2027-01-01.".to_owned());
         assert_eq!(note(None, &labels(vec![]), None), None);

@@ -1,19 +1,23 @@
 //! What is remembered of each Leaderboard between two reconciles, by UID.
 
-use std::collections::HashMap;
+use std::collections::{BTreeSet, HashMap};
 use std::sync::Mutex;
 use std::time::Duration;
 
 use jiff::Timestamp;
 
+use leaderboard_api::{LeaderboardStatus, TrackStatus};
 use leaderboard_base::lock::lock;
 use leaderboard_contract::verdict::WorkspaceVerdict;
+use leaderboard_policy::leaderboards::standings::Named;
 use leaderboard_policy::leaderboards::view::Policy;
 
 /// A status whose counts alone have changed is written at most this often.
 pub(super) const COUNTS_EVERY: Duration = Duration::from_secs(5);
 /// The next reconcile that something is due for is at least so far away.
 pub(super) const SOONEST: Duration = Duration::from_secs(1);
+/// A status of which the standings alone have changed is written at most this often.
+pub(super) const STANDINGS_EVERY: Duration = Duration::from_secs(30);
 /// The cache shows a status that was written within this time, or not for a long while.
 const SHOWS: Duration = Duration::from_secs(15);
 /// A policy that the API server did not take is applied again after this long.
@@ -46,6 +50,17 @@ pub(super) struct Found {
     pub(super) verdict: WorkspaceVerdict,
 }
 
+/// What standings are made of: as long as it is the same, they are.
+#[derive(Clone, Debug, PartialEq)]
+pub(super) struct Made {
+    /// The census's mark of the results.
+    pub(super) results: u64,
+    pub(super) named: Named,
+    /// Of the spec.
+    pub(super) generation: Option<i64>,
+    pub(super) cancelled: BTreeSet<String>,
+}
+
 /// One entry for each Leaderboard.
 #[derive(Default)]
 pub struct LeaderboardState(Mutex<HashMap<String, Entry>>);
@@ -54,6 +69,8 @@ pub struct LeaderboardState(Mutex<HashMap<String, Entry>>);
 pub(super) struct Entry {
     /// When its status was written, and the version of it that the API server has made.
     pub(super) written: Option<(Timestamp, u64)>,
+    /// What its stored standings were made of, and when they were written.
+    pub(super) standings: (Option<Made>, Option<Timestamp>),
     pub(super) applied: Option<Applied>,
     /// What was measured last, of which generation.
     pub(super) measured: Option<(Option<i64>, WorkspaceVerdict)>,
@@ -64,6 +81,13 @@ pub(super) struct Entry {
 }
 
 impl LeaderboardState {
+    /// Whether the stored standings were made of other results than this mark is of. No before the first reconcile.
+    pub fn lacks_results(&self, uid: &str, mark: u64) -> bool {
+        self.read(uid, |entry| {
+            entry.standings.0.as_ref().is_some_and(|made| made.results != mark)
+        })
+    }
+
     /// Drops a Leaderboard that is gone.
     pub fn forget(&self, uid: &str) {
         lock(&self.0).remove(uid);
@@ -100,6 +124,58 @@ impl LeaderboardState {
         });
     }
 
+    /// Whether standings that are made of this may be others than the stored ones.
+    pub(super) fn is_news(&self, uid: &str, made: &Made) -> bool {
+        self.read(uid, |entry| entry.standings.0.as_ref() != Some(made))
+    }
+
+    /// How long a status that differs from the old one waits for its write. What is new of it decides: numbers wait, all else does not.
+    pub(super) fn time_to_write(
+        &self,
+        uid: &str,
+        old: &LeaderboardStatus,
+        new: &LeaderboardStatus,
+        now: Timestamp,
+    ) -> Duration {
+        let only_numbers = LeaderboardStatus {
+            counts: old.counts,
+            evalai: old.evalai.clone(),
+            table: old.table.clone(),
+            gpu_use: old.gpu_use.clone(),
+            tracks: with_standings_of(old, &new.tracks),
+            ..new.clone()
+        } == *old;
+        if !only_numbers {
+            return Duration::ZERO;
+        }
+        let left = |since: Option<Timestamp>, every: Duration| {
+            let passed = since.map_or(every, |since| now.duration_since(since).unsigned_abs());
+            every.saturating_sub(passed)
+        };
+        let (written, ranked) = self.read(uid, |entry| (entry.written.map(|(at, _)| at), entry.standings.1));
+        // The number of requests moves with each of them; alone it is worth a write a minute.
+        let of_counts = (old.counts != new.counts).then(|| left(written, COUNTS_EVERY));
+        let of_standings =
+            (old.tracks != new.tracks).then(|| left(ranked, STANDINGS_EVERY).max(left(written, COUNTS_EVERY)));
+        let first = of_counts.into_iter().chain(of_standings).min();
+        first.unwrap_or_else(|| left(written, RESYNC))
+    }
+
+    /// Its status was written, in this version.
+    pub(super) fn note_written(&self, uid: &str, now: Timestamp, version: u64, has_new_standings: bool) {
+        self.change(uid, |entry| {
+            entry.written = Some((now, version));
+            if has_new_standings {
+                entry.standings.1 = Some(now);
+            }
+        });
+    }
+
+    /// The stored standings are made of this.
+    pub(super) fn note_made(&self, uid: &str, made: &Made) {
+        self.change(uid, |entry| entry.standings.0 = Some(made.clone()));
+    }
+
     /// Whether its status was not written for so long.
     pub(super) fn is_older(&self, uid: &str, now: Timestamp, age: Duration) -> bool {
         self.read(uid, |entry| entry.written)
@@ -113,22 +189,81 @@ impl LeaderboardState {
     }
 }
 
+/// Tracks with the standings that a status has of them.
+fn with_standings_of(status: &LeaderboardStatus, tracks: &[TrackStatus]) -> Vec<TrackStatus> {
+    let mut tracks = tracks.to_vec();
+    for track in &mut tracks {
+        let stored = status.tracks.iter().find(|stored| stored.name == track.name);
+        track.standings = stored.map(|stored| stored.standings.clone()).unwrap_or_default();
+    }
+    tracks
+}
+
 #[cfg(test)]
 mod tests {
     use super::*;
 
-    #[test]
-    fn counts_are_written_at_once_and_then_once_in_five_seconds() {
+    fn status(finished: i32, leader: &str, requests: i32) -> LeaderboardStatus {
+        let status = serde_json::json!({
+            "counts": {"pending": 0, "running": 0, "finished": finished, "failed": 0, "cancelled": 0},
+            "evalai": {"requestsLastMinute": requests, "requestsPerMinute": 54},
+            "tracks": [{
+                "name": "sensors", "carla": {"pairs": 1, "routes": 1, "repetitions": 1},
+                "ranking": {"metric": "Driving score", "order": "Descending"},
+                "standings": [{"rank": 1, "submission": leader, "score": {"name": "Driving score", "value": "1", "text": "1"}}],
+            }],
+        });
+        serde_json::from_value(status).unwrap()
+    }
+
+    /// Moments of writes when each second has this status.
+    fn written(seconds: i64, status: impl Fn(i64) -> LeaderboardStatus) -> Vec<i64> {
         let state = LeaderboardState::default();
         let at = |second| Timestamp::from_second(second).unwrap();
-        // Each second another submission starts or ends.
-        let written = (0..60).filter(|second| {
-            let may = state.is_older("u", at(*second), COUNTS_EVERY);
-            if may {
-                state.change("u", |entry| entry.written = Some((at(*second), 1)));
+        let mut shown = status(0);
+        let mut moments = Vec::new();
+        for second in 1..=seconds {
+            let new = status(second);
+            if new == shown || !state.time_to_write("u", &shown, &new, at(second)).is_zero() {
+                continue;
             }
-            may
+            let has_new_standings = new.tracks != shown.tracks;
+            state.note_written("u", at(second), 1, has_new_standings);
+            shown = new;
+            moments.push(second);
+        }
+        moments
+    }
+
+    #[test]
+    fn counts_are_written_at_once_and_then_once_in_five_seconds() {
+        let found = written(12, |second| status(i32::try_from(second).unwrap(), "a", 1));
+        assert_eq!(found, [1, 6, 11]);
+    }
+
+    #[test]
+    fn standings_alone_are_written_at_once_and_then_once_in_thirty_seconds() {
+        let found = written(70, |second| status(1, &format!("s-{second}"), 1));
+        assert_eq!(found, [1, 31, 61]);
+    }
+
+    #[test]
+    fn new_standings_go_with_a_write_of_the_counts_and_cost_none_of_their_own() {
+        let one_in_ten = |second: i64| i32::try_from(second / 10).unwrap();
+        let found = written(60, |second| {
+            status(one_in_ten(second), &format!("s-{}", second / 10), 1)
         });
-        assert_eq!(written.take(3).collect::<Vec<_>>(), [0, 5, 10]);
+        assert_eq!(found, [10, 20, 30, 40, 50, 60]);
+    }
+
+    #[test]
+    fn the_number_of_requests_alone_is_written_once_a_minute_and_all_else_at_once() {
+        let found = written(130, |second| status(1, "a", i32::try_from(second).unwrap()));
+        assert_eq!(found, [1, 61, 121]);
+        let observed = |second| LeaderboardStatus {
+            observed_generation: Some(second),
+            ..status(1, "a", 1)
+        };
+        assert_eq!(written(3, observed), [1, 2, 3]);
     }
 }

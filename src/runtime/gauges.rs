@@ -1,4 +1,5 @@
-//! What the leader shows of what is there: one walk over the caches every 15 s. It wakes each Leaderboard whose status has other counts.
+//! What the leader shows of what is there: one walk over the caches every 15 s. It wakes each Leaderboard whose status has other counts or
+//! standings of other results.
 
 use std::collections::{BTreeMap, HashMap};
 use std::sync::Arc;
@@ -11,11 +12,12 @@ use kube::runtime::reflector::ObjectRef;
 use super::Shared;
 use super::queue::{Class, Queue};
 use super::reconciles::{LEADERBOARD, SUBMISSION};
+use crate::leaderboards::state::LeaderboardState;
 use crate::leaderboards::{self, operator};
 use crate::metrics::OTHERS;
 use crate::metrics::leader::{self, Samples};
 use crate::observability::Observability;
-use crate::runtime::objects::{board_of, key_of};
+use crate::runtime::objects::{board_of, key_of, uid};
 use leaderboard_api::{FailureClass, Leaderboard, ReasonName, State, Submission, SubmissionStatus, conditions};
 use leaderboard_policy::census::Census;
 use leaderboard_policy::submissions::awaits_publication;
@@ -54,7 +56,7 @@ pub(super) fn walk(shared: &Shared, now: Timestamp) -> Samples {
     boards.retain(|board| operator::is_ours(board, us));
     let submissions = context.stores.submissions.state();
     show_states(&mut samples, &submissions);
-    for board in show_boards(&mut samples, &boards, &submissions, now) {
+    for board in show_boards(&mut samples, &boards, &submissions, &context.leaderboards, now) {
         shared.queues.leaderboards.add(&board, Class::Refresh);
     }
     for board in &boards {
@@ -118,11 +120,13 @@ struct OfBoard {
     holders: BTreeMap<(Timestamp, String), i64>,
 }
 
-/// How each Leaderboard stands, how long its submissions have waited, and what they use. Returns those whose status has other counts.
+/// How each Leaderboard stands, how long its submissions have waited, and what they use. Returns those whose status has other counts, or standings
+/// of other results.
 fn show_boards(
     samples: &mut Samples,
     leaderboards: &[Arc<Leaderboard>],
     submissions: &[Arc<Submission>],
+    state: &LeaderboardState,
     now: Timestamp,
 ) -> Vec<ObjectRef<Leaderboard>> {
     let known = |leaderboard| (ObjectRef::from_obj(leaderboard), (leaderboard, OfBoard::default()));
@@ -140,7 +144,8 @@ fn show_boards(
         samples.set(&leader::READY, [&name], i64::from(is_ready));
         board.show(samples, &name, now);
         let counts = leaderboard.status.as_ref().and_then(|status| status.counts);
-        if counts != Some(board.census.counts) {
+        let lacks_results = state.lacks_results(uid(leaderboard), board.census.results);
+        if counts != Some(board.census.counts) || lacks_results {
             stale.push(reference);
         }
     }

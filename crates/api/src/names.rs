@@ -80,6 +80,12 @@ pub fn submission(id: i64) -> String {
     format!("submission-{id}")
 }
 
+/// Id of the EvalAI submission whose Submission has this name.
+pub fn id_of_submission(name: &str) -> Option<i64> {
+    let id = name.strip_prefix("submission-")?.parse().ok()?;
+    (submission(id) == name).then_some(id)
+}
+
 /// Name of a Job of a submission.
 pub fn job(submission: &str, number: JobNumber) -> String {
     format!("{submission}-{}", number.suffix())

@@ -140,7 +140,10 @@ impl Standing {
         let made = submission.metadata.creation_timestamp.as_ref();
         let row = Self {
             rank: 0,
-            team: submission.team_name().map(|name| one_line(&name, MAX_STANDING_TEAM)).unwrap_or_default(),
+            team: submission
+                .team_name()
+                .map(|name| one_line(&name, MAX_STANDING_TEAM))
+                .unwrap_or_default(),
             team_id: id.map(|id| one_line(id, MAX_STANDING_TEAM)),
             submission: submission.name_any(),
             uid: submission.uid(),
@@ -148,7 +151,11 @@ impl Standing {
             metrics: score.into_iter().chain(metrics).collect(),
             attempt: status.attempt,
             submitted_at: status.times.submitted.as_ref().or(made).cloned(),
-            finished_at: status.times.finished.clone().or_else(|| status.end().map(|end| end.last_transition_time.clone())),
+            finished_at: status
+                .times
+                .finished
+                .clone()
+                .or_else(|| status.end().map(|end| end.last_transition_time.clone())),
         };
         row.ranked_by(ranking)
     }
@@ -159,7 +166,10 @@ impl Standing {
         if self.score.name != ranking.metric {
             let all = &mut self.metrics;
             if !self.score.name.is_empty() {
-                let (name, value) = (std::mem::take(&mut self.score.name), std::mem::take(&mut self.score.value));
+                let (name, value) = (
+                    std::mem::take(&mut self.score.name),
+                    std::mem::take(&mut self.score.value),
+                );
                 all.insert(0, Metric { name, value });
             }
             let found = all.iter().position(|metric| metric.name == ranking.metric)?;
@@ -230,7 +240,10 @@ pub fn track_of(submission: &Submission) -> Option<&str> {
 ///
 /// Equal values go to the earlier submission, then to the name, so that the order never depends on the order of `rows`.
 pub fn rank(ranking: &Ranking, rows: impl IntoIterator<Item = Standing>) -> Vec<Standing> {
-    let mut rows: Vec<(f64, Standing)> = rows.into_iter().filter_map(|row| Some((row.number()? + 0.0, row))).collect();
+    let mut rows: Vec<(f64, Standing)> = rows
+        .into_iter()
+        .filter_map(|row| Some((row.number()? + 0.0, row)))
+        .collect();
     rows.sort_by(|(x, a), (y, b)| {
         let by_value = match ranking.order {
             Order::Ascending => x.total_cmp(y),

@@ -109,6 +109,10 @@ impl Client {
                 let path = format!("challenges/challenge/create/dataset_split/{id}/");
                 Reply::DatasetSplit(self.get(token, &path).await)
             }
+            Request::PhaseSplit(_, id) => {
+                let path = format!("challenges/challenge/create/challenge_phase_split/{id}/");
+                Reply::PhaseSplit(self.get(token, &path).await)
+            }
             Request::Receive(queue) => {
                 let path = format!("jobs/challenge/queues/{queue}/");
                 Reply::Message(self.get(token, &path).await.of_hosts())

@@ -8,6 +8,7 @@ use jiff::Timestamp;
 
 use super::row::{Phase, Split};
 use super::types::Target;
+use leaderboard_api::{Order, Ranking};
 
 /// What EvalAI shows of a challenge.
 #[derive(Clone, Debug, PartialEq)]
@@ -20,6 +21,8 @@ pub struct Catalog {
     pub splits: Vec<Split>,
     /// Codenames of dataset splits; none where EvalAI does not show them.
     pub codenames: BTreeMap<i64, Option<String>>,
+    /// Whether the highest value leads, by the ids of leaderboards whose schemas leave it open; none where EvalAI does not show it.
+    pub descending: BTreeMap<i64, Option<bool>>,
 }
 
 /// How a Leaderboard fits its challenge.
@@ -29,6 +32,8 @@ pub struct Labels {
     pub at: Timestamp,
     /// What does not fit.
     pub problems: Vec<Misfit>,
+    /// How each phase ranks, where its leaderboard names a metric.
+    pub rankings: BTreeMap<i64, Ranking>,
 }
 
 impl Labels {
@@ -71,7 +76,29 @@ pub fn compare(target: &Target, catalog: &Catalog) -> Labels {
             .iter()
             .flat_map(|phase| compare_phase(target, catalog, *phase))
             .collect(),
+        rankings: target
+            .phases
+            .iter()
+            .filter_map(|phase| Some((*phase, ranking(catalog, split_of(catalog, *phase, &target.split)?)?)))
+            .collect(),
     }
+}
+
+/// How a leaderboard ranks. EvalAI's own default is that the highest value leads.
+fn ranking(catalog: &Catalog, split: &Split) -> Option<Ranking> {
+    let metric = split.schema.default_order_by.as_deref()?;
+    let order = split.schema.order(metric).unwrap_or_else(|| {
+        let is_descending = catalog.descending.get(&split.id).copied().flatten();
+        if is_descending.unwrap_or(true) {
+            Order::Descending
+        } else {
+            Order::Ascending
+        }
+    });
+    Some(Ranking {
+        metric: metric.to_owned(),
+        order,
+    })
 }
 
 fn compare_phase(target: &Target, catalog: &Catalog, phase: i64) -> Vec<Misfit> {
@@ -117,6 +144,7 @@ mod tests {
     use super::*;
     use crate::row::Schema;
     use crate::token::Token;
+    use serde_json::{Value, json};
     use std::sync::Arc;
     use std::time::Duration;
 
@@ -144,10 +172,13 @@ mod tests {
 
     fn catalog(codename: Option<&str>) -> Catalog {
         let split = |phase, dataset_split, labels: &[&str]| Split {
+            id: phase,
             phase,
             dataset_split,
             schema: Schema {
                 labels: labels.iter().map(|label| (*label).to_owned()).collect(),
+                default_order_by: Some("A".into()),
+                metadata: Value::Null,
             },
         };
         Catalog {
@@ -157,7 +188,48 @@ mod tests {
                 .into(),
             splits: vec![split(1, 10, &["A", "B"]), split(2, 11, &["A", "B", "C"])],
             codenames: [(10, codename.map(str::to_owned)), (11, None)].into(),
+            descending: BTreeMap::new(),
         }
+    }
+
+    #[test]
+    fn each_phase_ranks_as_its_schema_says_then_as_its_leaderboard_is_set() {
+        let of = |schema: Value, descending| {
+            let mut catalog = catalog(Some("leaderboard"));
+            catalog.splits[0].schema = serde_json::from_value(schema).unwrap();
+            catalog.descending = descending;
+            compare(&target(&[1], &["A"]), &catalog).rankings.remove(&1)
+        };
+        let ranking = |metric: &str, order| {
+            let metric = metric.to_owned();
+            Some(Ranking { metric, order })
+        };
+        let plain = || json!({"labels": ["A", "B"], "default_order_by": "B"});
+        let says = |ascending: Value| {
+            let about = json!({"B": {"sort_ascending": ascending}});
+            json!({"labels": ["A", "B"], "default_order_by": "B", "metadata": about})
+        };
+        for (schema, descending, expected) in [
+            (plain(), vec![], ranking("B", Order::Descending)),
+            (plain(), vec![(1, None)], ranking("B", Order::Descending)),
+            (plain(), vec![(1, Some(true))], ranking("B", Order::Descending)),
+            (plain(), vec![(1, Some(false))], ranking("B", Order::Ascending)),
+            (says(json!(true)), vec![(1, Some(true))], ranking("B", Order::Ascending)),
+            (
+                says(json!(false)),
+                vec![(1, Some(false))],
+                ranking("B", Order::Descending),
+            ),
+            (json!({"labels": ["A"]}), vec![], None),
+        ] {
+            assert_eq!(
+                of(schema.clone(), descending.into_iter().collect()),
+                expected,
+                "{schema}"
+            );
+        }
+        let other = compare(&target(&[2, 3], &["A"]), &catalog(Some("leaderboard")));
+        assert_eq!(other.rankings.keys().collect::<Vec<_>>(), [&2]);
     }
 
     #[test]

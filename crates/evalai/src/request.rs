@@ -5,7 +5,7 @@ use std::sync::Arc;
 use jiff::Timestamp;
 
 use super::answer::Answer;
-use super::row::{DatasetSplit, Phase, Received, Row, Split};
+use super::row::{DatasetSplit, Phase, PhaseSplit, Received, Row, Split};
 use super::types::{ImageAnswer, Key, Payload};
 use leaderboard_api::Attempt;
 use leaderboard_api::evalai_status::{Outcome, Progress};
@@ -62,6 +62,8 @@ pub enum Request {
     Phases(i64),
     Splits(i64),
     DatasetSplit(i64, i64),
+    /// The settings of a leaderboard of a challenge.
+    PhaseSplit(i64, i64),
     /// One message of a challenge's queue, by the queue's name.
     Receive(String),
     /// The row of a message's submission.
@@ -93,6 +95,7 @@ impl Request {
             | Self::Phases(_)
             | Self::Splits(_)
             | Self::DatasetSplit(..)
+            | Self::PhaseSplit(..)
             | Self::Receive(_)
             | Self::MessageRow(_)
             | Self::DeleteMessage(..) => None,
@@ -118,6 +121,7 @@ impl Request {
             Self::Phases(_) => "get_phases",
             Self::Splits(_) => "get_splits",
             Self::DatasetSplit(..) => "get_dataset_split",
+            Self::PhaseSplit(..) => "get_phase_split",
             Self::Receive(_) => "receive_message",
             Self::MessageRow(_) => "get_message_row",
             Self::DeleteMessage(..) => "delete_message",
@@ -141,6 +145,7 @@ impl Request {
             Self::Phases(_) => "phases",
             Self::Splits(_) => "splits",
             Self::DatasetSplit(..) => "dataset split",
+            Self::PhaseSplit(..) => "phase split",
             Self::Receive(_) => "message",
             Self::MessageRow(_) => "row of a message",
             Self::DeleteMessage(..) => "deletion of a message",
@@ -159,6 +164,7 @@ pub enum Reply {
     Phases(Answer<Vec<Phase>>),
     Splits(Answer<Vec<Split>>),
     DatasetSplit(Answer<DatasetSplit>),
+    PhaseSplit(Answer<PhaseSplit>),
     Message(Answer<Received>),
 }
 
@@ -182,6 +188,7 @@ impl Reply {
             Self::Phases(answer) => bare(answer),
             Self::Splits(answer) => bare(answer),
             Self::DatasetSplit(answer) => bare(answer),
+            Self::PhaseSplit(answer) => bare(answer),
             Self::Message(answer) => bare(answer),
         }
     }

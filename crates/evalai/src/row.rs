@@ -10,7 +10,7 @@ use serde_json::Value;
 use super::job_names::JobNames;
 use leaderboard_api::evalai_status::Status;
 use leaderboard_api::text::{LONGEST_NAME, one_line};
-use leaderboard_api::{Attempt, ImageReference, names};
+use leaderboard_api::{Attempt, ImageReference, Order, names};
 
 /// A submission as EvalAI shows it to a host.
 #[derive(Clone, Debug, PartialEq)]
@@ -146,6 +146,8 @@ fn is_true<'de, D: Deserializer<'de>>(deserializer: D) -> Result<bool, D::Error>
 /// A leaderboard of a phase. The codename of its dataset split stands elsewhere.
 #[derive(Clone, Debug, PartialEq, Eq, Deserialize)]
 pub struct Split {
+    /// Its own id.
+    pub id: i64,
     /// Id of the phase.
     #[serde(rename = "challenge_phase")]
     pub phase: i64,
@@ -161,6 +163,42 @@ pub struct Split {
 pub struct Schema {
     /// The metrics it knows.
     pub labels: Vec<String>,
+    /// The metric that ranks.
+    #[serde(default, deserialize_with = "any_text")]
+    pub default_order_by: Option<String>,
+    /// What it says of each metric.
+    #[serde(default)]
+    pub metadata: Value,
+}
+
+impl Schema {
+    /// Whether it names a metric that ranks, and not in which order.
+    pub fn leaves_order_open(&self) -> bool {
+        let metric = self.default_order_by.as_deref();
+        metric.is_some_and(|metric| self.order(metric).is_none())
+    }
+
+    /// The order of a metric, as EvalAI reads it: what it says of a metric is ascending unless `sort_ascending` is false. None where it says
+    /// nothing, and the leaderboard's own order holds.
+    pub fn order(&self, metric: &str) -> Option<Order> {
+        let about = self.metadata.get(metric).filter(|about| !about.is_null())?;
+        Some(match about.get("sort_ascending") {
+            Some(Value::Bool(false)) => Order::Descending,
+            _ => Order::Ascending,
+        })
+    }
+}
+
+fn any_text<'de, D: Deserializer<'de>>(deserializer: D) -> Result<Option<String>, D::Error> {
+    Ok(Value::deserialize(deserializer)?.as_str().map(str::to_owned))
+}
+
+/// A leaderboard's own settings.
+#[derive(Clone, Copy, Debug, PartialEq, Eq, Deserialize)]
+pub struct PhaseSplit {
+    /// Whether the highest value leads, where the schema says nothing of the metric.
+    #[serde(rename = "is_leaderboard_order_descending")]
+    pub is_descending: bool,
 }
 
 /// A message of a challenge's queue, or that there is none.
@@ -237,6 +275,30 @@ mod tests {
             (Status::Cancelled, None, None, 0)
         );
         assert!(serde_json::from_value::<Row>(json!({"id": 7})).is_err());
+    }
+
+    #[test]
+    fn a_metric_is_ordered_as_evalai_reads_its_schema() {
+        let of = |schema: Value| serde_json::from_value::<Schema>(schema).unwrap();
+        let about = |about: Value| of(json!({"labels": ["A"], "default_order_by": "A", "metadata": {"A": about}}));
+        for (said, expected) in [
+            (json!({"sort_ascending": true}), Some(Order::Ascending)),
+            (json!({"sort_ascending": false}), Some(Order::Descending)),
+            (json!({"description": "x"}), Some(Order::Ascending)),
+            (json!({"sort_ascending": null}), Some(Order::Ascending)),
+            (json!({}), Some(Order::Ascending)),
+            (json!(null), None),
+        ] {
+            assert_eq!(about(said.clone()).order("A"), expected, "{said}");
+        }
+        assert_eq!(about(json!({})).order("B"), None);
+        for odd in [
+            json!({"labels": []}),
+            json!({"labels": [], "default_order_by": 7, "metadata": "x"}),
+        ] {
+            let schema = of(odd);
+            assert_eq!((schema.default_order_by.clone(), schema.order("A")), (None, None));
+        }
     }
 
     #[test]

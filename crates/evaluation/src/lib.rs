@@ -21,7 +21,7 @@ pub mod workload;
 
 use std::sync::Arc;
 
-use leaderboard_api::{LeaderboardSpec, RunPlan};
+use leaderboard_api::{LeaderboardSpec, Ranking, RunPlan};
 use leaderboard_contract::run::Run;
 use leaderboard_evidence::{Tree, TreeError};
 use leaderboard_protocol::files::Pair;
@@ -36,6 +36,12 @@ pub trait Evaluation {
 
     /// The numbers of a result, in EvalAI's order.
     fn columns(&self) -> Vec<Column>;
+
+    /// Names of the numbers that a result's status shows, the one that ranks where EvalAI names none first.
+    fn measures(&self) -> &'static [&'static str];
+
+    /// The number that ranks, and its order, where EvalAI names none.
+    fn ranking(&self) -> Ranking;
 
     /// Names that no host may use.
     fn reserved(&self) -> Reserved;

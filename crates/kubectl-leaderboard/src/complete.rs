@@ -56,7 +56,7 @@ pub fn offer(command: &Command, words: &[String]) -> Offer {
         }
         Some(verb) if verb.get_positionals().next().is_none() => Offer::Words(Vec::new()),
         Some(verb) if ["import", "lint", "man"].contains(&verb.get_name()) => Offer::Files,
-        Some(verb) if ["check", "pause", "unpause"].contains(&verb.get_name()) => Offer::Leaderboards,
+        Some(verb) if ["check", "pause", "scores", "unpause"].contains(&verb.get_name()) => Offer::Leaderboards,
         Some(_) => Offer::Submissions,
     }
 }
@@ -132,6 +132,7 @@ mod tests {
             (&["status", "-w", ""], Offer::Submissions),
             (&["why", "sub"], Offer::Submissions),
             (&["check", ""], Offer::Leaderboards),
+            (&["scores", ""], Offer::Leaderboards),
             (&["submit", "--leaderboard", ""], Offer::Leaderboards),
             (&["top", ""], words(&[])),
             (&["status", "--leaderboard", ""], Offer::Leaderboards),

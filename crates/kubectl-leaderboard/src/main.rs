@@ -13,6 +13,7 @@ mod check;
 mod cluster;
 mod commands;
 mod complete;
+mod csv;
 mod dashboard;
 mod error;
 mod facts;
@@ -30,6 +31,7 @@ mod overview;
 mod pause;
 mod report;
 mod resume;
+mod scores;
 mod status;
 mod submit;
 mod table;
@@ -86,6 +88,11 @@ enum Command {
         #[command(flatten)]
         output: Output,
     },
+    /// Show who leads each track: the best result of each team.
+    #[command(
+        after_help = "Examples:\n  kubectl leaderboard scores\n  kubectl leaderboard scores carla --track sensors\n  kubectl leaderboard scores -A -o csv > scores.csv"
+    )]
+    Scores(scores::Scores),
     /// List what a submission has stored, or copy it into a folder.
     Get(get::Get),
     /// Submit an image to a track, without EvalAI.
@@ -259,6 +266,7 @@ async fn carry_out_there(command: Command, cluster: &Cluster) -> Result<ExitCode
         Command::Pause(wanted) => pause::pause(cluster, &wanted, true).await,
         Command::Unpause(wanted) => pause::pause(cluster, &wanted, false).await,
         Command::Top { scope, output } => commands::top(cluster, &scope, output.format).await,
+        Command::Scores(wanted) => scores::scores(cluster, &wanted).await,
         Command::Submit(wanted) => changes::submit(cluster, &wanted).await,
         Command::Dashboard(wanted) => Box::pin(dashboard::dashboard(cluster, &wanted))
             .await

@@ -7,7 +7,7 @@ const GAP: usize = 2;
 /// The fewest columns to which a cell is cut.
 const LEAST: usize = 8;
 /// What is copied from a table or searched for, so it is not cut.
-const WHOLE: [&str; 4] = ["NAMESPACE", "NAME", "STATE", "REASON"];
+const WHOLE: [&str; 5] = ["NAMESPACE", "NAME", "SUBMISSION", "STATE", "REASON"];
 /// What `why`, `logs` and `-o wide` show as well, so that a narrow terminal may go without it.
 const SPARE: [&str; 4] = ["QUEUE", "CRASHES", "NODE", "SIMULATOR"];
 /// What is cut at its start: the tags of an image's versions differ at the end.

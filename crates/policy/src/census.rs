@@ -2,8 +2,10 @@
 
 use std::cmp::Reverse;
 use std::collections::{BTreeMap, BTreeSet};
+use std::hash::{DefaultHasher, Hash, Hasher};
 
 use leaderboard_api::leaderboard::Counts;
+use leaderboard_api::standings::is_candidate;
 use leaderboard_api::{MAX_USING_TEAMS, Reason, State, Submission, SubmissionStatus, TeamUse, conditions};
 
 /// Checks are in no count.
@@ -12,6 +14,8 @@ pub struct Census {
     pub counts: Counts,
     /// Submissions that are live, or whose end is not yet published and recorded.
     pub in_use: usize,
+    /// Changes when a result that ranks comes, goes or changes.
+    pub results: u64,
     /// GPU seconds of each team that has used any.
     teams: BTreeMap<String, i64>,
     /// The teams of those whose images cannot be pulled at present, by the names of the submissions.
@@ -44,6 +48,7 @@ impl Census {
         if submission.spec.check {
             return;
         }
+        self.results = self.results.wrapping_add(mark(submission));
         let counts = &mut self.counts;
         let count = match status.map_or(State::Pending, SubmissionStatus::state_of_conditions) {
             State::Pending => &mut counts.pending,
@@ -79,6 +84,22 @@ impl Census {
             )
         })
     }
+}
+
+/// Zero for a Submission that does not rank.
+fn mark(submission: &Submission) -> u64 {
+    if !is_candidate(submission) {
+        return 0;
+    }
+    let mut hasher = DefaultHasher::new();
+    let status = submission.status.as_ref();
+    submission.metadata.uid.hash(&mut hasher);
+    status
+        .and_then(|status| status.score.as_ref())
+        .map(|score| &score.value)
+        .hash(&mut hasher);
+    submission.team().hash(&mut hasher);
+    hasher.finish()
 }
 
 fn lacks_image(status: &SubmissionStatus) -> bool {

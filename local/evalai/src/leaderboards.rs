@@ -31,11 +31,26 @@ pub(crate) fn entries(state: &State, split: u64, order_by: Option<&str>) -> Resu
     {
         return Err(Reply::server_error());
     }
-    found.sort_by(|(a, _), (b, _)| score(b).partial_cmp(&score(a)).unwrap_or(Ordering::Equal));
+    found.sort_by(|(a, _), (b, _)| {
+        let by_score = score(a).partial_cmp(&score(b)).unwrap_or(Ordering::Equal);
+        if is_descending(board, order) {
+            by_score.reverse()
+        } else {
+            by_score
+        }
+    });
     let mut teams = BTreeSet::new();
     found.retain(|(_, submission)| submission.is_baseline || teams.insert(submission.participant_team));
     let entry = |(row, submission)| entry(state, board, row, submission, score(row));
     Ok(found.into_iter().map(entry).collect())
+}
+
+/// What the schema says of a metric comes before the split's own order, and is ascending unless it says otherwise.
+fn is_descending(board: &Split, metric: &str) -> bool {
+    match board.schema.metadata.get(metric).filter(|about| !about.is_null()) {
+        Some(about) => about.get("sort_ascending") == Some(&Value::Bool(false)),
+        None => board.is_leaderboard_order_descending,
+    }
 }
 
 fn is_shown(state: &State, split: u64, submission: &Submission) -> bool {

@@ -217,6 +217,9 @@ pub struct Split {
     /// Everybody may read it.
     #[serde(default = "yes")]
     pub public: bool,
+    /// The highest value leads, where the schema says nothing of the metric.
+    #[serde(default = "yes")]
+    pub is_leaderboard_order_descending: bool,
     /// Primary key of its leaderboard.
     pub leaderboard: u64,
     /// The leaderboard's columns.
@@ -241,6 +244,9 @@ pub struct Schema {
     pub labels: Vec<String>,
     /// The metric that ranks.
     pub default_order_by: String,
+    /// Of each metric, such as `{"A": {"sort_ascending": true}}`.
+    #[serde(default, skip_serializing_if = "Value::is_null")]
+    pub metadata: Value,
 }
 
 /// A submission: the whole row, as the server reads it and saves it.

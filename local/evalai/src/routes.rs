@@ -45,6 +45,8 @@ pub enum Endpoint {
     Splits(u64),
     /// `challenges/challenge/create/dataset_split/{d}/`
     DatasetSplit(u64),
+    /// `challenges/challenge/create/challenge_phase_split/{s}/`
+    PhaseSplit(u64),
 }
 
 impl Endpoint {
@@ -62,7 +64,10 @@ impl Endpoint {
 
     /// May be read without signing in.
     pub fn is_public(&self) -> bool {
-        matches!(self, Self::Leaderboard(_) | Self::Phase(..) | Self::Splits(_))
+        matches!(
+            self,
+            Self::Leaderboard(_) | Self::Phase(..) | Self::Splits(_) | Self::PhaseSplit(_)
+        )
     }
 
     /// A user who signs in must have a confirmed e-mail address.
@@ -122,6 +127,7 @@ fn endpoint(path: &str) -> Option<Endpoint> {
         ["jobs", "challenge_phase_split", s, "leaderboard", ""] => Endpoint::Leaderboard(key(s)?),
         ["challenges", "challenge", "queues", queue, ""] => Endpoint::ChallengeOfQueue(name(queue)?),
         ["challenges", "challenge", "create", "dataset_split", d, ""] => Endpoint::DatasetSplit(key(d)?),
+        ["challenges", "challenge", "create", "challenge_phase_split", s, ""] => Endpoint::PhaseSplit(key(s)?),
         ["challenges", "challenge", c, "challenge_phase", p] => Endpoint::Phase(key(c)?, key(p)?),
         ["challenges", c, "phases", ""] => Endpoint::Phases(key(c)?),
         ["challenges", c, "challenge_phase_split"] => Endpoint::Splits(key(c)?),

@@ -184,6 +184,22 @@ pub fn split(phase: &Phase, row: &Split) -> Value {
     })
 }
 
+/// The same with what only its own request shows.
+pub fn split_settings(phase: &Phase, row: &Split) -> Value {
+    json!({
+        "id": row.id,
+        "challenge_phase": phase.id,
+        "dataset_split": row.dataset_split.id,
+        "leaderboard": row.leaderboard,
+        "visibility": if row.public { 3 } else { 1 },
+        "leaderboard_decimal_precision": 2,
+        "is_leaderboard_order_descending": row.is_leaderboard_order_descending,
+        "show_leaderboard_by_latest_submission": false,
+        "show_execution_time": false,
+        "show_scores_on_leaderboard": true,
+    })
+}
+
 #[cfg(test)]
 mod tests {
     use super::*;

@@ -195,6 +195,17 @@ async fn context_is_what_a_worker_reads_before_it_writes() {
         splits[0]["dataset_split"]
     );
     assert_eq!(stand.get(&path, HOST).await.ok().json()["codename"], "leaderboard");
+    let path = format!(
+        "/api/challenges/challenge/create/challenge_phase_split/{}/",
+        splits[0]["id"]
+    );
+    let own = stand.get(&path, HOST).await.ok().json();
+    assert_eq!(own["is_leaderboard_order_descending"], json!(true));
+    assert_eq!(
+        splits[0].get("is_leaderboard_order_descending"),
+        None,
+        "the list lacks it"
+    );
     let phases = stand.get("/api/challenges/1/phases/", HOST).await.ok().json();
     assert_eq!(
         (&phases[0]["codename"], &phases[1]["codename"]),

@@ -69,7 +69,13 @@ fn boards(leaderboards: impl IntoIterator<Item = Leaderboard>, submissions: &[Su
     let mut samples = Samples::default();
     let leaderboards: Vec<_> = leaderboards.into_iter().map(Arc::new).collect();
     let submissions: Vec<_> = submissions.iter().cloned().map(Arc::new).collect();
-    show_boards(&mut samples, &leaderboards, &submissions, now());
+    show_boards(
+        &mut samples,
+        &leaderboards,
+        &submissions,
+        &LeaderboardState::default(),
+        now(),
+    );
     samples
 }
 

@@ -30,7 +30,9 @@ fn condition(type_: &str, status: &str, reason: &str) -> Value {
 }
 
 fn objects(all: impl IntoIterator<Item = Value>) -> Vec<Submission> {
-    all.into_iter().map(|one| serde_json::from_value(one).unwrap()).collect()
+    all.into_iter()
+        .map(|one| serde_json::from_value(one).unwrap())
+        .collect()
 }
 
 fn of(ranking: &Ranking, all: &[Submission], stored: &[Standing]) -> Vec<(i32, String, String)> {
@@ -40,7 +42,8 @@ fn of(ranking: &Ranking, all: &[Submission], stored: &[Standing]) -> Vec<(i32, S
 
 fn rows(expected: &[(i32, &str, &str)]) -> Vec<(i32, String, String)> {
     let rows = expected.iter();
-    rows.map(|(rank, name, score)| (*rank, (*name).to_owned(), (*score).to_owned())).collect()
+    rows.map(|(rank, name, score)| (*rank, (*name).to_owned(), (*score).to_owned()))
+        .collect()
 }
 
 #[test]
@@ -52,8 +55,14 @@ fn each_team_has_its_best_result_in_the_order_of_the_metric() {
         finished("s-4", "c", "100.00", 4),
     ]);
     for (order, expected) in [
-        (Order::Descending, [(1, "s-4", "100.00"), (2, "s-3", "43.13"), (3, "s-2", "9.50")]),
-        (Order::Ascending, [(1, "s-2", "9.50"), (2, "s-1", "40.00"), (3, "s-4", "100.00")]),
+        (
+            Order::Descending,
+            [(1, "s-4", "100.00"), (2, "s-3", "43.13"), (3, "s-2", "9.50")],
+        ),
+        (
+            Order::Ascending,
+            [(1, "s-2", "9.50"), (2, "s-1", "40.00"), (3, "s-4", "100.00")],
+        ),
     ] {
         assert_eq!(of(&driving(order), &all, &[]), rows(&expected), "{order:?}");
     }
@@ -100,13 +109,19 @@ fn what_has_no_result_that_counts_does_not_rank() {
         ("another track", changed("/status/track", json!("map"))),
         ("no status", changed("/status", Value::Null)),
         ("running", conditions(json!([condition("Running", "True", "Running")]))),
-        ("failed", changed("/status/conditions/0", condition("Finished", "True", "AgentCrashed"))),
+        (
+            "failed",
+            changed("/status/conditions/0", condition("Finished", "True", "AgentCrashed")),
+        ),
         ("not final", changed("/status/score/final", json!(false))),
         ("no number", changed("/status/score/value", json!("NaN"))),
         ("no score", changed("/status/score", Value::Null)),
         (
             "cancelled in EvalAI",
-            changed("/status/conditions/1", condition("Published", "False", "CancelledInEvalAI")),
+            changed(
+                "/status/conditions/1",
+                condition("Published", "False", "CancelledInEvalAI"),
+            ),
         ),
     ];
     for (name, one) in cases {
@@ -124,12 +139,18 @@ fn the_score_is_the_metric_that_ranks_and_the_others_follow() {
         order: Order::Descending,
     };
     let row = standings("sensors", &completion, &all, &[]).remove(0);
-    assert_eq!((row.score.name.as_str(), row.score.value.as_str()), ("Route completion", "80.00"));
+    assert_eq!(
+        (row.score.name.as_str(), row.score.value.as_str()),
+        ("Route completion", "80.00")
+    );
     let names = |row: &Standing| row.metrics.iter().map(|metric| metric.name.clone()).collect::<Vec<_>>();
     assert_eq!(names(&row), ["Driving score", "Infraction penalty"]);
     // The metric that ranks is another one now: a stored row has both.
     let again = standings("sensors", &driving(Order::Descending), &[], &[row]).remove(0);
-    assert_eq!((again.score.value.as_str(), again.metric("Route completion")), ("40.00", Some("80.00")));
+    assert_eq!(
+        (again.score.value.as_str(), again.metric("Route completion")),
+        ("40.00", Some("80.00"))
+    );
     let unknown = Ranking {
         metric: "Comfort".into(),
         order: Order::Descending,
@@ -143,7 +164,11 @@ fn a_stored_row_stays_while_its_submission_is_gone_and_leaves_when_that_no_longe
     let all = objects([finished("s-1", "a", "40.00", 1), finished("s-2", "b", "30.00", 2)]);
     let stored = standings("sensors", &ranking, &all, &[]);
     assert_eq!(standings("sensors", &ranking, &[], &stored), stored);
-    assert_eq!(standings("sensors", &ranking, &all, &stored), stored, "nothing counts twice");
+    assert_eq!(
+        standings("sensors", &ranking, &all, &stored),
+        stored,
+        "nothing counts twice"
+    );
 
     let mut cancelled = finished("s-1", "a", "40.00", 1);
     cancelled["status"]["conditions"][1] = condition("Published", "False", "CancelledInEvalAI");
@@ -154,10 +179,16 @@ fn a_stored_row_stays_while_its_submission_is_gone_and_leaves_when_that_no_longe
     let mut anew = finished("s-1", "a", "40.00", 1);
     anew["metadata"]["uid"] = json!("another");
     anew["status"]["conditions"] = json!([condition("Finished", "True", "EndedInEvalAI")]);
-    assert_eq!(of(&ranking, &objects([anew]), &stored), rows(&[(1, "s-1", "40.00"), (2, "s-2", "30.00")]));
+    assert_eq!(
+        of(&ranking, &objects([anew]), &stored),
+        rows(&[(1, "s-1", "40.00"), (2, "s-2", "30.00")])
+    );
 
     let better = objects([finished("s-3", "b", "50.00", 3)]);
-    assert_eq!(of(&ranking, &better, &stored), rows(&[(1, "s-3", "50.00"), (2, "s-1", "40.00")]));
+    assert_eq!(
+        of(&ranking, &better, &stored),
+        rows(&[(1, "s-3", "50.00"), (2, "s-1", "40.00")])
+    );
 }
 
 #[test]

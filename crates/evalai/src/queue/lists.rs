@@ -59,12 +59,15 @@ impl Queue {
             }
             (Request::DatasetSplit(id, split), Reply::DatasetSplit(answer)) => {
                 // Not every host may read it: the phase's only leaderboard is taken then.
-                let answer = match answer {
-                    Answer::Refused(refusal) if refusal.about != About::Token => Answer::Done(None),
-                    other => other.and_then(|split| Answer::Done(Some(split.codename))),
-                };
+                let answer = or_hidden(answer, |split| split.codename);
                 self.took_of_check(*id, answer, now, |check, codename| {
                     check.codenames.insert(*split, codename);
+                });
+            }
+            (Request::PhaseSplit(id, split), Reply::PhaseSplit(answer)) => {
+                let answer = or_hidden(answer, |split| split.is_descending);
+                self.took_of_check(*id, answer, now, |check, is_descending| {
+                    check.descending.insert(*split, is_descending);
                 });
             }
             _ => {}
@@ -227,6 +230,14 @@ impl Queue {
             self.changes
                 .extend(of.map(|(key, _)| Changed::Leaderboard(key.clone())));
         }
+    }
+}
+
+/// What an answer shows; none where EvalAI does not show it to this token's user.
+fn or_hidden<T, U>(answer: Answer<T>, take: impl FnOnce(T) -> U) -> Answer<Option<U>> {
+    match answer {
+        Answer::Refused(refusal) if refusal.about != About::Token => Answer::Done(None),
+        other => other.and_then(|content| Answer::Done(Some(take(content)))),
     }
 }
 

@@ -109,6 +109,8 @@ pub(super) struct ChallengeCheck {
     pub phases: Option<Vec<Phase>>,
     pub splits: Option<Vec<Split>>,
     pub codenames: BTreeMap<i64, Option<String>>,
+    /// Whether the highest value leads, by the ids of the leaderboards whose schemas leave it open.
+    pub descending: BTreeMap<i64, Option<bool>>,
     /// The last whole reading.
     pub catalog: Option<Catalog>,
     /// Why there is no newer one.
@@ -122,6 +124,7 @@ impl ChallengeCheck {
     pub fn restart(&mut self) {
         (self.phases, self.splits) = (None, None);
         self.codenames.clear();
+        self.descending.clear();
     }
 
     /// Starts anew at once: a list was refused as if the token's user were no host of the challenge.
@@ -140,13 +143,14 @@ impl ChallengeCheck {
         let Some(splits) = &self.splits else {
             return Some(Request::Splits(challenge));
         };
-        let open = splits
-            .iter()
-            .filter(|split| self.wanted.contains(&split.phase))
-            .map(|split| split.dataset_split);
-        open.into_iter()
-            .find(|id| !self.codenames.contains_key(id))
-            .map(|id| Request::DatasetSplit(challenge, id))
+        let wanted = || splits.iter().filter(|split| self.wanted.contains(&split.phase));
+        let unnamed = wanted().find(|split| !self.codenames.contains_key(&split.dataset_split));
+        let codename = unnamed.map(|split| Request::DatasetSplit(challenge, split.dataset_split));
+        codename.or_else(|| {
+            let is_open = |split: &&Split| split.schema.leaves_order_open() && !self.descending.contains_key(&split.id);
+            let open = wanted().find(is_open);
+            open.map(|split| Request::PhaseSplit(challenge, split.id))
+        })
     }
 
     /// Closes a whole reading.
@@ -155,12 +159,14 @@ impl ChallengeCheck {
             return;
         };
         let codenames = std::mem::take(&mut self.codenames);
+        let descending = std::mem::take(&mut self.descending);
         (self.error, self.is_forbidden) = (None, false);
         self.catalog = Some(Catalog {
             at,
             phases,
             splits,
             codenames,
+            descending,
         });
     }
 }

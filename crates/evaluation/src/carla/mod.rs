@@ -9,7 +9,7 @@ mod workload;
 
 use std::sync::Arc;
 
-use leaderboard_api::LeaderboardVersion;
+use leaderboard_api::{LeaderboardVersion, Order, Ranking};
 use leaderboard_contract::run::Run;
 use leaderboard_evidence::Tree;
 use leaderboard_protocol::files::Pair;
@@ -50,6 +50,17 @@ impl Evaluation for Carla {
                 name: metric.column,
             })
             .collect()
+    }
+
+    fn measures(&self) -> &'static [&'static str] {
+        &measures::NAMES
+    }
+
+    fn ranking(&self) -> Ranking {
+        Ranking {
+            metric: measures::DRIVING_SCORE.to_owned(),
+            order: Order::Descending,
+        }
     }
 
     fn reserved(&self) -> Reserved {

@@ -11,6 +11,7 @@ mod messages;
 mod overview;
 mod pages;
 mod resume;
+mod scores;
 mod shown;
 mod why;
 

@@ -6,6 +6,7 @@ use jiff::Timestamp;
 use k8s_openapi::apimachinery::pkg::apis::meta::v1::Time;
 
 use super::refusal::Refusal;
+use super::standings::{self, Named, Results};
 use super::view::{Claims, EvalaiStanding, Policy, Unreachable};
 use crate::submissions::previous_controller;
 use leaderboard_api::conditions::{self, Truth};
@@ -34,6 +35,10 @@ pub struct LeaderboardView {
     pub gpu_use: Vec<TeamUse>,
     /// Submissions that are live or not yet published and recorded.
     pub in_use: usize,
+    /// How EvalAI ranks its phases.
+    pub named: Named,
+    /// The results that rank, if anything of them may have changed since the standings were stored.
+    pub results: Option<Results>,
     /// The note about images that several teams lack.
     pub image_note: Option<String>,
     /// Its Pods that have not ended, counted while it is being deleted.
@@ -85,7 +90,7 @@ pub fn decide(view: &LeaderboardView) -> LeaderboardPlan {
     status.gpu_use.clone_from(&view.gpu_use);
     status.evalai = view.usage.clone().filter(|_| view.refusal.is_none());
     status.table = view.rows_waiting.filter(|waiting| *waiting > 0).map(table_use);
-    status.tracks = tracks(leaderboard);
+    status.tracks = tracks(view);
     let now = Time(view.now);
     let set = |status: &mut LeaderboardStatus, type_, (truth, reason, message): (Truth, Reason, String)| {
         conditions::set(&mut status.conditions, type_, truth, reason, &message, generation, &now);
@@ -174,6 +179,7 @@ fn with_notes(view: &LeaderboardView, ready: (Truth, Reason, String)) -> (Truth,
     ];
     let texts = [Some(message)].into_iter().chain(notes).flatten();
     let texts = texts.chain(view.image_note.clone());
+    let texts = texts.chain(standings::notes(&view.leaderboard, &view.named));
     let texts = texts.chain(view.pod_notes.iter().chain(&view.place_notes).cloned());
     let texts: Vec<String> = texts.filter(|text| !text.is_empty()).collect();
     (truth, reason, texts.join(" "))
@@ -294,10 +300,12 @@ fn qualified(leaderboard: &Leaderboard) -> String {
     )
 }
 
-fn tracks(leaderboard: &Leaderboard) -> Vec<TrackStatus> {
+fn tracks(view: &LeaderboardView) -> Vec<TrackStatus> {
+    let leaderboard = view.leaderboard.as_ref();
     let number = |count| i32::try_from(count).unwrap_or(i32::MAX);
     let status = |track: &Track| {
         let shape = effective::shape(&leaderboard.spec, track);
+        let ranking = standings::ranked(leaderboard, track, &view.named).ranking;
         TrackStatus {
             name: track.name.clone(),
             carla: CarlaShape {
@@ -305,8 +313,8 @@ fn tracks(leaderboard: &Leaderboard) -> Vec<TrackStatus> {
                 routes: number(shape.routes),
                 repetitions: number(shape.repetitions),
             },
-            ranking: None,
-            standings: Vec::new(),
+            standings: standings::of_track(leaderboard, track, &ranking, view.results.as_ref()),
+            ranking: Some(ranking),
         }
     };
     leaderboard.spec.tracks.iter().map(status).collect()

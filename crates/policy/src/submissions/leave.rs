@@ -6,6 +6,7 @@ use super::plan::Action;
 use super::status::{PlanBuilder, seconds};
 use super::stop;
 use super::waits::{Wait, after};
+use crate::leaderboards::standings;
 use crate::view::ObservedJob;
 use leaderboard_api::conditions;
 use leaderboard_api::{Ingested, JOB_SECONDS, Reason};
@@ -128,6 +129,10 @@ pub(super) fn delete_in_time(draft: &mut PlanBuilder<'_>) {
     if draft.now() < until {
         draft.look_again(Wait::RETENTION);
         return draft.requeue_at(until);
+    }
+    let board = draft.view.leaderboard.as_deref();
+    if !board.is_none_or(|board| standings::can_spare(board, draft.submission())) {
+        return draft.look_again(Wait::STANDINGS);
     }
     let object = draft.submission();
     if object.status.as_ref() == Some(&draft.status)

@@ -92,6 +92,8 @@ impl Wait {
     pub(super) const BEFORE_RELEASE: Self = row(NONE, NONE, 120);
     /// The end of a retention, which an edit of the Leaderboard moves.
     pub(super) const RETENTION: Self = row(NONE, 3600, NONE);
+    /// The standings, before a result that is among the best is deleted.
+    pub(super) const STANDINGS: Self = row(NONE, 15, NONE);
     /// Progress that waits for its write.
     pub(super) const PROGRESS: Self = row(30, NONE, NONE);
 

@@ -173,3 +173,11 @@ pub(super) fn dataset_split(call: &Call, pk: u64) -> Answer {
         &json!({"id": row.id, "name": row.name, "codename": row.codename, "config_id": null}),
     ))
 }
+
+/// A phase split: where the order of its leaderboard is.
+pub(super) fn phase_split(call: &Call, pk: u64) -> Answer {
+    let state = call.app.state();
+    let unknown = || Reply::error(&errors::PHASE_SPLIT_NOT_FOUND, &[&pk.to_string()]);
+    let (_, phase, split) = state.split(pk).ok_or_else(unknown)?;
+    Ok(Reply::ok(&views::split_settings(phase, split)))
+}

@@ -123,6 +123,7 @@ pub(crate) async fn answer(call: Call, endpoint: Endpoint) -> Answer {
         Endpoint::Phases(challenge) => context::phases(&call, challenge),
         Endpoint::Splits(challenge) => context::splits(&call, challenge),
         Endpoint::DatasetSplit(pk) => context::dataset_split(&call, pk),
+        Endpoint::PhaseSplit(pk) => context::phase_split(&call, pk),
     }
 }
 

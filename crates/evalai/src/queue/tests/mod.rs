@@ -16,11 +16,11 @@ use jiff::SignedDuration;
 use super::*;
 use crate::answer::{About, Answer, Refusal, Silence};
 use crate::request::{Purpose, Reply};
-use crate::row::{DatasetSplit, Phase, Row, Schema, Split};
+use crate::row::{DatasetSplit, Phase, PhaseSplit, Row, Schema, Split};
 use crate::token::Token;
 use crate::types::{ImageAnswer, Payload, PayloadProblem, Run, StoredResult, Usage};
-use leaderboard_api::Attempt;
 use leaderboard_api::evalai_status::Status;
+use leaderboard_api::{Attempt, Order};
 use leaderboard_base::spans::LogSpan;
 use leaderboard_contract::report::{ContentId, Patience};
 

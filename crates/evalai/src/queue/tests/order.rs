@@ -1,5 +1,7 @@
 //! What comes first, how much at once, and what is asked for a whole challenge.
 
+use serde_json::Value;
+
 use super::*;
 
 #[test]
@@ -141,10 +143,13 @@ fn a_leaderboard_is_checked_at_its_start_and_hourly() {
     bench.list("sweep of submitted", vec![]);
     bench.list("sweep of resuming", vec![]);
     let split = Split {
+        id: 3,
         phase: 1,
         dataset_split: 5,
         schema: Schema {
             labels: vec!["Driving score".into()],
+            default_order_by: Some("Driving score".into()),
+            metadata: Value::Null,
         },
     };
     for round in 0..2 {
@@ -158,8 +163,19 @@ fn a_leaderboard_is_checked_at_its_start_and_hourly() {
             codename: codename.into(),
         };
         bench.answer(&ticket, Reply::DatasetSplit(Answer::Done(answer)));
+        // The schema leaves the order open.
+        let ticket = bench.expect("phase split");
+        let answer = if round == 0 {
+            Answer::Done(PhaseSplit { is_descending: false })
+        } else {
+            Answer::Refused(refusal(About::Request, 403))
+        };
+        bench.answer(&ticket, Reply::PhaseSplit(answer));
         let (labels, error) = bench.queue.labels(&key(100));
-        assert_eq!((labels.unwrap().ok(), error), (round == 0, None));
+        let labels = labels.unwrap();
+        assert_eq!((labels.ok(), error), (round == 0, None));
+        let order = labels.rankings.get(&1).map(|ranking| ranking.order);
+        assert_eq!(order, (round == 0).then_some(Order::Ascending));
         assert_eq!(bench.queue.take_changes(), [Changed::Leaderboard(key(100))].into());
         bench.wait(3600.0);
         bench.list("sweep of submitted", vec![]);

@@ -29,6 +29,8 @@ fn view(mine: &Arc<Leaderboard>, all: &[Arc<Leaderboard>]) -> LeaderboardView {
         counts: Counts::default(),
         gpu_use: Vec::new(),
         in_use: 0,
+        named: None,
+        results: None,
         image_note: None,
         pods: 0,
         policy: Policy::InPlace,

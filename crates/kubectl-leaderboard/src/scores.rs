@@ -1,0 +1,327 @@
+//! `scores`: who leads each track. All Submissions rank, and the rows that the Leaderboard has kept of those that are gone.
+//!
+//! `scores` asks the cluster; all else is pure.
+
+use std::process::ExitCode;
+
+use clap::{Args, ValueEnum};
+use jiff::Timestamp;
+use k8s_openapi::apimachinery::pkg::apis::meta::v1::Time;
+use kube::ResourceExt;
+use leaderboard_api::standings::{standings, track_of};
+use leaderboard_api::{Leaderboard, Order, Ranking, Standing, Submission, TrackStatus};
+use serde_json::{Value, json};
+
+use crate::cluster::{Cluster, Fetched, Scope};
+use crate::commands::frame;
+use crate::csv;
+use crate::error::Error;
+use crate::output::{self, Format, print};
+use crate::table::table;
+use crate::text::{Frame, columns, join};
+
+/// Columns to which the name of a team may be cut before a metric is left out.
+const TEAM: usize = 16;
+/// Columns between two cells.
+const GAP: usize = 2;
+/// The team of a submission that has none.
+const NO_TEAM: &str = "(none)";
+
+/// Whose standings, and how they are printed.
+#[derive(Args, Debug)]
+pub struct Scores {
+    /// Name of the Leaderboard [default: all of the namespace].
+    name: Option<String>,
+    /// Name of a track [default: all].
+    #[arg(long)]
+    track: Option<String>,
+    /// All namespaces.
+    #[arg(short = 'A', long)]
+    all_namespaces: bool,
+    /// Output format.
+    #[arg(short = 'o', long = "output", value_enum, default_value_t, value_name = "FORMAT")]
+    format: As,
+}
+
+/// What is printed.
+#[derive(ValueEnum, Clone, Copy, Debug, Default, PartialEq, Eq)]
+enum As {
+    #[default]
+    Text,
+    /// All metrics, in columns as wide as they are.
+    Wide,
+    Json,
+    Yaml,
+    /// For a spreadsheet.
+    Csv,
+}
+
+/// The standings of one track.
+#[derive(Debug, PartialEq)]
+pub(super) struct Board {
+    pub(super) namespace: String,
+    pub(super) leaderboard: String,
+    pub(super) track: String,
+    pub(super) ranking: Option<Ranking>,
+    pub(super) rows: Vec<Standing>,
+}
+
+/// Prints the standings.
+pub async fn scores(cluster: &Cluster, wanted: &Scores) -> Result<ExitCode, Error> {
+    let scope = Scope {
+        all_namespaces: wanted.all_namespaces,
+        selector: None,
+    };
+    let leaderboards = leaderboards(cluster, wanted, &scope).await?;
+    let submissions = cluster.submissions(&scope).await?;
+    let boards = boards(&leaderboards, &submissions, wanted.track.as_deref());
+    if boards.is_empty() {
+        return Err(Error::Unfit(nothing(
+            &leaderboards,
+            wanted.track.as_deref(),
+            &cluster.namespace,
+        )));
+    }
+    print(&printed(&boards, wanted.format, frame()));
+    Ok(ExitCode::SUCCESS)
+}
+
+async fn leaderboards(cluster: &Cluster, wanted: &Scores, scope: &Scope) -> Result<Vec<Leaderboard>, Error> {
+    let forbidden = || Error::Forbidden("Leaderboards cannot be read".to_owned());
+    match &wanted.name {
+        Some(name) if !wanted.all_namespaces => match cluster.leaderboard(name).await? {
+            Fetched::Found(found) => Ok(vec![*found]),
+            Fetched::Missing => Err(cluster.unknown::<Leaderboard>("Leaderboard", name).await?),
+            Fetched::Forbidden => Err(forbidden()),
+        },
+        name => {
+            let mut found = cluster.leaderboards(scope).await?.ok_or_else(forbidden)?;
+            found.retain(|board| name.as_ref().is_none_or(|name| board.name_any() == *name));
+            Ok(found)
+        }
+    }
+}
+
+/// Why no track was found, with the next step.
+pub(super) fn nothing(leaderboards: &[Leaderboard], track: Option<&str>, namespace: &str) -> String {
+    let mut tracks: Vec<&str> = leaderboards
+        .iter()
+        .flat_map(|board| &board.spec.tracks)
+        .map(|track| track.name.as_str())
+        .collect();
+    tracks.sort_unstable();
+    tracks.dedup();
+    match track {
+        Some(track) if !tracks.is_empty() => format!("there is no track {track}. The tracks are {}", tracks.join(", ")),
+        _ => format!("there is no such Leaderboard in namespace {namespace}. Use -n NAMESPACE, or -A"),
+    }
+}
+
+/// The standings of all tracks of these Leaderboards, or of those with this name.
+pub(super) fn boards(leaderboards: &[Leaderboard], submissions: &[Submission], track: Option<&str>) -> Vec<Board> {
+    let mut boards = Vec::new();
+    for leaderboard in leaderboards {
+        let (namespace, name) = (leaderboard.namespace().unwrap_or_default(), leaderboard.name_any());
+        let its: Vec<&Submission> = submissions
+            .iter()
+            .filter(|one| one.spec.leaderboard_name == name && one.namespace().unwrap_or_default() == namespace)
+            .collect();
+        let tracks = leaderboard.spec.tracks.iter().map(|track| track.name.as_str());
+        for track in tracks.filter(|name| track.is_none_or(|track| track == *name)) {
+            let shown = leaderboard.status.iter().flat_map(|status| &status.tracks);
+            let stored = shown.into_iter().find(|stored| stored.name == track);
+            let ranking = stored
+                .and_then(|stored| stored.ranking.clone())
+                .or_else(|| own_ranking(track, &its));
+            let kept = stored.map_or(&[][..], |TrackStatus { standings, .. }| standings);
+            let rows = ranking
+                .as_ref()
+                .map(|ranking| standings(track, ranking, its.iter().copied(), kept));
+            boards.push(Board {
+                namespace: namespace.clone(),
+                leaderboard: name.clone(),
+                track: track.to_owned(),
+                ranking,
+                rows: rows.unwrap_or_default(),
+            });
+        }
+    }
+    boards
+}
+
+/// By the score that the results themselves name: before the operator has looked at the Leaderboard, or one of an older version.
+fn own_ranking(track: &str, submissions: &[&Submission]) -> Option<Ranking> {
+    let scores = submissions.iter().filter(|one| track_of(one) == Some(track));
+    let mut names = scores.filter_map(|one| Some(one.status.as_ref()?.score.as_ref()?.name.clone()));
+    let metric = names.next()?;
+    let order = Order::Descending;
+    Some(Ranking { metric, order })
+}
+
+fn printed(boards: &[Board], format: As, frame: Frame) -> Vec<String> {
+    let document = match format {
+        As::Text => None,
+        As::Wide => {
+            return text(
+                boards,
+                Frame {
+                    width: usize::MAX,
+                    ..frame
+                },
+            );
+        }
+        As::Json => output::document(Format::Json, &value(boards)),
+        As::Yaml => output::document(Format::Yaml, &value(boards)),
+        As::Csv => return comma_separated(boards),
+    };
+    document.unwrap_or_else(|| text(boards, frame))
+}
+
+/// For people: a table for each track.
+pub(super) fn text(boards: &[Board], frame: Frame) -> Vec<String> {
+    let is_qualified = boards.iter().any(|board| board.namespace != boards[0].namespace);
+    let mut lines = Vec::new();
+    for board in boards {
+        if !lines.is_empty() {
+            lines.push(String::new());
+        }
+        let namespace = if is_qualified {
+            format!("{}/", board.namespace)
+        } else {
+            String::new()
+        };
+        let title = format!("{namespace}{}, track {}", board.leaderboard, board.track);
+        let by = board
+            .ranking
+            .as_ref()
+            .map(|ranking| format!(": {ranking}"))
+            .unwrap_or_default();
+        lines.push(join(&[&format!("{title}{by}")]));
+        if board.rows.is_empty() {
+            lines.push("No result ranks yet.".to_owned());
+        } else {
+            lines.extend(of_board(board, frame));
+        }
+    }
+    lines
+}
+
+/// The table of a track. Metrics that a narrow page has no room for are left out, the last ones first.
+fn of_board(board: &Board, frame: Frame) -> Vec<String> {
+    let metric = board
+        .ranking
+        .as_ref()
+        .map(|ranking| ranking.metric.as_str())
+        .unwrap_or_default();
+    let mut metrics = metric_names(&board.rows);
+    loop {
+        let (head, rows) = cells(&board.rows, metric, &metrics);
+        if metrics.is_empty() || fits(&head, &rows, frame.width) {
+            let head: Vec<&str> = head.iter().map(String::as_str).collect();
+            return table(&head, &rows, frame.width);
+        }
+        metrics.pop();
+    }
+}
+
+fn cells(rows: &[Standing], metric: &str, metrics: &[&str]) -> (Vec<String>, Vec<Vec<String>>) {
+    let title = |text: &str| text.to_uppercase();
+    let head = ["RANK".to_owned(), "TEAM".to_owned(), title(metric)];
+    let head = head.into_iter().chain(metrics.iter().map(|name| title(name)));
+    let head = head.chain(["SUBMISSION".to_owned(), "WHEN".to_owned()]);
+    let row = |row: &Standing| {
+        let team = if row.team.is_empty() { NO_TEAM } else { &row.team };
+        let first = [row.rank.to_string(), team.to_owned(), row.score.text.clone()];
+        let others = metrics
+            .iter()
+            .map(|name| row.metric(name).unwrap_or_default().to_owned());
+        let last = [
+            row.submission.clone(),
+            row.finished_at.as_ref().map(minute).unwrap_or_default(),
+        ];
+        first.into_iter().chain(others).chain(last).collect()
+    };
+    (head.collect(), rows.iter().map(row).collect())
+}
+
+/// Whether a table does without cutting more than the names of teams.
+fn fits(head: &[String], rows: &[Vec<String>], width: usize) -> bool {
+    let widest = |column: usize| {
+        let cells = rows.iter().filter_map(|row| row.get(column));
+        cells
+            .chain(head.get(column))
+            .map(|cell| columns(cell))
+            .max()
+            .unwrap_or(0)
+    };
+    let of_column = |column: usize| {
+        if column == 1 {
+            widest(column).min(TEAM)
+        } else {
+            widest(column)
+        }
+    };
+    let cells: usize = (0..head.len()).map(|column| of_column(column) + GAP).sum();
+    cells.saturating_sub(GAP) <= width
+}
+
+fn minute(time: &Time) -> String {
+    time.0.strftime("%Y-%m-%d %H:%MZ").to_string()
+}
+
+/// Names of the metrics of all rows, beside the one that ranks, as they come.
+fn metric_names<'a>(rows: impl IntoIterator<Item = &'a Standing>) -> Vec<&'a str> {
+    let mut names: Vec<&str> = Vec::new();
+    for metric in rows.into_iter().flat_map(|row| &row.metrics) {
+        if !names.contains(&metric.name.as_str()) {
+            names.push(&metric.name);
+        }
+    }
+    names
+}
+
+/// The same for programs.
+pub(super) fn value(boards: &[Board]) -> Value {
+    let item = |board: &Board| {
+        json!({
+            "namespace": board.namespace, "leaderboard": board.leaderboard, "track": board.track,
+            "ranking": board.ranking, "standings": board.rows,
+        })
+    };
+    Value::Array(boards.iter().map(item).collect())
+}
+
+/// The same for a spreadsheet: one line for each row of all tracks.
+pub(super) fn comma_separated(boards: &[Board]) -> Vec<String> {
+    let metrics = metric_names(boards.iter().flat_map(|board| &board.rows));
+    let head = ["namespace", "leaderboard", "track", "rank", "team", "metric", "score"];
+    let head = head
+        .iter()
+        .chain(&metrics)
+        .chain(&["submission", "attempt", "submitted", "finished"]);
+    let mut lines = vec![csv::line(head.copied())];
+    let exact = |time: Option<&Time>| time.map(|time| exact(time.0)).unwrap_or_default();
+    for board in boards {
+        for row in &board.rows {
+            let rank = row.rank.to_string();
+            let attempt = row.attempt.map(|attempt| attempt.to_string()).unwrap_or_default();
+            let (submitted, finished) = (exact(row.submitted_at.as_ref()), exact(row.finished_at.as_ref()));
+            let first = [&board.namespace, &board.leaderboard, &board.track, &rank, &row.team];
+            let score = [row.score.name.as_str(), row.score.value.as_str()];
+            let others = metrics.iter().map(|name| row.metric(name).unwrap_or_default());
+            let last = [row.submission.as_str(), &attempt, &submitted, &finished];
+            let cells = first
+                .into_iter()
+                .map(String::as_str)
+                .chain(score)
+                .chain(others)
+                .chain(last);
+            lines.push(csv::line(cells));
+        }
+    }
+    lines
+}
+
+fn exact(time: Timestamp) -> String {
+    time.strftime("%Y-%m-%dT%H:%M:%SZ").to_string()
+}
