@@ -89,9 +89,6 @@ enum Command {
         output: Output,
     },
     /// Show who leads each track: the best result of each team.
-    #[command(
-        after_help = "Examples:\n  kubectl leaderboard scores\n  kubectl leaderboard scores carla --track sensors\n  kubectl leaderboard scores -A -o csv > scores.csv"
-    )]
     Scores(scores::Scores),
     /// List what a submission has stored, or copy it into a folder.
     Get(get::Get),

@@ -70,7 +70,7 @@ pub(super) struct Board {
 pub async fn scores(cluster: &Cluster, wanted: &Scores) -> Result<ExitCode, Error> {
     let scope = Scope {
         all_namespaces: wanted.all_namespaces,
-        selector: None,
+        ..Scope::default()
     };
     let leaderboards = leaderboards(cluster, wanted, &scope).await?;
     let submissions = cluster.submissions(&scope).await?;
