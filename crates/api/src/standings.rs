@@ -90,7 +90,7 @@ pub struct RankedScore {
 #[derive(Serialize, Deserialize, JsonSchema, Clone, Debug, Default, PartialEq, Eq)]
 #[serde(rename_all = "camelCase")]
 pub struct Standing {
-    /// Rank counts from 1. Of two equal results the one that was submitted first has the lower rank.
+    /// Number of the place, from 1. Of two equal results the one that was submitted first has the lower rank.
     pub rank: i32,
     /// Name of the team, else its id, in at most 64 characters. Its members chose it. Absent for a submission without a team, which ranks
     /// for itself.

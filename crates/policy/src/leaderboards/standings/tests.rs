@@ -10,7 +10,8 @@ fn ranking(metric: &str, order: Order) -> Ranking {
 
 /// A Leaderboard with two tracks, of which EvalAI has the first, and with these tracks in its status.
 fn leaderboard(has_evalai: bool, tracks: &Value) -> Leaderboard {
-    let evalai = json!({"challenge": 1, "token": {"secretKeyRef": {"name": "t", "key": "k"}}});
+    let evalai =
+        json!({"apiServer": "https://e", "challenge": 1, "token": {"secretKeyRef": {"name": "t", "key": "k"}}});
     let object = json!({
         "apiVersion": "leaderboard.carla.org/v1alpha1", "kind": "Leaderboard",
         "metadata": {"name": "lb", "namespace": "ns"},

@@ -1,14 +1,16 @@
 //! When what has ended is deleted.
 
+use std::sync::Arc;
 use std::time::Duration;
 
 use super::builders::*;
 use super::foreign;
+use crate::leaderboards::standings::{self, Results};
 use crate::submissions::{Action, Plan};
 use crate::view::EvalaiEnd;
 use leaderboard_api::State::{Failed, Finished};
 use leaderboard_api::conditions::{FINISHED, PUBLISHED, RECORDED};
-use leaderboard_api::{Attempt, Reason};
+use leaderboard_api::{Attempt, Reason, TrackStatus};
 
 /// What a host keeps, in seconds.
 const KEPT: i64 = 3600;
@@ -33,7 +35,48 @@ fn known_to_all() -> World {
     world.pass();
     world.recorded();
     world.pass();
+    world.is_in_the_standings();
     world
+}
+
+impl World {
+    /// The Leaderboard's status holds its result.
+    fn is_in_the_standings(&mut self) {
+        let submission = self.submission().clone();
+        let leaderboard = Arc::make_mut(self.view.leaderboard.as_mut().unwrap());
+        let track = leaderboard.spec.tracks[0].clone();
+        let ranking = standings::ranked(leaderboard, &track, &None).ranking;
+        let results = Results {
+            submissions: vec![Arc::new(submission)],
+            ..Results::default()
+        };
+        let rows = standings::of_track(leaderboard, &track, &ranking, Some(&results));
+        assert_eq!(rows.len(), 1);
+        let tracks = vec![TrackStatus {
+            name: track.name,
+            ranking: Some(ranking),
+            standings: rows,
+            ..TrackStatus::default()
+        }];
+        leaderboard.status.get_or_insert_default().tracks = tracks;
+    }
+}
+
+#[test]
+fn a_result_that_leads_waits_for_the_standings_to_hold_it() {
+    let mut world = known_to_all();
+    world.wait(KEPT);
+    let leaderboard = Arc::make_mut(world.view.leaderboard.as_mut().unwrap());
+    leaderboard.status.as_mut().unwrap().tracks[0].standings.clear();
+    let plan = world.pass();
+    assert!(!deletes(&plan));
+    assert!(
+        plan.requeue.is_some_and(|wait| wait <= Duration::from_secs(30)),
+        "{:?}",
+        plan.requeue
+    );
+    world.is_in_the_standings();
+    assert!(deletes(&world.pass()));
 }
 
 fn deletes(plan: &Plan) -> bool {
