@@ -47,8 +47,8 @@ mod api {
     mod scale;
     mod shared_queue;
     mod slots;
-    mod suspended;
     mod standings;
+    mod suspended;
     mod switch;
     mod table;
     mod token;

@@ -169,7 +169,8 @@ async fn the_best_of_each_team_stay_in_the_standings_when_their_submissions_are_
         let Some(object) = api.get_opt(name).await.unwrap() else {
             continue;
         };
-        let gone = await_condition(api, name, kubernetes::is_deleted(&object.uid().unwrap()));
+        let uid = object.uid().unwrap();
+        let gone = await_condition(api, name, kubernetes::is_deleted(&uid));
         timeout(LIMIT, gone).await.expect("retention deletes it").unwrap();
     }
     let board = world.api::<Leaderboard>().get("lb").await.unwrap();
