@@ -68,7 +68,14 @@ PRINTS: dict[str, tuple[str, int]] = {
     "aws dynamodb scan --table-name leaderboard-20 --output json": (json.dumps({"Items": [ROW]}), 99),
     "aws ec2 describe-network-interfaces": ("192.168.255.5", 99),
     "aws ecr describe-repositories": ("challenge-participant-team-7", 99),
-    "aws": ("stand-in", 99),
+    # What examples/aws/up.sh reads as JSON.
+    **{
+        f"aws cloudformation describe-stacks --stack-name {name} --query Stacks[0].Parameters": ("[]", 99)
+        for name in ("leaderboard-queue", "leaderboard-10", "leaderboard-20", "leaderboard-registry")
+    },
+    "aws iam get-policy-version": ("{}", 99),
+    "aws iam get-user-policy": ("{}", 99),
+    "aws": ("stand-in", 999),
     "make --silent install-yaml": ("apiVersion: v1\nkind: ConfigMap\nmetadata: {name: installed}", 99),
     "docker create": ("0123456789ab", 99),
     PLUGIN: ("stand-in", 99),
