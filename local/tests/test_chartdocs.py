@@ -134,6 +134,11 @@ class Schema(unittest.TestCase):
         with self.assertRaisesRegex(LabError, "schema.json alone has .'other'"):
             self.compare({**schema, "properties": {**properties, "other": {}}})
 
+    def test_a_program_may_have_what_both_have(self) -> None:
+        program = {"properties": {"replicas": {}, "resources": {}, "place": {}}}
+        bridge = {"properties": {"enabled": {}, "replicas": {}}}
+        self.compare({"properties": {"place": {}, "controller": program, "bridge": bridge}})
+
     def test_the_charts_are_the_same(self) -> None:
         chartdocs.same_schema(CHART)
 

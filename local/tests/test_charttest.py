@@ -5,7 +5,7 @@ import subprocess
 import unittest
 from typing import cast
 
-from labkit import chartrender, charttest, schemas, testrun
+from labkit import chartnotes, chartrender, charttest, schemas, testrun
 from labkit.chartcases import Access
 from labkit.errors import LabError
 from labkit.kube import Kube
@@ -30,6 +30,16 @@ OPENAPI = {
         },
     }
 }
+
+
+class Printed:
+    """A kubectl that prints these objects."""
+
+    def __init__(self, items: list[dict[str, object]]) -> None:
+        self.items = items
+
+    def run(self, *_argv: str, given: str) -> str:
+        return given + json.dumps({"kind": "List", "items": self.items})
 
 
 class Definitions:
@@ -96,6 +106,41 @@ class Questions(unittest.TestCase):
             json.dumps({"kind": "A"}, indent=1) + "\n" + json.dumps({"kind": "List", "items": [{"kind": "B"}]}) + "\n"
         )
         self.assertEqual([one["kind"] for one in charttest.documents(text)], ["A", "B"])
+
+
+class Notes(unittest.TestCase):
+    BOUNDS = {"queues": ["submissions*"], "buckets": ["results/boards/*"], "secretsManager": ["evalai/*"]}
+
+    def refused(self, **spec: object) -> list[str]:
+        place = {"s3": {"bucket": "results", "prefix": "boards/a/"}}
+        return list(chartnotes.refused({"storage": place, **spec}, self.BOUNDS))
+
+    def test_what_a_manifest_names_is_held_against_the_bounds(self) -> None:
+        self.assertEqual(self.refused(), [])
+        self.assertEqual(self.refused(queue={"sqs": {"url": "https://sqs.example/1/submissions-2"}}), [])
+        self.assertEqual(
+            self.refused(queue={"sqs": {"url": "https://sqs.example/submissions/other"}}),
+            ["queues https://sqs.example/submissions/other"],
+        )
+        self.assertEqual(self.refused(table={"dynamoDB": {"name": "rows"}}), ["tables rows"])
+        self.assertEqual(self.refused(evalai={"token": {"secretsManager": {"id": "evalai/a"}}}), [])
+        self.assertEqual(
+            self.refused(storage={"s3": {"bucket": "results", "prefix": "arena/"}}), ["buckets results/arena/"]
+        )
+
+    def test_a_manifest_is_found_with_its_namespace(self) -> None:
+        text = "say\n\nkubectl -n boards apply --filename=- <<'EOF'\nkind: A\n\nb: c\nEOF\nkubectl -n boards get a\n"
+        self.assertEqual(chartnotes.PASTED.findall(text), [("boards", "kind: A\n\nb: c")])
+
+
+class Objects(unittest.TestCase):
+    def test_objects_of_one_name_are_told_apart_by_their_namespaces(self) -> None:
+        items = [{"kind": "Role", "metadata": {"name": "r", "namespace": name}} for name in ("a", "b")]
+        found = chartrender.objects(cast(Kube, Printed(items)), "")
+        self.assertEqual(sorted(found), ["Role/a/r", "Role/b/r", "Role/r"])
+        self.assertEqual(found["Role/r"]["metadata"]["namespace"], "a")
+        with self.assertRaisesRegex(LabError, "Role/a/r is rendered twice"):
+            chartrender.objects(cast(Kube, Printed([items[0], items[0]])), "")
 
 
 class Driver(unittest.TestCase):
