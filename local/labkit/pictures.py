@@ -39,7 +39,7 @@ class Shown:
 
 def run(settings: Settings) -> None:
     """Takes all pictures; raises where the demo's cluster is not there."""
-    pagetest.ensure_browser(settings)
+    pagetest.ensure_browser(settings, pictures=True)
     with of_person(settings) as kube, browser.tab() as tab:
         if kube.attempt("kubectl", "get", "leaderboard", LEADERBOARD).returncode != 0:
             raise LabError("the pictures are of the demo's cluster, which is not there: run `make demo` first")

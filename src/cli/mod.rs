@@ -101,6 +101,9 @@ struct Controller {
     /// Serve the page of `kubectl leaderboard dashboard` on this port of 127.0.0.1: read-only, from the caches. Without it there is none.
     #[arg(long, env = "LEADERBOARD_DASHBOARD", value_name = "PORT", num_args = 0..=1, require_equals = true, default_missing_value = PAGE_PORT)]
     dashboard: Option<u16>,
+    /// Title of the page, such as the cluster's name. It stands in the page's header and in the browser's tab.
+    #[arg(long, env = "LEADERBOARD_PAGE_TITLE", default_value = "")]
+    page_title: String,
     #[command(flatten)]
     scope: Scope,
     /// Name of this replica.

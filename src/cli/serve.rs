@@ -154,7 +154,10 @@ async fn lead(options: Controller) -> Result<(), String> {
         concurrency: options.concurrency,
     };
     let page = match options.dashboard {
-        Some(port) => Some(Page::bind(port, &options.pod_name).await.map_err(|e| e.to_string())?),
+        Some(port) => {
+            let page = Page::bind(port, &options.pod_name).await.map_err(|e| e.to_string())?;
+            Some(page.titled(&options.page_title))
+        }
         None => None,
     };
     let result = run::run(clients, lease, settings, aws, page, telemetry).await;

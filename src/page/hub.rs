@@ -30,6 +30,8 @@ pub(super) trait Source: Send + Sync + 'static {
     fn changes(&self) -> BoxStream<'static, ()>;
     /// The view as JSON in one line.
     fn view(&self) -> Vec<u8>;
+    /// One submission as JSON; none if there is none of this name.
+    fn detail(&self, namespace: &str, name: &str) -> Option<Vec<u8>>;
 }
 
 /// Clones are the same hub.
@@ -70,7 +72,7 @@ impl Hub {
     }
 
     /// Makes views while somebody looks, until the stop.
-    pub(super) async fn run(self, source: impl Source, stop: Stop) {
+    pub(super) async fn run(self, source: Arc<dyn Source>, stop: Stop) {
         loop {
             tokio::select! {
                 () = stop.wait() => return,
@@ -78,13 +80,13 @@ impl Hub {
             }
             tokio::select! {
                 () = stop.wait() => return,
-                () = self.show(&source) => {}
+                () = self.show(source.as_ref()) => {}
             }
         }
     }
 
     /// Until the last viewer has gone.
-    async fn show(&self, source: &impl Source) {
+    async fn show(&self, source: &dyn Source) {
         let latest = &self.0.latest;
         let mut changes = source.changes();
         let mut shown = Vec::new();
@@ -188,12 +190,16 @@ mod tests {
             self.views.fetch_add(1, Ordering::SeqCst);
             self.content.load(Ordering::SeqCst).to_string().into_bytes()
         }
+
+        fn detail(&self, _: &str, _: &str) -> Option<Vec<u8>> {
+            None
+        }
     }
 
     fn hub() -> (Hub, Counter, watch::Sender<bool>, Stop) {
         let (hub, source) = (Hub::new(), Counter::default());
         let (sender, stop) = Stop::new();
-        tokio::spawn(hub.clone().run(source.clone(), stop.clone()));
+        tokio::spawn(hub.clone().run(Arc::new(source.clone()), stop.clone()));
         (hub, source, sender, stop)
     }
 

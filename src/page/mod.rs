@@ -1,32 +1,38 @@
-//! The page: a read-only view of the line, the runs, their scores and failures, for people who look at it in a browser.
+//! The page: a read-only view of standings, runs, queue and failures, for people who look at it in a browser.
 //!
 //! Started by the controller's `runtime` with `--dashboard`. It reads the controller's caches and grants nothing: it sends no request to
-//! the API server, knows no credential and writes nothing. `model` (pure) makes of the cached objects what is shown, `hub` hands it to
-//! the viewers, `routes` are the few files and the stream of events, `connections` bounds what one of them can hold.
+//! the API server, knows no credential and writes nothing. `model` (pure) makes of the cached objects what is shown, `detail` what is
+//! shown of one submission. `hub` hands it to the viewers, `routes` are the few files and the stream of events, `connections` bounds what one of them can hold.
 //!
 //! It listens on 127.0.0.1 of its Pod alone, where no other Pod can reach it. A person comes in by `kubectl leaderboard dashboard`, a
 //! port-forward, which the API server authenticates and authorizes (`pods/portforward`).
 
 mod connections;
+mod detail;
 mod hub;
+mod links;
 mod model;
 mod phases;
 mod routes;
 mod rows;
+mod standings;
 
 #[cfg(test)]
 mod samples_tests;
 
 use std::net::{Ipv4Addr, SocketAddr};
+use std::sync::Arc;
 
 use futures::StreamExt;
 use futures::stream::{self, BoxStream};
 use jiff::Timestamp;
+use kube::runtime::reflector::ObjectRef;
 use tokio::net::TcpListener;
 
 use crate::kubernetes::Watch;
 use crate::observability::Observability;
 use connections::Bounded;
+use detail::Detail;
 use hub::{Hub, Source};
 use leaderboard_api::{Leaderboard, Submission};
 use model::{PageView, Replica};
@@ -47,6 +53,7 @@ pub struct Page {
     listener: TcpListener,
     address: SocketAddr,
     name: String,
+    title: String,
 }
 
 /// What the page reads.
@@ -71,7 +78,15 @@ impl Page {
             listener,
             address,
             name: name.to_owned(),
+            title: String::new(),
         })
+    }
+
+    /// The same page under the installation's title, such as the name of its cluster.
+    #[must_use]
+    pub fn titled(mut self, title: &str) -> Self {
+        title.clone_into(&mut self.title);
+        self
     }
 
     /// Where it listens.
@@ -81,11 +96,12 @@ impl Page {
 
     /// Serves it until the stop.
     pub fn start(self, reads: Reads, telemetry: &Observability) {
-        let source = Caches { reads, name: self.name };
+        let (name, title) = (self.name, self.title);
+        let source: Arc<dyn Source> = Arc::new(Caches { reads, name, title });
         let hub = Hub::new();
-        let work = hub.clone().run(source, telemetry.stop.clone());
+        let work = hub.clone().run(Arc::clone(&source), telemetry.stop.clone());
         telemetry.tasks.stay("page's view", work);
-        let router = routes::router(hub, telemetry.stop.clone());
+        let router = routes::router(hub, source, telemetry.stop.clone());
         let stop = telemetry.stop.clone();
         let listener = Bounded::new(self.listener);
         telemetry.tasks.stay("page", async move {
@@ -101,6 +117,7 @@ impl Page {
 struct Caches {
     reads: Reads,
     name: String,
+    title: String,
 }
 
 impl Source for Caches {
@@ -114,6 +131,7 @@ impl Source for Caches {
         let (boards, submissions) = (&self.reads.leaderboards, &self.reads.submissions);
         let replica = Replica {
             name: &self.name,
+            title: &self.title,
             leads: (self.reads.leads)(),
             is_complete: boards.is_complete() && submissions.is_complete(),
         };
@@ -121,5 +139,17 @@ impl Source for Caches {
         let view = PageView::of(replica, &leaderboards, &submissions, Timestamp::now());
         // Names as keys and plain values: serde_json has no error for them.
         serde_json::to_vec(&view).unwrap_or_default()
+    }
+
+    fn detail(&self, namespace: &str, name: &str) -> Option<Vec<u8>> {
+        let submission = self
+            .reads
+            .submissions
+            .store
+            .get(&ObjectRef::new(name).within(namespace))?;
+        let board = ObjectRef::new(&submission.spec.leaderboard_name).within(namespace);
+        let board = self.reads.leaderboards.store.get(&board);
+        let evalai = board.as_ref().and_then(|board| board.spec.evalai.as_ref());
+        serde_json::to_vec(&Detail::of(&submission, evalai)).ok()
     }
 }

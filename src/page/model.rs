@@ -11,11 +11,14 @@ use leaderboard_api::text::{LONGEST_MESSAGE, one_line, sentence};
 use leaderboard_api::{Leaderboard, State, Submission, SubmissionStatus, conditions};
 use serde::Serialize;
 
+use super::links;
 use super::phases::{Phases, Typical, seconds, typical};
 use super::rows::{Ended, Failed, Runs, Waits, end};
+use super::standings::{Table, tables};
 
-/// The longest lists. A view of all of them at their longest is under half a megabyte.
+/// The longest lists. A view of all of them at their longest is under three quarters of a megabyte.
 const LEADERBOARDS: usize = 50;
+const TABLES: usize = 24;
 const WAITING: usize = 200;
 const RUNNING: usize = 60;
 const ENDED: usize = 40;
@@ -25,11 +28,13 @@ const TYPICAL: usize = 50;
 /// A failure is recent for so many hours.
 const RECENT_HOURS: i64 = 24;
 
-/// Which replica answers.
+/// Which replica answers, and of which installation.
 #[derive(Serialize, Clone, Copy, Debug)]
 #[serde(rename_all = "camelCase")]
 pub(super) struct Replica<'a> {
     pub name: &'a str,
+    /// Title that the installation has, or an empty text.
+    pub title: &'a str,
     pub leads: bool,
     /// Its caches hold everything.
     pub is_complete: bool,
@@ -40,6 +45,7 @@ pub(super) struct Replica<'a> {
 pub(super) struct PageView<'a> {
     replica: Replica<'a>,
     version: &'static str,
+    standings: List<Table>,
     leaderboards: List<Board>,
     waiting: List<Waits>,
     running: List<Runs>,
@@ -74,6 +80,8 @@ struct Board {
     failed: usize,
     cancelled: usize,
     evalai: Option<Budget>,
+    /// Address of the challenge's page in EvalAI.
+    challenge: Option<String>,
     typical: Option<Typical>,
 }
 
@@ -136,13 +144,15 @@ impl<'a> PageView<'a> {
         submissions: &[Arc<Submission>],
         now: Timestamp,
     ) -> Self {
+        let leaderboards = by_name(leaderboards);
         let sorted = Sorted::of(submissions);
         let tallies = sorted.tallies();
         let ended = sorted.ended.iter();
         Self {
             replica,
             version: env!("CARGO_PKG_VERSION"),
-            leaderboards: boards(leaderboards, &tallies),
+            standings: standings(&leaderboards),
+            leaderboards: boards(&leaderboards, &tallies),
             waiting: List::of(&sorted.waiting, WAITING, |one| Waits::of(one)),
             running: List::of(&sorted.running, RUNNING, |one| Runs::of(one)),
             ended: List::of(&sorted.ended, ENDED, |(one, state)| Ended::of(one, *state)),
@@ -227,12 +237,24 @@ impl<'a> Sorted<'a> {
     }
 }
 
-fn boards(leaderboards: &[Arc<Leaderboard>], tallies: &BTreeMap<Key, Tally>) -> List<Board> {
-    let name = |board: &Leaderboard| (board.namespace().unwrap_or_default(), board.name_any());
+fn name(leaderboard: &Leaderboard) -> Key {
+    (leaderboard.namespace().unwrap_or_default(), leaderboard.name_any())
+}
+
+fn by_name(leaderboards: &[Arc<Leaderboard>]) -> Vec<&Leaderboard> {
     let mut all: Vec<&Leaderboard> = leaderboards.iter().map(Arc::as_ref).collect();
     all.sort_by_cached_key(|board| name(board));
+    all
+}
+
+fn standings(leaderboards: &[&Leaderboard]) -> List<Table> {
+    let tables: Vec<Table> = leaderboards.iter().flat_map(|board| tables(board)).collect();
+    List::of(&tables, TABLES, Table::clone)
+}
+
+fn boards(leaderboards: &[&Leaderboard], tallies: &BTreeMap<Key, Tally>) -> List<Board> {
     let none = Tally::default();
-    List::of(&all, LEADERBOARDS, |leaderboard| {
+    List::of(leaderboards, LEADERBOARDS, |leaderboard| {
         let tally = tallies.get(&name(leaderboard)).unwrap_or(&none);
         board(leaderboard, tally)
     })
@@ -259,6 +281,7 @@ fn board(leaderboard: &Leaderboard, tally: &Tally) -> Board {
         failed: tally.failed,
         cancelled: tally.cancelled,
         evalai: budget,
+        challenge: leaderboard.spec.evalai.as_ref().and_then(links::challenge),
         typical: typical(&tally.last_runs),
     }
 }

@@ -1,13 +1,14 @@
-//! The page's files and its stream of events, for a browser that came by its own address alone.
+//! The page's files, its stream of events and one submission at a time, for a browser that came by its own address alone.
 //!
 //! A name that leads to 127.0.0.1 (DNS rebinding) is refused by its Host, and another site's script by `Sec-Fetch-Site`. Everything else
 //! that a browser could do with the texts of strangers is forbidden by the policy of the content.
 
 use std::convert::Infallible;
+use std::sync::Arc;
 
 use axum::Router;
 use axum::body::Body;
-use axum::extract::{Request, State};
+use axum::extract::{Path, Request, State};
 use axum::http::header::{self, HeaderName};
 use axum::http::{HeaderMap, HeaderValue, StatusCode};
 use axum::middleware::{self, Next};
@@ -15,7 +16,7 @@ use axum::response::{IntoResponse, Response};
 use axum::routing::{MethodRouter, get};
 use futures::StreamExt;
 
-use super::hub::Hub;
+use super::hub::{Hub, Source};
 use leaderboard_base::shutdown::Stop;
 
 /// What the browser may load and run: our own files. Texts never become markup.
@@ -27,36 +28,48 @@ const HTML: &str = "text/html; charset=utf-8";
 const CSS: &str = "text/css; charset=utf-8";
 const SCRIPT: &str = "text/javascript; charset=utf-8";
 const SVG: &str = "image/svg+xml";
+const JSON: &str = "application/json";
 
 #[derive(Clone)]
 struct Shown {
     hub: Hub,
+    source: Arc<dyn Source>,
     stop: Stop,
 }
 
-pub(super) fn router(hub: Hub, stop: Stop) -> Router {
+pub(super) fn router(hub: Hub, source: Arc<dyn Source>, stop: Stop) -> Router {
     Router::new()
         .route("/", file(HTML, include_str!("web/index.html")))
         .route("/page.css", file(CSS, include_str!("web/page.css")))
         .route("/page.js", file(SCRIPT, include_str!("web/page.js")))
         .route("/sections.js", file(SCRIPT, include_str!("web/sections.js")))
+        .route("/detail.js", file(SCRIPT, include_str!("web/detail.js")))
+        .route("/timeline.js", file(SCRIPT, include_str!("web/timeline.js")))
         .route("/elements.js", file(SCRIPT, include_str!("web/elements.js")))
         .route("/icon.svg", file(SVG, include_str!("web/icon.svg")))
         .route("/events", get(events))
+        .route("/submissions/{namespace}/{name}", get(detail))
         .layer(middleware::from_fn(guard))
-        .with_state(Shown { hub, stop })
+        .with_state(Shown { hub, source, stop })
 }
 
 fn file(kind: &'static str, text: &'static str) -> MethodRouter<Shown> {
     get(move || async move { ([(header::CONTENT_TYPE, kind)], text) })
 }
 
-async fn events(State(Shown { hub, stop }): State<Shown>) -> Response {
+async fn events(State(Shown { hub, stop, .. }): State<Shown>) -> Response {
     let body = match hub.join() {
         Some(viewer) => Body::from_stream(viewer.events(stop).map(Ok::<_, Infallible>)),
         None => Body::from(FULL),
     };
     ([(header::CONTENT_TYPE, "text/event-stream")], body).into_response()
+}
+
+async fn detail(State(shown): State<Shown>, Path((namespace, name)): Path<(String, String)>) -> Response {
+    match shown.source.detail(&namespace, &name) {
+        Some(body) => ([(header::CONTENT_TYPE, JSON)], body).into_response(),
+        None => (StatusCode::NOT_FOUND, "There is no submission of this name.\n").into_response(),
+    }
 }
 
 /// Refuses what comes by another name or from another site, and gives every answer its headers.

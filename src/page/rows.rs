@@ -6,7 +6,7 @@ use jiff::Timestamp;
 use kube::ResourceExt;
 use leaderboard_api::text::{one_line, sentence};
 use leaderboard_api::{
-    Attempt, EndReason, Failure, ReasonName, State, Submission, SubmissionStatus, WorkerState, WorkerStatus,
+    Attempt, EndReason, Failure, Metric, ReasonName, State, Submission, SubmissionStatus, WorkerState, WorkerStatus,
     conditions, reasons,
 };
 use serde::Serialize;
@@ -62,6 +62,13 @@ pub(super) struct Runs {
     pub phases: Phases,
 }
 
+/// A number with its name.
+#[derive(Serialize, Clone, Debug, PartialEq, Eq)]
+pub(super) struct Number {
+    name: String,
+    value: String,
+}
+
 /// One of its workers.
 #[derive(Serialize, Clone, Debug, PartialEq, Eq)]
 pub(super) struct Worker {
@@ -81,6 +88,8 @@ pub(super) struct Ended {
     #[serde(flatten)]
     pub who: Who,
     pub state: &'static str,
+    /// Whose failure it is.
+    pub class: Option<&'static str>,
     pub reason: Option<String>,
     pub score: Option<String>,
     pub is_final: bool,
@@ -127,11 +136,11 @@ impl Who {
     }
 }
 
-fn name(text: &str) -> String {
+pub(super) fn name(text: &str) -> String {
     one_line(text, NAME)
 }
 
-fn message(text: &str) -> String {
+pub(super) fn message(text: &str) -> String {
     one_line(&sentence(text), MESSAGE)
 }
 
@@ -195,7 +204,7 @@ impl Runs {
     }
 }
 
-fn progress(status: &SubmissionStatus) -> (i32, i32, String) {
+pub(super) fn progress(status: &SubmissionStatus) -> (i32, i32, String) {
     let progress = status.progress.as_ref();
     progress.map_or_else(
         || (0, 0, String::new()),
@@ -203,8 +212,23 @@ fn progress(status: &SubmissionStatus) -> (i32, i32, String) {
     )
 }
 
+impl Number {
+    pub(super) fn new(of: &str, value: &str) -> Self {
+        Self {
+            name: name(of),
+            value: name(value),
+        }
+    }
+
+    /// The first so many metrics.
+    pub(super) fn first(metrics: &[Metric], most: usize) -> Vec<Self> {
+        let first = metrics.iter().take(most);
+        first.map(|metric| Self::new(&metric.name, &metric.value)).collect()
+    }
+}
+
 impl Worker {
-    fn of(worker: &WorkerStatus) -> Self {
+    pub(super) fn of(worker: &WorkerStatus) -> Self {
         Self {
             id: worker.id,
             done: worker.done,
@@ -228,6 +252,7 @@ impl Ended {
             Self {
                 who: Who::of(submission),
                 state: state.as_str(),
+                class: status.failure.as_ref().map(|failure| failure.class.as_str()),
                 reason: reason(status),
                 score: score.map(|score| name(&score.text)),
                 is_final: score.is_some_and(|score| score.is_final),
@@ -242,7 +267,7 @@ impl Ended {
 }
 
 /// The systems that have not got the end yet, and need it.
-fn open(status: &SubmissionStatus) -> Vec<&'static str> {
+pub(super) fn open(status: &SubmissionStatus) -> Vec<&'static str> {
     let is_open = |type_: &str| status.condition(type_).is_some() && !status.is_delivered(type_);
     let open = conditions::SYSTEMS.into_iter().filter(|(type_, _)| is_open(type_));
     open.map(|(_, system)| system).collect()

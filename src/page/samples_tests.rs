@@ -1,14 +1,28 @@
-//! Submissions and Leaderboards as an evening before a deadline has them, for the tests of the page and its pictures in the docs.
+//! Submissions and Leaderboards as an evening before a deadline has them, for the tests of the page.
 
 use std::sync::Arc;
 
 use jiff::{SignedDuration, Timestamp};
 use leaderboard_api::{Leaderboard, Submission};
+use serde::Serialize;
 use serde_json::{Value, json};
 
 pub(super) const NAMESPACE: &str = "leaderboard";
 const MINUTE: i64 = 60;
 const HOUR: i64 = 60 * MINUTE;
+
+/// Compares a value with a file of src/page/golden; `UPDATE_GOLDEN=1` writes the file.
+pub(super) fn golden(file: &str, value: &impl Serialize) {
+    let file = std::path::Path::new(env!("CARGO_MANIFEST_DIR"))
+        .join("src/page/golden")
+        .join(file);
+    let found = serde_json::to_string_pretty(value).unwrap() + "\n";
+    if std::env::var_os("UPDATE_GOLDEN").is_some() {
+        std::fs::write(&file, &found).unwrap();
+    }
+    let expected = std::fs::read_to_string(&file).unwrap_or_default();
+    assert!(found == expected, "run it with UPDATE_GOLDEN=1 and read the difference");
+}
 
 /// The moment of all samples.
 pub(super) fn now() -> Timestamp {
@@ -25,10 +39,12 @@ fn condition(type_: &str, status: &str, reason: &str, seconds: i64) -> Value {
 }
 
 pub(super) fn submission(name: &str, board: &str, team: &str, status: &Value) -> Arc<Submission> {
+    let number: Option<i64> = name.strip_prefix("submission-").and_then(|number| number.parse().ok());
+    let evalai = number.map(|number| json!({"challenge": 2050, "phase": 4101, "submission": number}));
     let object = json!({
         "apiVersion": "leaderboard.carla.org/v1alpha1", "kind": "Submission",
         "metadata": {"name": name, "namespace": NAMESPACE, "creationTimestamp": ago(12 * HOUR)},
-        "spec": {"leaderboardName": board, "track": "sensors", "image": "agent:1", "team": {"name": team}},
+        "spec": {"leaderboardName": board, "track": "sensors", "image": "agent:1", "team": {"name": team}, "evalai": evalai},
         "status": status,
     });
     Arc::new(serde_json::from_value(object).unwrap())
@@ -61,8 +77,14 @@ pub(super) fn running(name: &str, team: &str, attempt: i64, hours: i64, workers:
         "nodeName": format!("gpu-{hours}"), "workers": all,
         "progress": {"done": done, "total": total, "unit": "routes", "text": format!("{done}/{total}")},
         "score": {"name": "Driving score", "value": "41.20", "final": false, "text": format!("~4{hours}.20")},
+        "metrics": [{"name": "Route completion", "value": "71.33"}, {"name": "Infraction penalty", "value": "0.61"}],
+        "resultsURL": format!("s3://results-20/v2/{name}"),
         "times": {"submitted": ago(started + hours * 20 * MINUTE), "scheduled": ago(started + 7 * MINUTE), "started": ago(started)},
-        "conditions": [condition("Running", "True", "Running", started)],
+        "conditions": [
+            condition("Accepted", "True", "Accepted", started + hours * 20 * MINUTE),
+            condition("Running", "True", "Running", started),
+            condition("Finished", "False", "Running", started + hours * 20 * MINUTE),
+        ],
     });
     submission(name, "carla-20", team, &status)
 }
@@ -84,11 +106,19 @@ pub(super) fn finished(name: &str, team: &str, score: &str, minutes: i64, hours:
         "attempt": 1, "reason": "Finished", "track": "sensors",
         "progress": {"done": 80, "total": 80, "unit": "routes", "text": "80/80"},
         "score": {"name": "Driving score", "value": score, "final": true, "text": score},
+        "metrics": [{"name": "Route completion", "value": "88.10"}, {"name": "Infraction penalty", "value": "0.72"}],
+        "resultsURL": format!("s3://results-20/v2/{name}"), "workers": (1..=4).map(|id| worker(id, 20, 0)).collect::<Vec<_>>(),
         "times": {
             "submitted": ago(end + 2 * hours * HOUR), "scheduled": ago(end + hours * HOUR + 6 * MINUTE),
             "started": ago(end + hours * HOUR), "finished": ago(end), "published": ago(end - 20),
         },
-        "conditions": [condition("Finished", "True", "Finished", end), condition("Published", "True", "Published", end - 20)],
+        "conditions": [
+            condition("Accepted", "True", "Accepted", end + 2 * hours * HOUR),
+            condition("Archived", "True", "Archived", end),
+            condition("Published", "True", "Published", end - 20),
+            condition("Finished", "True", "Finished", end),
+            condition("Succeeded", "True", "Finished", end),
+        ],
     });
     submission(name, "carla-20", team, &status)
 }
@@ -110,14 +140,19 @@ pub(super) fn failed(
             "submitted": ago(end + 2 * HOUR), "scheduled": ago(end + HOUR), "started": ago(end + HOUR - 5 * MINUTE),
             "finished": ago(end),
         },
-        "conditions": [condition("Finished", "True", reason, end), condition("Published", "False", "Waiting", end)],
+        "resultsURL": format!("s3://results-20/v2/{name}"),
+        "conditions": [
+            condition("Accepted", "True", "Accepted", end + 2 * HOUR),
+            condition("Finished", "True", reason, end),
+            condition("Published", "False", "Waiting", end),
+        ],
     });
     submission(name, "carla-20", team, &status)
 }
 
 pub(super) fn leaderboard(name: &str, spec: &Value, status: &Value) -> Arc<Leaderboard> {
     let mut of = json!({
-        "tracks": [{"name": "sensors"}],
+        "tracks": [{"name": "sensors"}, {"name": "map"}],
         "evaluation": {"carla": {
             "version": "V2", "contents": {"image": "contents:1"}, "simulator": {"image": "simulator:1"},
         }}, "storage": {"s3": {"bucket": "results"}},
@@ -130,10 +165,63 @@ pub(super) fn leaderboard(name: &str, spec: &Value, status: &Value) -> Arc<Leade
     Arc::new(serde_json::from_value(object).unwrap())
 }
 
+fn evalai(challenge: i64) -> Value {
+    let token = json!({"secretKeyRef": {"name": "evalai", "key": "token"}});
+    json!({"apiServer": "https://eval.ai", "challenge": challenge, "token": token})
+}
+
+/// Team, number of its submission, minutes since its end, then score, route completion and infraction penalty; the best first.
+type Scores<'a> = [(&'a str, i64, i64, [&'a str; 3])];
+const SENSORS: [(&str, i64, i64, [&str; 3]); 7] = [
+    ("Autobahn Labs", 4189, 9, ["68.05", "94.21", "0.72"]),
+    ("KIT Drivers", 4185, 289, ["61.18", "91.70", "0.67"]),
+    ("Team Seven", 4187, 149, ["55.30", "88.02", "0.63"]),
+    ("Roach", 4184, 359, ["47.02", "81.95", "0.58"]),
+    ("Interfuser", 4188, 79, ["41.77", "79.40", "0.53"]),
+    ("Tübingen Vision", 4022, 9_000, ["38.64", "70.12", "0.55"]),
+    ("Équipe Ñandú", 4186, 219, ["23.91", "52.87", "0.46"]),
+];
+const MAP: [(&str, i64, i64, [&str; 3]); 3] = [
+    ("Team Seven", 4101, 3_000, ["74.92", "97.33", "0.77"]),
+    (
+        "<b>Bobby</b> & <script>alert(1)</script>",
+        4097,
+        3_300,
+        ["70.40", "96.10", "0.73"],
+    ),
+    ("Roach", 4090, 4_000, ["52.11", "84.25", "0.62"]),
+];
+
+/// A track with its standings.
+fn track(name: &str, scores: &Scores<'_>) -> Value {
+    let standing = |(rank, (team, number, minutes, [score, completion, penalty])): (
+        i64,
+        &(&str, i64, i64, [&str; 3]),
+    )| {
+        json!({
+            "rank": rank, "team": team, "submission": format!("submission-{number}"),
+            "score": {"name": "Driving score", "value": score, "text": score},
+            "metrics": [{"name": "Route completion", "value": completion}, {"name": "Infraction penalty", "value": penalty}],
+            "finishedAt": ago(minutes * MINUTE),
+        })
+    };
+    json!({
+        "name": name, "carla": {"pairs": 4, "routes": 20, "repetitions": 1}, "ranking": {"metric": "Driving score", "order": "Descending"},
+        "standings": (1..).zip(scores).map(standing).collect::<Vec<_>>(),
+    })
+}
+
+/// A track whose standings are full, of teams of this name.
+pub(super) fn ranked(name: &str, team: &str) -> Value {
+    let scores: Vec<_> = (0..20).map(|at| (team, at, 10, ["68.05", "94.21", "0.72"])).collect();
+    track(name, &scores)
+}
+
 /// Two Leaderboards: a busy one, and one that is paused and not Ready.
 pub(super) fn leaderboards() -> Vec<Arc<Leaderboard>> {
     let backlog = json!({"waiting": 3, "lastExpectedTime": ago(-4 * MINUTE)});
     let busy = json!({
+        "tracks": [track("sensors", &SENSORS), track("map", &MAP)],
         "evalai": {"requestsLastMinute": 41, "requestsPerMinute": 60, "backlog": backlog},
         "conditions": [condition("Ready", "True", "Ready", HOUR)],
     });
@@ -142,7 +230,11 @@ pub(super) fn leaderboards() -> Vec<Arc<Leaderboard>> {
         "s3:PutObject is denied for the bucket results-10; give the role the policy of docs/aws.md".into();
     let broken = json!({"evalai": {"requestsLastMinute": 4, "requestsPerMinute": 30}, "conditions": [denied]});
     vec![
-        leaderboard("carla-20", &json!({"concurrency": {"total": 4}}), &busy),
+        leaderboard(
+            "carla-20",
+            &json!({"concurrency": {"total": 4}, "evalai": evalai(2050)}),
+            &busy,
+        ),
         leaderboard("carla-10", &json!({"paused": true}), &broken),
     ]
 }
@@ -163,7 +255,7 @@ pub(super) fn submissions() -> Vec<Arc<Submission>> {
     ];
     for (at, (score, team)) in (0_i64..).zip(scores.into_iter().zip(teams)) {
         all.push(finished(
-            &format!("submission-{}", 4199 - at),
+            &format!("submission-{}", 4189 - at),
             team,
             score,
             9 + 70 * at,

@@ -13,11 +13,13 @@ use crate::page::hub::{Source, VIEWERS};
 
 /// What a test waits for at most.
 const LIMIT: Duration = Duration::from_secs(30);
-const FILES: [&str; 6] = [
+const FILES: [&str; 8] = [
     "/",
     "/page.css",
     "/page.js",
     "/sections.js",
+    "/detail.js",
+    "/timeline.js",
     "/elements.js",
     "/icon.svg",
 ];
@@ -33,16 +35,21 @@ impl Source for Still {
     fn view(&self) -> Vec<u8> {
         vec![b'x'; self.0]
     }
+
+    fn detail(&self, namespace: &str, name: &str) -> Option<Vec<u8>> {
+        (name != "none").then(|| format!("{{\"of\":\"{namespace}/{name}\"}}").into_bytes())
+    }
 }
 
 /// A page with a view of so many bytes. It ends when the sender goes.
 async fn page(bytes: usize) -> (SocketAddr, watch::Sender<bool>) {
     let (sender, stop) = Stop::new();
     let hub = Hub::new();
-    tokio::spawn(hub.clone().run(Still(bytes), stop.clone()));
+    let source = Arc::new(Still(bytes));
+    tokio::spawn(hub.clone().run(source.clone(), stop.clone()));
     let listener = TcpListener::bind("127.0.0.1:0").await.unwrap();
     let address = listener.local_addr().unwrap();
-    let router = router(hub, stop);
+    let router = router(hub, source, stop);
     tokio::spawn(async move { axum::serve(Bounded::new(listener), router).await });
     (address, sender)
 }
@@ -126,6 +133,7 @@ async fn another_sites_script_reads_nothing_and_a_link_may_lead_here() {
     for (path, site, code) in [
         ("/events", "cross-site", 403),
         ("/events", "same-site", 403),
+        ("/submissions/a/b", "cross-site", 403),
         ("/page.js", "cross-site", 403),
         ("/page.js", "same-origin", 200),
         ("/", "cross-site", 200),
@@ -142,10 +150,23 @@ async fn another_sites_script_reads_nothing_and_a_link_may_lead_here() {
 }
 
 #[tokio::test]
+async fn a_submission_is_read_by_its_name() {
+    let (address, _sender) = page(1).await;
+    let found = answer(address, "GET /submissions/demo/submission-7", "Host: localhost\r\n").await;
+    assert!(
+        found.starts_with("HTTP/1.1 200") && found.contains("content-type: application/json"),
+        "{found}"
+    );
+    assert!(found.ends_with("{\"of\":\"demo/submission-7\"}"), "{found}");
+    let found = answer(address, "GET /submissions/demo/none", "Host: localhost\r\n").await;
+    assert!(found.starts_with("HTTP/1.1 404"), "{found}");
+}
+
+#[tokio::test]
 async fn nothing_can_be_written() {
     let (address, _sender) = page(1).await;
     for method in ["POST", "PUT", "PATCH", "DELETE", "OPTIONS"] {
-        for path in ["/", "/events"] {
+        for path in ["/", "/events", "/submissions/a/b"] {
             let found = answer(
                 address,
                 &format!("{method} {path}"),

@@ -25,8 +25,8 @@ export function graphic(tag, attributes = {}, ...children) {
   return fill(document.createElementNS(SVG, tag), attributes, children);
 }
 
-// Makes the children of `live` like those of `fresh`. What stays the same thing stays the same node, so that focus, selection and
-// opened details survive: by `data-key` where there is one, else by its place.
+// Makes the children of `live` like those of `fresh`. What stays the same thing stays the same node, so that focus and selection
+// survive: by `data-key` where there is one, else by its place.
 export function update(live, fresh) {
   const keyed = new Map();
   for (const child of live.children) {
@@ -62,8 +62,7 @@ function change(live, fresh) {
     return;
   }
   for (const { name } of [...live.attributes]) {
-    // Whether details are open is the reader's.
-    if (!fresh.hasAttribute(name) && name !== "open") live.removeAttribute(name);
+    if (!fresh.hasAttribute(name)) live.removeAttribute(name);
   }
   for (const { name, value } of fresh.attributes) {
     if (live.getAttribute(name) !== value) live.setAttribute(name, value);
@@ -83,12 +82,38 @@ export function span(seconds) {
   return rest ? `${Math.floor(hours / 24)} d ${rest} h` : `${hours / 24} d`;
 }
 
+// As long ago as people say it: in one unit.
+
 export function ago(seconds, now) {
   if (seconds === null) return null;
   const at = new Date(seconds * 1000);
-  return element("time", { datetime: at.toISOString(), title: at.toLocaleString() }, `${span(now - seconds)} ago`);
+  return element("time", { datetime: at.toISOString(), title: at.toLocaleString("en") }, `${span(now - seconds).split(" ", 2).join(" ")} ago`);
+}
+
+// A moment of today by its clock, an older one with its date.
+export function moment(seconds, now) {
+  const at = new Date(seconds * 1000);
+  const isToday = at.toDateString() === new Date(now * 1000).toDateString();
+  const format = { hour: "2-digit", minute: "2-digit", hourCycle: "h23", ...(isToday ? {} : { month: "short", day: "numeric" }) };
+  return element("time", { datetime: at.toISOString() }, at.toLocaleString("en", format));
 }
 
 export function number(count) {
   return count.toLocaleString("en");
+}
+
+// A bar that is filled to a share; decorative, the number stands next to it.
+export function bar(share, kind = "running") {
+  const width = (100 * Math.min(1, Math.max(0, share))).toFixed(2);
+  return graphic("svg", { class: "meter", viewBox: "0 0 100 1", preserveAspectRatio: "none", "aria-hidden": "true" }, graphic("rect", { class: kind, width, height: 1 }));
+}
+
+// A short word on a coloured ground.
+export function badge(kind, ...text) {
+  return element("span", { class: `badge ${kind}` }, text);
+}
+
+// Leads to another site.
+export function link(address, ...text) {
+  return element("a", { href: address, target: "_blank", rel: "noopener noreferrer" }, text, element("span", { "aria-hidden": "true" }, " ↗"));
 }

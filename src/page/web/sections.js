@@ -1,256 +1,235 @@
 // Each section of the page from its part of the view.
 
-import { ago, element, graphic, number, span } from "./elements.js";
+import { ago, badge, bar, element, graphic, link, number, span } from "./elements.js";
+import { lengths } from "./timeline.js";
 
-const PHASES = [
-  ["waiting", "waited", "submitted"],
-  ["starting", "started in", "scheduled"],
-  ["running", "ran", "started"],
-  ["publishing", "published in", "finished"],
-];
-
-const WORKER = {
-  Waiting: "waiting",
-  Running: "running",
-  Done: "done",
-  Crashed: "crashed, starts again",
-  Unknown: "",
-};
+// Rows that a section shows before somebody asks for more, and how many come then.
+const FIRST = { standings: 10, running: 8, waiting: 12, leaderboards: 4, failures: 5, ended: 8 };
+const STEP = 20;
+// Medians of fewer runs say nothing.
+const RUNS = 5;
+// A budget of requests is scarce from this share on.
+const SCARCE = 0.8;
 
 export function keyOf(row) {
   return `${row.namespace}/${row.name}`;
 }
 
-// The seconds of each phase; of one that goes on, until now.
-function lengths(phases, now) {
-  const ends = [phases.scheduled, phases.started, phases.finished, phases.published];
-  return PHASES.map(([, , from], at) => {
-    const begin = phases[from];
-    if (begin === null) return 0;
-    // A phase that was left out ends with the next moment that is known.
-    const end = ends.slice(at).find((moment) => moment !== null);
-    const isOver = phases.finished !== null && at === 3 && phases.published === null;
-    return isOver ? 0 : Math.max(0, (end ?? now) - begin);
-  }).map((length, at, all) => (at > 0 && phases[PHASES[at][2]] === null ? 0 : length));
+// Whose failure it is has its colour: red asks the hosts to act, amber does not.
+export function fault(failureClass) {
+  return failureClass === "Infrastructure" ? "bad" : "warn";
 }
 
-// A bar with one part for each phase; `scale` is how many seconds its whole width stands for.
-function picture(seconds, scale) {
-  let x = 0;
-  const parts = PHASES.map(([name], at) => {
-    const share = scale > 0 ? (100 * seconds[at]) / scale : 0;
-    const width = seconds[at] > 0 ? Math.max(share, 0.6) : 0;
-    const part = graphic("rect", { class: name, x: x.toFixed(2), y: 0, width: width.toFixed(2), height: 10 });
-    x += width;
-    return part;
-  });
-  const texts = PHASES.map(([, verb], at) => (seconds[at] > 0 ? `${verb} ${span(seconds[at])}` : null));
-  const label = texts.filter(Boolean).join(", ") || "no times yet";
-  const width = Math.max(x, 100).toFixed(2);
-  const size = { viewBox: `0 0 ${width} 10`, preserveAspectRatio: "none" };
-  return element(
-    "div",
-    { class: "picture" },
-    graphic("svg", { class: "phases", role: "img", "aria-label": label, ...size }, parts),
-    element("span", { class: "times", "aria-hidden": "true" }, label),
-  );
+function boardOf(row, context) {
+  return context.isQualified ? `${row.namespace}/${row.leaderboard}` : row.leaderboard;
 }
 
-export function legend() {
-  const items = PHASES.map(([name]) => element("li", {}, element("span", { class: `swatch ${name}` }), name));
-  return element("ul", { class: "legend", "aria-label": "Phases" }, items);
-}
-
-function sum(numbers) {
-  return numbers.reduce((all, one) => all + one, 0);
-}
-
-function longest(rows, now) {
-  return Math.max(1, ...rows.map((row) => sum(lengths(row.phases, now))));
+// Opens the submission; its whole row is the link's ground.
+function open(row) {
+  return element("a", { class: "open", href: `#/${keyOf(row)}` }, row.name);
 }
 
 function who(row, context) {
-  const board = context.isQualified ? `${row.namespace}/${row.leaderboard}` : row.leaderboard;
-  const facts = [row.team ?? (row.isCheck ? "a check" : null), row.track, board].filter(Boolean);
-  return element(
-    "div",
-    { class: "who" },
-    element("strong", {}, row.name),
-    element("span", { class: "muted" }, facts.join(" · ")),
-  );
+  const facts = [row.track, context.hasBoards ? boardOf(row, context) : null].filter(Boolean).map((fact) => [" ", element("span", { class: "whole" }, `· ${fact}`)]);
+  const name = row.team ?? (row.isCheck ? "Check" : row.name);
+  return element("div", { class: "who" }, element("strong", {}, name), element("span", { class: "muted" }, open(row), facts));
 }
 
-function bar(done, total, label) {
-  return element("progress", { max: Math.max(total, 1), value: Math.min(done, Math.max(total, 1)), "aria-label": label });
-}
-
-function more(list, shown) {
-  const hidden = list.count - list.rows.length;
-  const texts = [];
-  if (shown < list.rows.length) texts.push(`${number(shown)} of ${number(list.rows.length)} fit the filter`);
-  if (hidden > 0) texts.push(`${number(hidden)} more are not shown: kubectl leaderboard status lists all`);
-  return texts.length ? element("p", { class: "muted more" }, `${texts.join("; ")}.`) : null;
-}
-
-// A list, or a sentence where there is nothing.
-function rows(list, context, empty, row) {
+// The first rows of a list that fit the filter, drawn by `row`; below them what is left.
+function rows(name, list, context, empty, draw) {
   const fitting = list.rows.filter(context.fits);
-  const nothing = list.count === 0 ? empty : "Nothing fits the filter.";
-  const items = fitting.map((each) => row(each));
-  const kind = context.kind ?? "ul";
-  const content = items.length ? element(kind, { class: "rows" }, items) : element("p", { class: "muted" }, nothing);
-  return element("div", {}, context.before, content, more(list, fitting.length));
+  if (!fitting.length) return element("p", { class: "empty" }, list.count === 0 ? empty : "Nothing fits the filter.");
+  const most = FIRST[name] + STEP * context.steps(name);
+  const left = fitting.length - most;
+  const hidden = list.count - list.rows.length;
+  const button = left > 0 ? element("button", { type: "button", class: "more", "data-more": name }, `Show ${Math.min(left, STEP)} more`) : null;
+  const rest = left <= 0 && hidden > 0 ? element("p", { class: "muted rest" }, `${number(hidden)} more: `, element("code", {}, "kubectl leaderboard status"), " lists all.") : null;
+  return element("div", {}, draw(fitting.slice(0, most)), button, rest);
 }
 
-function fact(term, ...value) {
-  return element("div", { class: "fact" }, element("dt", {}, term), element("dd", {}, value));
+function list(items, attributes = {}) {
+  return element("ul", { class: "rows", ...attributes }, items);
 }
 
-function budget(evalai) {
-  const text = `${evalai.used} of ${evalai.limit} requests in the last minute`;
-  const backlog = evalai.waiting
-    ? `${number(evalai.waiting)} results on their way, the last at about ${clock(evalai.lastExpected)}`
-    : "all results are there";
-  const said = [`${text}; `, element("span", { class: "muted" }, backlog)];
-  return fact("Budget of EvalAI", bar(evalai.used, evalai.limit, "Requests to EvalAI"), said);
-}
+const MEDALS = ["gold", "silver", "bronze"];
 
-function clock(seconds) {
-  const format = { hour: "2-digit", minute: "2-digit", hour12: false };
-  return new Date(seconds * 1000).toLocaleTimeString("en", format);
-}
-
-function typical(runs) {
-  const seconds = [runs.waiting, runs.starting, runs.running, runs.publishing];
-  const of = runs.runs === 1 ? "Where the time went in the last run" : `Where the time went: medians of the last ${runs.runs} runs`;
-  return fact(of, picture(seconds, sum(seconds)));
-}
-
-function board(row, context) {
-  const slots = row.slots === null ? "no limit" : `${number(row.inUse)} of ${row.slots} slots`;
-  const marks = [row.isPaused ? element("span", { class: "badge waiting" }, "paused") : null];
-  marks.push(row.trouble === null ? null : element("span", { class: "badge failed" }, "not ready"));
-  const counts = [
-    fact("Running", `${number(row.running)} `, element("span", { class: "muted" }, slots)),
-    fact("In line", number(row.waiting)),
-    fact("Finished", number(row.finished)),
-    fact("Failed", number(row.failed)),
-    fact("Cancelled", number(row.cancelled)),
-  ];
+function standing(row, table, context) {
+  const known = { namespace: table.namespace, name: row.name };
+  const place = element("span", { class: `place ${MEDALS[row.rank - 1] ?? ""}` }, row.rank);
+  const team = element("div", { class: "who" }, element("strong", {}, row.team ?? row.name), element("span", { class: "muted" }, open(known), row.finished === null ? null : [" · ", ago(row.finished, context.now)]));
   return element(
-    "li",
-    { class: "card", "data-key": keyOf(row) },
-    element("h3", {}, context.isQualified ? keyOf(row) : row.name, marks),
-    row.trouble === null ? null : element("p", { class: "trouble" }, row.trouble),
-    element("dl", { class: "counts" }, counts),
-    element("dl", {}, row.evalai && budget(row.evalai), row.typical && typical(row.typical)),
+    "tr",
+    { "data-key": row.name },
+    element("td", {}, place),
+    element("th", { scope: "row" }, team),
+    row.values.map((value) => element("td", { class: "metric" }, value ?? "–")),
+    element("td", { class: "score" }, row.score),
   );
 }
 
-export function leaderboards(view, context) {
-  const shown = view.leaderboards.rows.filter((row) => !context.leaderboard || keyOf(row) === context.leaderboard);
-  const hidden = view.leaderboards.count - view.leaderboards.rows.length;
-  const cards = element("ul", { class: "cards" }, shown.map((row) => board(row, context)));
-  const empty = element("p", { class: "muted" }, "There is no Leaderboard yet.");
-  const rest = hidden > 0 ? element("p", { class: "muted more" }, `${number(hidden)} more are not shown.`) : null;
-  return element("div", {}, shown.length ? [legend(), cards] : empty, rest);
+function ranking(table, context) {
+  const all = { count: table.rows.length, rows: table.rows.map((row) => ({ ...row, leaderboard: table.leaderboard, namespace: table.namespace })) };
+  return rows("standings", all, context, "No result yet: the first finished run of this track opens the ranking.", (shown) =>
+    element(
+      "table",
+      {},
+      element("caption", {}, `Best result of each team; ${table.ascending ? "the lowest" : "the highest"} ${(table.metric ?? "score").toLowerCase()} leads.`),
+      element("thead", {}, element("tr", {}, element("th", { scope: "col" }, element("span", { class: "hidden" }, "Rank")), element("th", { scope: "col" }, "Team"), table.metrics.map((metric) => element("th", { scope: "col", class: "metric" }, metric)), element("th", { scope: "col", class: "score" }, table.metric ?? "Score"))),
+      element("tbody", {}, shown.map((row) => standing(row, table, context))),
+    ),
+  );
 }
 
-function worker(each) {
-  const crashes = each.crashes === 1 ? "1 crash" : `${each.crashes} crashes`;
-  const last = each.last ? ` (${each.last})` : "";
-  const state = each.crashes ? `${WORKER[each.state]}, ${crashes}${last}` : WORKER[each.state];
-  return element(
-    "li",
-    { "data-key": each.id, "data-state": each.state },
-    element("span", { class: "label" }, `Worker ${each.id}`),
-    bar(each.done, each.total, `Progress of worker ${each.id}`),
-    element("span", {}, `${each.done}/${each.total}`),
-    element("span", { class: "muted state" }, state),
-  );
+export function standings(view, context) {
+  const tables = view.standings.rows.filter((table) => context.isChosen(table));
+  const key = (table) => `${table.namespace}/${table.leaderboard}/${table.track}`;
+  const chosen = tables.find((table) => key(table) === context.table) ?? tables.find((table) => table.rows.length) ?? tables[0];
+  if (!chosen) return element("p", { class: "empty" }, "No Leaderboard is here yet.");
+  const tab = (table) => {
+    const isChosen = table === chosen;
+    const text = context.hasBoards ? `${boardOf(table, context)} · ${table.track}` : table.track;
+    return element("button", { type: "button", role: "tab", id: `tab-${key(table)}`, "data-key": key(table), "data-table": key(table), "aria-selected": String(isChosen), "aria-controls": "ranking", tabindex: isChosen ? 0 : -1 }, text);
+  };
+  if (tables.length === 1) return ranking(chosen, context);
+  const hidden = view.standings.count - view.standings.rows.length;
+  return element("div", {}, element("div", { class: "tabs", role: "tablist", "aria-label": "Tracks" }, tables.map(tab)), element("div", { id: "ranking", role: "tabpanel", "aria-labelledby": `tab-${key(chosen)}` }, ranking(chosen, context)), hidden > 0 ? element("p", { class: "muted rest" }, `${number(hidden)} more tracks: `, element("code", {}, "kubectl leaderboard scores"), " lists all.") : null);
+}
+
+// Progress of a run: one part for each of its workers.
+function progress(row) {
+  const parts = row.workers.length ? row.workers : [row];
+  const bars = parts.map((part) => bar(part.total ? part.done / part.total : 0, part.crashes ? "warn" : "running"));
+  const label = { role: "progressbar", "aria-label": `Progress of ${row.name}`, "aria-valuemin": 0, "aria-valuemax": Math.max(row.total, 1), "aria-valuenow": Math.min(row.done, Math.max(row.total, 1)) };
+  const share = row.total ? ` · ${Math.floor((100 * row.done) / row.total)} %` : "";
+  return element("div", { class: "progress" }, element("div", { class: "parts", ...label }, bars), element("span", { class: "muted" }, `${row.done}/${row.total} ${row.unit}${share}`));
+}
+
+function trouble(row) {
+  const crashed = row.workers.filter((worker) => worker.crashes > 0);
+  const texts = crashed.map((worker) => `Pair ${worker.id}: ${worker.crashes} ${worker.crashes === 1 ? "crash" : "crashes"}`);
+  return [row.attempt > 1 ? badge("plain", `Attempt ${row.attempt}`) : null, texts.length ? badge("warn", texts.join(", ")) : null];
+}
+
+function fact(value, ...note) {
+  return element("div", { class: "fact" }, element("span", {}, value), element("span", { class: "muted" }, note));
 }
 
 export function running(view, context) {
-  const scale = longest(view.running.rows, context.now);
-  return rows(view.running, context, "Nothing runs.", (row) => {
-    const score = row.score ? element("span", { class: "score" }, row.score) : null;
-    const notes = [row.attempt > 1 ? `attempt ${row.attempt}` : null, row.node ? `on ${row.node}` : null];
-    if (row.reason && row.reason !== "Running" && row.reason !== "Resumed") notes.push(row.reason);
-    const workers = element("ul", { class: "workers", "aria-label": `Workers of ${row.name}` }, row.workers.map(worker));
-    return element(
-      "li",
-      { class: "row run", "data-key": keyOf(row) },
-      who(row, context),
-      element(
-        "div",
-        { class: "side" },
-        element("div", { class: "whole" }, bar(row.done, row.total, `Progress of ${row.name}`), `${row.done}/${row.total} ${row.unit}`, score),
-        element("span", { class: "muted notes" }, notes.filter(Boolean).join(" · ")),
-      ),
-      picture(lengths(row.phases, context.now), scale),
-      row.workers.length ? workers : null,
-    );
-  });
+  return rows("running", view.running, context, "Nothing runs.", (shown) =>
+    list(
+      shown.map((row) => {
+        const since = row.phases.started ?? row.phases.submitted;
+        return element(
+          "li",
+          { class: "row run", "data-key": keyOf(row) },
+          element("div", {}, who(row, context), element("div", { class: "badges" }, trouble(row))),
+          progress(row),
+          fact(row.score?.replace("~", "") ?? "–", "score so far"),
+          fact(since === null ? "–" : span(context.now - since), row.node ? `on ${row.node}` : "running"),
+        );
+      }),
+    ),
+  );
 }
 
 export function waiting(view, context) {
-  return rows(view.waiting, { ...context, kind: "ol" }, "Nobody waits.", (row) => {
-    const place = row.position === null ? "–" : String(row.position);
-    const since = row.since === null ? null : [" · came ", ago(row.since, context.now)];
-    return element(
-      "li",
-      { class: "row wait", "data-key": keyOf(row) },
-      element("span", { class: "place" }, element("span", { class: "hidden" }, row.position === null ? "no place" : "place "), place),
-      who(row, context),
-      element("p", { class: "why" }, element("b", {}, row.reason ?? "New"), " ", row.message),
-      element("span", { class: "muted notes" }, row.eta ? `starts in about ${row.eta}` : "no estimate", since),
+  const group = ([key, members]) => {
+    const [{ reason, message }] = members;
+    const items = members.map((row) =>
+      element(
+        "li",
+        { class: "row wait", "data-key": keyOf(row) },
+        element("span", { class: "place" }, row.position === null ? "–" : row.position, element("span", { class: "hidden" }, row.position === null ? "no place" : ". in line")),
+        who(row, context),
+        fact(row.eta ? `~${row.eta}` : "–", row.eta ? "until it starts" : "no estimate"),
+        fact(row.since === null ? "–" : span(context.now - row.since), "in the queue"),
+      ),
     );
+    return element("div", { class: "group", "data-key": key }, element("p", { class: "why" }, badge("plain", reason ?? "New"), " ", message), list(items));
+  };
+  return rows("waiting", view.waiting, context, "Nobody waits.", (shown) => {
+    const groups = Map.groupBy(shown, (row) => `${row.reason}: ${row.message}`);
+    return element("div", {}, [...groups].map(group));
   });
 }
 
-const BADGE = { Finished: "finished", Failed: "failed", Cancelled: "cancelled" };
-
-export function ended(view, context) {
-  const scale = longest(view.ended.rows, context.now);
-  return rows(view.ended, context, "Nothing has ended yet.", (row) => {
-    const end = row.phases.finished === null ? null : ago(row.phases.finished, context.now);
-    const open = row.open.length ? ` · not yet in ${row.open.join(", ")}` : "";
-    const reason = row.reason && row.reason !== row.state ? row.reason : null;
-    return element(
-      "li",
-      { class: "row end", "data-key": keyOf(row) },
-      who(row, context),
-      element("div", { class: "outcome" }, element("span", { class: `badge ${BADGE[row.state]}` }, row.state), element("span", { class: "score" }, row.score ?? "–")),
-      picture(lengths(row.phases, context.now), scale),
-      element("span", { class: "muted notes" }, [reason, row.total ? `${row.done}/${row.total} ${row.unit}` : null].filter(Boolean).join(" · "), open, end ? " · " : null, end),
-    );
-  });
-}
-
-function classes(failures) {
-  const most = Math.max(1, ...failures.classes.map((each) => each.count));
-  const items = failures.classes.map((each) =>
-    element(
-      "li",
-      { class: "row class", "data-key": `${each.class}/${each.reason}` },
-      element("span", { class: `badge ${each.class.toLowerCase()}` }, each.class),
-      element("b", {}, each.reason),
-      bar(each.count, most, `${each.reason}, ${each.class}`),
-      element("span", {}, number(each.count)),
-    ),
+// How much of the slots is taken.
+function ring(row) {
+  const share = row.slots ? Math.min(100, (100 * row.inUse) / row.slots) : 0;
+  const circle = { cx: 18, cy: 18, r: 15.915 };
+  const label = row.slots === null ? `${row.inUse} in use, without a limit` : `${row.inUse} of ${row.slots} slots in use`;
+  return graphic(
+    "svg",
+    { class: "ring", viewBox: "0 0 36 36", role: "img", "aria-label": label },
+    graphic("circle", circle),
+    share ? graphic("circle", { ...circle, class: "running", "stroke-dasharray": `${share.toFixed(1)} 100`, transform: "rotate(-90 18 18)" }) : null,
+    graphic("text", { x: 18, y: 19.5, "text-anchor": "middle" }, row.slots === null ? row.inUse : `${row.inUse}/${row.slots}`),
+    graphic("text", { class: "unit", x: 18, y: 25.5, "text-anchor": "middle" }, row.slots === null ? "in use" : "slots"),
   );
-  return items.length ? element("ul", { class: "classes", "aria-label": "Failures by class and reason" }, items) : null;
+}
+
+function budget(evalai) {
+  const share = evalai.limit ? evalai.used / evalai.limit : 0;
+  const kind = share >= 1 ? "bad" : share > SCARCE ? "warn" : "";
+  const backlog = evalai.waiting ? `${number(evalai.waiting)} results on their way` : "all results published";
+  return [element("dt", {}, "EvalAI API budget"), element("dd", {}, element("span", { class: kind }, `${evalai.used} of ${evalai.limit} requests per minute`), ` · ${backlog}`)];
+}
+
+function typical(times) {
+  const moments = { submitted: 0, scheduled: times.waiting, started: times.waiting + times.starting };
+  moments.finished = moments.started + times.running;
+  moments.published = moments.finished + times.publishing;
+  return [element("dt", {}, `Typical run, median of ${times.runs}`), element("dd", {}, lengths(moments, moments.published))];
+}
+
+export function leaderboards(view, context) {
+  const board = (row) => {
+    const state = row.trouble ? badge("bad", "Not ready") : row.isPaused ? badge("warn", "Paused") : badge("good", "Ready");
+    const counts = [["Running", row.running], ["Queued", row.waiting], ["Finished", row.finished], ["Failed", row.failed], ["Cancelled", row.cancelled]];
+    return element(
+      "li",
+      { class: "row board", "data-key": keyOf(row) },
+      element("div", { class: "name" }, element("h3", {}, context.isQualified ? keyOf(row) : row.name), state, row.trouble && row.isPaused ? badge("warn", "Paused") : null, row.challenge ? link(row.challenge, "EvalAI") : null),
+      row.trouble ? element("p", { class: "bad" }, row.trouble) : null,
+      element("div", { class: "load" }, ring(row), element("dl", { class: "counts" }, counts.map(([name, count]) => element("div", {}, element("dt", {}, name), element("dd", {}, number(count)))))),
+      element("dl", { class: "facts" }, row.evalai ? budget(row.evalai) : null, row.typical?.runs >= RUNS ? typical(row.typical) : null),
+    );
+  };
+  const all = { ...view.leaderboards, rows: view.leaderboards.rows.map((row) => ({ ...row, leaderboard: row.name })) };
+  const fits = (row) => context.isChosen(row);
+  return rows("leaderboards", all, { ...context, fits }, "No Leaderboard is here yet: apply one, and it shows here.", (shown) => list(shown.map(board)));
 }
 
 export function failures(view, context) {
-  const all = { ...context, before: classes(view.failures) };
-  return rows(view.failures, all, "Nothing has failed.", (row) =>
-    element(
-      "li",
-      { class: "row fail", "data-key": keyOf(row) },
-      who(row, context),
-      element("p", { class: "why" }, element("b", {}, row.reason), " ", row.message),
-      element("span", { class: "muted notes" }, `${row.class}, ${row.class === "Participant" ? "counts as an attempt" : "not charged"}`, row.time === null ? null : [" · ", ago(row.time, context.now)]),
+  const classes = Map.groupBy(view.failures.classes, (each) => each.class);
+  const chips = [...classes].map(([name, each]) => element("p", { class: "chips", "data-key": name }, element("span", { class: "muted" }, name), each.map((one) => badge(fault(name), one.reason, element("b", {}, number(one.count))))));
+  const items = rows("failures", view.failures, context, "Nothing has failed.", (shown) =>
+    list(
+      shown.map((row) =>
+        element("li", { class: "row fail", "data-key": keyOf(row) }, who(row, context), fact(badge(fault(row.class), row.reason), row.time === null ? null : ago(row.time, context.now)), element("p", { class: "why" }, row.message)),
+      ),
+    ),
+  );
+  return element("div", {}, chips, items);
+}
+
+export function outcome(row) {
+  const kinds = { Finished: "good", Failed: fault(row.class), Running: "blue", Resumed: "blue" };
+  return badge(kinds[row.state] ?? "plain", row.state);
+}
+
+export function ended(view, context) {
+  return rows("ended", view.ended, context, "Nothing has ended yet.", (shown) =>
+    list(
+      shown.map((row) =>
+        element(
+          "li",
+          { class: "row end", "data-key": keyOf(row) },
+          who(row, context),
+          fact(row.state === "Finished" && row.score ? row.score : outcome(row), row.phases.finished === null ? null : ago(row.phases.finished, context.now)),
+          row.open.length ? element("div", { class: "badges" }, badge("warn", `Not yet in ${row.open.join(", ")}`)) : null,
+        ),
+      ),
     ),
   );
 }
