@@ -234,6 +234,10 @@ PROGRAMS = [
         (f"Role/{RELEASE}-page", "metadata.namespace", SYSTEM),
         (f"Role/{RELEASE}-page", "rules.1.resources", ["pods/portforward"]),
     ),
+    case(
+        {"webUI": {"enabled": True, "title": "eu-1"}},
+        (CONTROLLER, f"{CONTAINER}.env", [env("LEADERBOARD_PAGE_TITLE", "eu-1")]),
+    ),
     case({"webUI.enabled": False}, (f"Role/{RELEASE}-page", "", ABSENT), (CONTROLLER, f"{CONTAINER}.ports.1", ABSENT)),
     # Only to a container that asks for a login.
     case(
