@@ -49,6 +49,19 @@ impl Viewer {
     }
 }
 
+/// The whole answer of a page to one request.
+async fn answer(address: SocketAddr, path: &str) -> String {
+    let mut stream = TcpStream::connect(address).await.unwrap();
+    let request = format!("GET {path} HTTP/1.1\r\nHost: 127.0.0.1\r\nConnection: close\r\n\r\n");
+    stream.write_all(request.as_bytes()).await.unwrap();
+    let mut answer = String::new();
+    timeout(LIMIT, stream.read_to_string(&mut answer))
+        .await
+        .unwrap()
+        .unwrap();
+    answer
+}
+
 #[tokio::test]
 async fn a_change_arrives_at_who_looks_from_leader_and_standby() {
     let world = World::new().await;
@@ -68,6 +81,14 @@ async fn a_change_arrives_at_who_looks_from_leader_and_standby() {
     for viewer in &mut viewers {
         viewer.sees(&format!("\"name\":\"{name}\"")).await;
     }
+    let of_submission = format!("/submissions/{}/{name}", world.namespace);
+    let found = answer(addresses[1], &of_submission).await;
+    assert!(
+        found.contains(&format!("\"name\":\"{name}\"")) && found.contains("\"conditions\":["),
+        "{found}"
+    );
+    let found = answer(addresses[1], &format!("{of_submission}-other")).await;
+    assert!(found.starts_with("HTTP/1.1 404"), "{found}");
     // Whichever of them leads, the other one shows what it does.
     let leads = "\"leads\":true";
     let [first, second] = &mut viewers;
