@@ -38,10 +38,12 @@ pub(super) fn since(submission: &Submission) -> Option<Timestamp> {
     found.or_else(|| submission.creation_timestamp().map(|t| t.0))
 }
 
-/// Why it is in its state: the reason, unless it is the state's own name, and a message about it. Where the reason is the state's name and
-/// the progress is shown, that progress is the message.
+/// Why it is in its state: the reason, unless it is the state's own name, and a message about it. The progress of a run that goes on
+/// or has finished says what its message would.
 pub(super) fn reason(status: &SubmissionStatus, message: &str) -> String {
-    let state = status.known_state().map(State::as_str);
+    let state = status.known_state();
+    let is_cancelled = state == Some(State::Cancelled);
+    let state = state.map(State::as_str);
     match status
         .reason
         .as_ref()
@@ -49,7 +51,7 @@ pub(super) fn reason(status: &SubmissionStatus, message: &str) -> String {
         .filter(|reason| Some(*reason) != state)
     {
         Some(reason) => join(&[&format!("{reason}:"), message]).trim_end_matches(':').to_owned(),
-        None if status.progress.is_some() => String::new(),
+        None if status.progress.is_some() && !is_cancelled => String::new(),
         None => message.to_owned(),
     }
 }

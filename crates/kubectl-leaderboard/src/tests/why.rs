@@ -46,6 +46,20 @@ fn the_crashes_of_the_failed_worker_are_counted_once() {
     );
 }
 
+#[test]
+fn a_cancelled_run_says_who_cancelled_it_next_to_its_progress() {
+    let progress = json!({"progress": {"done": 3, "total": 20, "unit": "routes", "text": "3/20"}, "reason": null});
+    let text = explained(&with(cancelled(), &progress));
+    for part in ["Reason:      The submission was cancelled", "3/20 routes done"] {
+        assert!(text.contains(part), "{text}");
+    }
+    let text = explained(&with(running(), &json!({"reason": null})));
+    assert!(
+        !text.contains("Reason:") && text.contains("Progress:    12/20"),
+        "{text}"
+    );
+}
+
 /// What follows `Next:`.
 fn next_of(page: &str) -> &str {
     let (_, next) = page.split_once("\nNext:").unwrap_or_else(|| panic!("{page}"));
