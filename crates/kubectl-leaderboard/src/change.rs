@@ -100,7 +100,7 @@ fn how_it_stops(submission: &Submission, leaderboard: Observed<'_>) -> String {
         Observed::Missing => Some(Deadlines::default().cancel_seconds),
         Observed::Forbidden => None,
     };
-    let grace = seconds.map_or_else(|| "deadlines.cancelSeconds".to_owned(), |s| span(i64::from(s)));
+    let grace = seconds.map_or_else(|| "deadlines.cancelSeconds".to_owned(), span);
     if status.is_none_or(|s| s.times.started.is_none()) {
         return format!(
             "No agent has started, so the Job is deleted at once; a Pod that is already running is first asked to stop and \

@@ -65,13 +65,11 @@ pub async fn get(cluster: &Cluster, wanted: &Get) -> Result<ExitCode, Error> {
         }
         Err(Unread::Failed(why)) => return Err(of_bucket(results, &why)),
     };
-    match &wanted.download {
-        Some(folder) => download(&submission, results, storage, &stored, folder).await,
-        None => {
-            print(&lines(&submission, &stored, frame()));
-            Ok(ExitCode::SUCCESS)
-        }
+    if let Some(folder) = &wanted.download {
+        return download(&submission, results, storage, &stored, folder).await;
     }
+    print(&lines(&submission, &stored, frame()));
+    Ok(ExitCode::SUCCESS)
 }
 
 /// Copies all objects into a folder, unless one has a name that leads out of it.

@@ -46,7 +46,9 @@ fn narrowed(mut head: Vec<String>, mut rows: Vec<Vec<String>>, width: usize) -> 
             let wanted = if only_empty { usize::MAX } else { width };
             if (is_empty || is_spare && !only_empty) && total(&widths(&head, &rows, wanted)) > width {
                 head.remove(column);
-                rows.iter_mut().for_each(|row| drop(row.remove(column)));
+                for row in &mut rows {
+                    row.remove(column);
+                }
             }
         }
     }

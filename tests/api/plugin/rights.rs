@@ -104,11 +104,7 @@ async fn the_documented_rights_are_enough() {
         let text = terminal.run_as(&file, arguments).await.refused();
         assert_has(
             &text,
-            &[
-                "missing right: ",
-                "is forbidden",
-                "ask for the right: docs/plugin.md has a Role",
-            ],
+            &["missing right: ", "is forbidden", "docs/plugin.md#rights has a Role"],
         );
     }
 

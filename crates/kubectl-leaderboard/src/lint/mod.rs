@@ -137,7 +137,7 @@ impl Kinds {
             } else {
                 checked.faulty += 1;
             }
-            findings.extend(faults.into_iter().map(|fault| finding(&node, fault)));
+            findings.extend(faults.into_iter().map(|fault| finding(&node, &fault)));
         }
         findings.sort_by_key(|finding| finding.line);
         (findings, checked)
@@ -197,7 +197,7 @@ impl Kinds {
     }
 }
 
-fn finding(node: &Node, fault: Fault) -> Finding {
+fn finding(node: &Node, fault: &Fault) -> Finding {
     Finding {
         line: node.line_of(&fault.path),
         text: sentence(&fault.text),

@@ -34,7 +34,7 @@ pub fn check(schema: &Value, value: &mut Value, path: &str, faults: &mut Vec<Fau
                 }
             }
             Value::String(text) => {
-                found.extend(string(schema, text).map(|why| format!("{path} is {value}. It must {why}")))
+                found.extend(string(schema, text).map(|why| format!("{path} is {value}. It must {why}")));
             }
             Value::Number(number) => {
                 let number = number.as_f64().unwrap_or_default();

@@ -130,11 +130,14 @@ impl Explanation<'_> {
         let text = format!("{}{}, {counts}.", class(failure.class), worker.unwrap_or_default());
         // While the run is being stopped, the reason above is that of the stop.
         if self.status.present_reason().as_ref() == Some(&failure.reason) {
-            return self.page.row("Class", &text);
+            self.page.row("Class", &text);
+        } else {
+            self.page.row("Failure", &format!("{}: {text}", failure.reason));
         }
-        self.page.row("Failure", &format!("{}: {text}", failure.reason));
-        let message = self.without_steps(&failure.message);
-        self.page.row("", &message);
+        if self.status.message.as_deref() != Some(failure.message.as_str()) {
+            let message = self.without_steps(&failure.message);
+            self.page.row("", &message);
+        }
     }
 
     /// The position in the line, and the limits of the Leaderboard.
