@@ -48,11 +48,10 @@ pub struct Scores {
 enum As {
     #[default]
     Text,
-    /// All metrics, in columns as wide as they are.
+    // All metrics, in columns as wide as they are.
     Wide,
     Json,
     Yaml,
-    /// For a spreadsheet.
     Csv,
 }
 
