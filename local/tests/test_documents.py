@@ -40,6 +40,21 @@ class Links(unittest.TestCase):
         self.assertGreater(len(pages), 20)
         self.assertEqual([fault for page in pages for fault in doccheck.link_faults(page)], [])
 
+    def test_every_page_that_a_file_names_exists(self) -> None:
+        """In messages of programs, comments, charts and workflows: links between pages are above."""
+        named = re.compile(r"\bdocs/((?:[a-z][\w-]*/)*[\w-]+\.md)\b")
+        lost = []
+        for name in doccheck.tracked(REPOSITORY):
+            file = REPOSITORY / name
+            # The ledger names what is gone, and a test makes pages of its own.
+            if name in ("docs/decisions/ledger.md", "local/tests/test_docruns.py") or not file.is_file():
+                continue
+            text = file.read_bytes().decode(errors="ignore")
+            lost += [
+                f"{name}: docs/{page}" for page in named.findall(text) if not (REPOSITORY / "docs" / page).exists()
+            ]
+        self.assertEqual(lost, [])
+
 
 class Places(unittest.TestCase):
     """Pages that lead a contributor to a file: those of hosts name the objects of a cluster and the keys of a bucket as well."""
