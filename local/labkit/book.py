@@ -71,6 +71,9 @@ def stage(repository: Path, source: Path) -> int:
     for name in ["README.md", *others]:
         (source / name).parent.mkdir(parents=True, exist_ok=True)
         shutil.copy(repository / name, source / name)
+    # The book has its table of contents at its side, and no page of it.
+    readme = source / "README.md"
+    readme.write_text(re.sub(rf"\[([^\]]*)\]\({SUMMARY}\)", r"\1", readme.read_text()))
     summary = (source / SUMMARY).read_text()
     (source / SUMMARY).unlink()
     rest = ENTRY.sub(in_source, summary.removeprefix("# Summary\n"))

@@ -40,6 +40,7 @@ class Summary(unittest.TestCase):
             self.assertLessEqual({"docs/quickstart.md", "charts/leaderboard-operator/README.md"}, set(entries))
             self.assertEqual([entry for entry in entries if not (Path(folder) / entry).exists()], [])
             self.assertTrue((Path(folder) / "examples" / "leaderboard-20.yaml").exists())
+            self.assertNotIn("docs/SUMMARY.md", (Path(folder) / "README.md").read_text())
 
     def test_links_of_the_book_that_lead_nowhere_are_named(self) -> None:
         with tempfile.TemporaryDirectory() as folder:
