@@ -62,7 +62,7 @@ reasons! {
             "Fix what the message names, in the Leaderboard or in the namespace.";
         ImagePull,
             "An image cannot be pulled; the submission fails after `deadlines.startSeconds`. That counts as an attempt only if the \
-             registry lacks the image (`ImageNotFound`, `ImagePlatform`, `ImageInvalid`).",
+             registry lacks the agent's image (`ImageNotFound`, `ImagePlatform`, `ImageInvalid`).",
             "Fix the image's name, the rights of the nodes, or the network, as the message asks.",
             after_failure: "Fix this, then resume the submission.";
         ContainerConfig,
