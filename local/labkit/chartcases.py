@@ -161,7 +161,12 @@ NOTES: tuple[tuple[dict[str, Any], tuple[str, ...], tuple[str, ...]], ...] = (
     ),
     (
         {"namespaces": ["other", {"name": "leaderboard", "secretsManager": ["evalai/*"], "buckets": ["b*"]}]},
-        ("the namespaces leaderboard, other.", "kubectl -n leaderboard apply", '{id: "evalai/example"', 'bucket: "bexample"'),
+        (
+            "the namespaces leaderboard, other.",
+            "kubectl -n leaderboard apply",
+            '{id: "evalai/example"',
+            'bucket: "bexample"',
+        ),
         (),
     ),
     (

@@ -44,7 +44,7 @@ LINK = re.compile(r"\[([^\[\]]*)\](?:\([^()\s]*(?:\([^()]*\))?[^()\s]*\)|\[[^\]]
 TAG = re.compile(r"</?[a-zA-Z][^<>]*>")
 CODE = re.compile(r"(`+)(?!`)(.+?)(?<!`)\1(?!`)", re.DOTALL)
 SHORT = re.compile(r"\b(?:e\.g|i\.e|etc|vs|cf|No)\.(?= )")
-ENDS = re.compile(r"(?<=[.!?])[)\"'*_”]*\s+(?=[\"'(*_“`\[]*[A-Z0-9\x00])")
+ENDS = re.compile(r"(?<=[.!?]\*\*)\s+|(?<=[.!?])[)\"'*_”]*\s+(?=[\"'(*_“`\[]*[A-Z0-9\x00])")
 WORD = re.compile(r"[\w\x00]")
 # The place of a piece of code, while a sentence is read.
 HELD = "\x00"

@@ -320,8 +320,8 @@ reasons! {
     }
     Leaderboard {
         Ready,
-            "Submissions can run. A note in the message names what is no obstacle: metrics that stay empty or rank in EvalAI alone, a \
-             token that expires soon, images that cannot be pulled, Secrets that participants can read.",
+            "Submissions can run. A note names what is no obstacle: metrics that stay empty or rank in EvalAI alone, an expiring \
+             token, images that cannot be pulled, Secrets that participants can read.",
             "Nothing, or what the note asks for.";
         Checking,
             "The operator asks bucket, table, queues and the place of EvalAI's token for the first time, and not all have answered yet.",
