@@ -1,8 +1,8 @@
 """Owns how other programs read examples/gitops: Argo CD's Lua, Flux's CEL, and the schemas of External Secrets and Kueue.
 
-Runs as a program in the environment of `requirements-examples.txt`, and prints JSON: `health FILE` for the objects on its standard input, or
-`faults SCHEMAS FILE...`. The Lua has no more of the standard library than Argo CD gives it. Flux's order and its rule on
-`observedGeneration` are those of fluxcd/pkg, runtime/cel/status_evaluator.go.
+Runs as a program in the environment of `requirements-examples.txt`, and prints JSON: `health PROGRAM FILE` for the objects on its
+standard input, or `faults SCHEMAS FILE...`. The Lua has no more of the standard library than Argo CD gives it. Flux's order, and its rule
+on `observedGeneration`, are those of runtime/cel/status_evaluator.go in fluxcd/pkg.
 """
 
 import json

@@ -43,7 +43,9 @@ class Style(unittest.TestCase):
         program = pythonenv.ensure(settings.load(REPOSITORY), pythonenv.EXAMPLES) / "shellcheck"
         scripts = sorted(str(file) for file in (REPOSITORY / "examples").rglob("*.sh"))
         self.assertIn(str(AWS / "up.sh"), scripts)
-        done = subprocess.run([str(program), "--severity=warning", *scripts], capture_output=True, text=True, timeout=60, check=False)
+        done = subprocess.run(
+            [str(program), "--severity=warning", *scripts], capture_output=True, text=True, timeout=60, check=False
+        )
         self.assertEqual(done.stdout + done.stderr, "")
 
 

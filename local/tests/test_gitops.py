@@ -65,6 +65,7 @@ def unread(found: dict[str, Any]) -> dict[str, Any]:
 
 LIVE = condition("Finished", "False", "Preparing")
 ENDED = condition("Finished", "True", "Finished")
+FAILED = condition("Finished", "True", "AgentCrashed")
 READY = condition("Ready", "True", "Ready")
 # What is seen, what Argo CD shows of it, and what Flux does.
 STATES = {
