@@ -92,7 +92,7 @@ pub struct JobView {
     /// When the Job controller began with it; a resume begins anew. None while it is suspended.
     pub started: Option<Timestamp>,
     /// None while its Pods may run.
-    pub suspension: Option<Suspension>,
+    pub suspension: Option<Box<Suspension>>,
     pub end: Option<JobEnd>,
     pub deleting: bool,
     /// The words of its last FailedCreate event, while it has no Pod.

@@ -20,12 +20,14 @@ pub fn view(job: &Job, pod: Option<&Pod>) -> JobView {
 }
 
 /// The label counts for a Job that the host's own webhook has given its queue, too.
-fn suspension(job: &Job) -> Option<Suspension> {
+fn suspension(job: &Job) -> Option<Box<Suspension>> {
     let is_done = |c: &&JobCondition| &*c.type_ == "Suspended" && &*c.status == "True";
     let done = job.status.conditions.iter().find(is_done);
-    job.spec.suspend.then(|| Suspension {
-        since: done.and_then(|c| c.last_transition_time.as_ref()).map(|time| time.0),
-        queue: job.metadata.labels.queue.as_deref().map(SharedText::from),
+    job.spec.suspend.then(|| {
+        Box::new(Suspension {
+            since: done.and_then(|c| c.last_transition_time.as_ref()).map(|time| time.0),
+            queue: job.metadata.labels.queue.as_deref().map(SharedText::from),
+        })
     })
 }
 
@@ -101,10 +103,10 @@ mod tests {
         assert_eq!(suspension(&job(false, json!({}))), None);
         let since = Some("2026-01-01T00:00:09Z".parse().unwrap());
         let expected = |queue: Option<&str>| {
-            Some(Suspension {
+            Some(Box::new(Suspension {
                 since,
                 queue: queue.map(Into::into),
-            })
+            }))
         };
         assert_eq!(suspension(&job(true, json!({}))), expected(None));
         let labels = json!({"kueue.x-k8s.io/queue-name": "gpus"});

@@ -321,13 +321,13 @@ impl<'a> PlanBuilder<'a> {
     }
 
     pub(super) fn condition(&mut self, type_: &str, truth: Truth, reason: impl Into<ReasonName>, message: &str) {
-        self.condition_at(self.time(), type_, truth, reason, message);
+        self.condition_at(&self.time(), type_, truth, reason, message);
     }
 
     /// Sets a condition that is what it is since this time.
     pub(super) fn condition_at(
         &mut self,
-        since: Time,
+        since: &Time,
         type_: &str,
         truth: Truth,
         reason: impl Into<ReasonName>,
@@ -341,7 +341,7 @@ impl<'a> PlanBuilder<'a> {
             reason,
             message,
             generation,
-            &since,
+            since,
         );
     }
 

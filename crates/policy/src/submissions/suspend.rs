@@ -27,7 +27,7 @@ pub(super) fn holds(draft: &mut PlanBuilder<'_>, job: &JobView) -> bool {
     if draft.is_running() {
         // What passes from here on is no time of the run.
         let since = suspension.since.map_or(draft.now(), |since| since.min(draft.now()));
-        draft.condition_at(Time(since), conditions::RUNNING, Truth::False, Reason::Suspended, "");
+        draft.condition_at(&Time(since), conditions::RUNNING, Truth::False, Reason::Suspended, "");
     } else if is_new(draft, job) {
         run::update_evalai(draft);
         return true;

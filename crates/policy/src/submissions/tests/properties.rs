@@ -339,9 +339,11 @@ fn set_job(world: &mut World, case: JobCase) {
             uid: "job-uid".into(),
             created: Some(at(0)),
             started: (!suspended).then(|| at(5)),
-            suspension: suspended.then(|| Suspension {
-                since: Some(at(20)),
-                queue: refused.then(|| "gpus".into()),
+            suspension: suspended.then(|| {
+                Box::new(Suspension {
+                    since: Some(at(20)),
+                    queue: refused.then(|| "gpus".into()),
+                })
             }),
             end,
             deleting,

@@ -12,11 +12,11 @@ use leaderboard_api::conditions::{RUNNING, STALLED};
 /// How long a run may take.
 const LIMIT: i64 = 3600;
 
-fn suspended(since: i64, queue: Option<&str>) -> Option<Suspension> {
-    Some(Suspension {
+fn suspended(since: i64, queue: Option<&str>) -> Option<Box<Suspension>> {
+    Some(Box::new(Suspension {
         since: Some(at(since)),
         queue: queue.map(Into::into),
-    })
+    }))
 }
 
 /// A run that may take `LIMIT` seconds and is retried after no failure. The Job is suspended at second 90, and the Pod is ending.
