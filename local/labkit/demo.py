@@ -274,7 +274,7 @@ def show(kube: Kube, found: Findings) -> None:
     print(table.rstrip())
     heading("Timeline (UTC, to the second where Kubernetes keeps seconds)")
     print("\n".join(demo_check.timeline(found.submission)))
-    heading(f"S3: {found.submission['status'].get('results', '')}")
+    heading(f"S3: {found.submission['status']['resultsURL']}")
     for key, size in sorted(found.objects.items()):
         print(f"{size:>9}  {key}")
     heading(f"DynamoDB: table {LEADERBOARD}")

@@ -4,10 +4,13 @@ import copy
 import json
 import tempfile
 import unittest
+from contextlib import redirect_stdout
+from io import StringIO
 from pathlib import Path
+from types import SimpleNamespace
 from typing import Any
 
-from labkit import demo_check, evalai_server, follow, pki
+from labkit import demo, demo_check, evalai_server, follow, pki
 from labkit.demo_check import Findings
 
 LOCAL = Path(__file__).resolve().parent.parent
@@ -36,6 +39,7 @@ def good() -> Findings:
             },
             "status": {
                 "state": "Finished",
+                "resultsURL": "s3://leaderboard-20/1",
                 "score": {"text": "69.41"},
                 "progress": {"done": 20, "total": 20, "text": "20/20"},
                 "conditions": conditions,
@@ -51,6 +55,15 @@ def good() -> Findings:
         evalai={"status": "finished"},
         entries=[{"submission": 1, "result": copy.deepcopy(metrics)}],
     )
+
+
+class Shown(unittest.TestCase):
+    def test_each_place_has_a_heading_that_names_it(self) -> None:
+        shown = StringIO()
+        with redirect_stdout(shown):
+            demo.show(SimpleNamespace(run=lambda *_: "the table of kubectl"), good())
+        headings = [line for line in shown.getvalue().splitlines() if line.startswith("--- ")]
+        self.assertEqual(headings[2:], ["--- S3: s3://leaderboard-20/1", "--- DynamoDB: table leaderboard-20", "--- EvalAI"])
 
 
 class Comparison(unittest.TestCase):
