@@ -135,7 +135,7 @@ impl Observed {
                 moments.reasons.insert(name.clone(), (reason.clone(), now));
             }
             if is_true(&status.conditions, "Finished") {
-                if reason != "Finished" {
+                if !reason.is_empty() {
                     let why = format!("{reason}: {}", status.message.unwrap_or_default());
                     moments.failed.insert(name.clone(), why);
                 }

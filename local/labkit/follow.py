@@ -53,7 +53,8 @@ class Seen:
         end = [name for name, truth in (("EvalAI", self.published), ("DynamoDB", self.recorded)) if truth == "True"]
         stored = f"stored in S3{''.join(f', {place}' for place in end)}" if self.state == "Finished" else ""
         # While routes are driven the columns show it all.
-        note = stored or ("" if self.reason in ("Running", "Resumed") else self.message or self.reason)
+        is_driven = self.state in ("Running", "Resumed") and not self.reason
+        note = stored or ("" if is_driven else self.message or self.reason)
         return f"{self.state or 'New':<10}{self.progress:<7}{self.score:<9}{note}".rstrip()
 
 

@@ -73,7 +73,7 @@ pub(super) fn running(name: &str, team: &str, attempt: i64, hours: i64, workers:
         .collect();
     let started = hours * HOUR;
     let status = json!({
-        "attempt": attempt, "reason": "Running", "track": "sensors", "jobName": format!("{name}-{attempt}"),
+        "attempt": attempt, "track": "sensors", "jobName": format!("{name}-{attempt}"),
         "nodeName": format!("gpu-{hours}"), "workers": all,
         "progress": {"done": done, "total": total, "unit": "routes", "text": format!("{done}/{total}")},
         "score": {"name": "Driving score", "value": "41.20", "final": false, "text": format!("~4{hours}.20")},
@@ -103,7 +103,7 @@ fn worker(id: i32, done: i32, crashes: i32) -> Value {
 pub(super) fn finished(name: &str, team: &str, score: &str, minutes: i64, hours: i64) -> Arc<Submission> {
     let end = minutes * MINUTE;
     let status = json!({
-        "attempt": 1, "reason": "Finished", "track": "sensors",
+        "attempt": 1, "track": "sensors",
         "progress": {"done": 80, "total": 80, "unit": "routes", "text": "80/80"},
         "score": {"name": "Driving score", "value": score, "final": true, "text": score},
         "metrics": [{"name": "Route completion", "value": "88.10"}, {"name": "Infraction penalty", "value": "0.72"}],

@@ -104,8 +104,8 @@ fn standing(submission: &Submission) -> [&'static str; 3] {
     let state = status.map_or(State::Pending, SubmissionStatus::state_of_conditions);
     let failure = status.and_then(|status| status.failure.as_ref());
     let class = failure.filter(|_| state == State::Failed).map(|failure| failure.class);
-    let reason = status.and_then(|status| status.reason.as_ref());
-    let reason = reason.map_or("None", ReasonName::label);
+    let reason = status.and_then(SubmissionStatus::present_reason);
+    let reason = reason.as_ref().map_or("None", ReasonName::label);
     [state.as_str(), reason, class.map_or("", FailureClass::as_str)]
 }
 

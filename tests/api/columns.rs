@@ -22,8 +22,8 @@ pub fn full_status() -> Value {
         "retry": 1,
         "recreated": 1,
         "nextRetryTime": time,
-        "reason": "Resumed",
-        "message": "The second attempt runs.",
+        "reason": "Replacing",
+        "message": "The second attempt gets another Job.",
         "team": {"id": "7", "name": "Team Seven", "displayName": "Team Seven"},
         "blockedSince": {"reason": "Unschedulable", "time": time},
         "track": "sensors",
@@ -124,17 +124,17 @@ async fn submissions_fill_their_columns() {
     assert_eq!(
         table(&client, Kind::Submission, &namespace, false).await,
         "\
-NAME            TEAM         TRACK     STATE     REASON    PROGRESS   SCORE    QUEUE            AGE
-new             <none>       <none>    <none>    <none>    <none>     <none>   <none>           <age>
-submission-42   Team Seven   sensors   Running   Resumed   12/20      ~41.20   1st, 20-40 min   <age>
+NAME            TEAM         TRACK     STATE     REASON      PROGRESS   SCORE    QUEUE            AGE
+new             <none>       <none>    <none>    <none>      <none>     <none>   <none>           <age>
+submission-42   Team Seven   sensors   Running   Replacing   12/20      ~41.20   1st, 20-40 min   <age>
 "
     );
     assert_eq!(
         table(&client, Kind::Submission, &namespace, true).await,
         "\
-NAME            TEAM         TRACK     STATE     REASON    PROGRESS   SCORE    QUEUE            AGE     LEADERBOARD   ATTEMPT   FAILURE          PUBLISHED   DURATION   NODE     RESULTS
-new             <none>       <none>    <none>    <none>    <none>     <none>   <none>           <age>   local         <none>    <none>           <none>      <none>     <none>   <none>
-submission-42   Team Seven   sensors   Running   Resumed   12/20      ~41.20   1st, 20-40 min   <age>   local         2         Infrastructure   Published   1h25m      node-1   s3://results/a/42
+NAME            TEAM         TRACK     STATE     REASON      PROGRESS   SCORE    QUEUE            AGE     LEADERBOARD   ATTEMPT   FAILURE          PUBLISHED   DURATION   NODE     RESULTS
+new             <none>       <none>    <none>    <none>      <none>     <none>   <none>           <age>   local         <none>    <none>           <none>      <none>     <none>   <none>
+submission-42   Team Seven   sensors   Running   Replacing   12/20      ~41.20   1st, 20-40 min   <age>   local         2         Infrastructure   Published   1h25m      node-1   s3://results/a/42
 "
     );
 }

@@ -50,7 +50,7 @@ const AIMS: &[Aim] = &[
         "latency",
         "operator writes a lifecycle",
         "",
-        AtMost(5.0),
+        AtMost(6.0),
     ),
     Aim(
         "operator CPU a submission, intake",

@@ -42,7 +42,12 @@ impl SubmissionStatus {
         self.attempt.is_some_and(|present| attempt > present) && self.state_of_conditions() != State::Finished
     }
 
-    /// Why the submission is in its state.
+    /// True for a reason that says no more than the state. The status then has none.
+    pub fn repeats(&self, reason: &ReasonName) -> bool {
+        self.state_of_conditions().as_str() == reason.as_str()
+    }
+
+    /// Why the submission is in its state: the reason of the status, or the state itself where it is a reason of the table.
     pub fn present_reason(&self) -> Option<ReasonName> {
         let of_state = || Reason::of(self.known_state()?.as_str()).map(ReasonName::from);
         self.reason.clone().or_else(of_state)

@@ -84,7 +84,8 @@ pub struct SubmissionStatus {
     /// When the next Job of this attempt is made, after an infrastructure failure.
     #[serde(default, skip_serializing_if = "Option::is_none")]
     pub next_retry_time: Option<Time>,
-    /// Reason names in one word why the submission is in its state.
+    /// Reason names in one word why the submission is in its state. It is absent where it would repeat the state, as with Running or Finished;
+    /// conditions have it then, too.
     #[serde(default, skip_serializing_if = "Option::is_none")]
     pub reason: Option<ReasonName>,
     /// Reason as a sentence.

@@ -197,10 +197,7 @@ fn own_reason(submission: &Submission, status: &SubmissionStatus) -> Option<Stri
             None => format!("{reason}: {message}"),
         }),
         Some(State::Running | State::Resumed) => {
-            let is_well = status
-                .reason
-                .as_ref()
-                .is_none_or(|reason| reason.is_one_of(&[Reason::Running, Reason::Resumed]));
+            let is_well = status.reason.is_none();
             let stalled = conditions::get(&status.conditions, conditions::STALLED).filter(|c| c.is_true());
             match stalled {
                 Some(stalled) => Some(format!("{}: {}", stalled.reason, stalled.message)),

@@ -159,7 +159,7 @@ fn submissions_are_counted_by_the_reason_and_the_class_of_their_failure() {
         in_state(State::Failed, Some("AgentCrashed"), Some("Participant")),
         in_state(State::Failed, Some("AgentCrashed"), Some("Infrastructure")),
         // What failed once is no failure of the attempt that runs now.
-        in_state(State::Running, Some("Running"), Some("Infrastructure")),
+        in_state(State::Running, None, Some("Infrastructure")),
         in_state(State::Cancelled, Some("of a version to come"), None),
     ];
     let expected = [

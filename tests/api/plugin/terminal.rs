@@ -209,7 +209,7 @@ pub fn waiting() -> Value {
 
 pub fn running() -> Value {
     json!({
-        "state": "Running", "attempt": 1, "reason": "Running", "message": "12/20 routes done.", "track": "sensors",
+        "state": "Running", "attempt": 1, "message": "12/20 routes done.", "track": "sensors",
         "jobName": "a-1", "times": {"started": TIME},
         "conditions": [condition("Finished", "False", "Preparing"), condition("Running", "True", "Running")],
     })

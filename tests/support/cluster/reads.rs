@@ -2,20 +2,17 @@
 
 use k8s_openapi::api::core::v1::{ContainerStatus, Pod};
 use kube::{Resource, ResourceExt};
-use leaderboard_api::{Reason, ReasonName, State, Submission, conditions};
+use leaderboard_api::{Reason, State, Submission, SubmissionStatus, conditions};
 
 /// The STATE column.
 pub fn state(submission: &Submission) -> Option<State> {
     submission.status.as_ref().and_then(|status| status.state)
 }
 
-/// The REASON column.
-pub fn reason(submission: &Submission) -> &str {
-    submission
-        .status
-        .as_ref()
-        .and_then(|status| status.reason.as_ref())
-        .map_or("", ReasonName::as_str)
+/// Why it is in its state.
+pub fn reason(submission: &Submission) -> String {
+    let present = submission.status.as_ref().and_then(SubmissionStatus::present_reason);
+    present.map(|reason| reason.to_string()).unwrap_or_default()
 }
 
 /// Its driving score.

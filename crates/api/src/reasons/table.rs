@@ -290,6 +290,9 @@ reasons! {
             "Nothing.";
     }
     Event {
+        Started,
+            "The agents run: the first of a Job's Pod has started. Each Job of a submission has one such event.",
+            "Nothing.";
         JobRecreated,
             "Somebody deleted the Job; the operator creates it again, at most three times between two retries.",
             "Find out who deletes Jobs.";

@@ -88,7 +88,7 @@ fn waiting() -> Value {
 /// Two agents run.
 fn running() -> Value {
     json!({
-        "state": "Running", "attempt": 1, "reason": "Running", "message": "12/20 routes done.", "track": "sensors",
+        "state": "Running", "attempt": 1, "message": "12/20 routes done.", "track": "sensors",
         "progress": {"done": 12, "total": 20, "unit": "routes", "text": "12/20"}, "score": {"name": "Driving score", "value": "41.20", "final": false, "text": "~41.20"}, "jobName": "submission-42-1",
         "nodeName": "gpu-3", "resultsURL": "s3://results/v2/42", "times": {"started": "2026-11-01T11:00:00Z"},
         "conditions": [condition("Finished", "False", "Preparing", ""), condition("Running", "True", "Running", ""),
@@ -133,7 +133,7 @@ fn node_lost() -> Value {
 /// All is done.
 fn finished() -> Value {
     json!({
-        "state": "Finished", "attempt": 1, "reason": "Finished", "track": "sensors", "score": {"name": "Driving score", "value": "43.13", "final": true, "text": "43.13"},
+        "state": "Finished", "attempt": 1, "track": "sensors", "score": {"name": "Driving score", "value": "43.13", "final": true, "text": "43.13"},
         "message": "20 of 20 routes, Driving score 43.13.", "progress": {"done": 20, "total": 20, "unit": "routes", "text": "20/20"},
         "resultsURL": "s3://results/v2/42", "times": {"finished": "2026-11-01T11:57:00Z"},
         "conditions": [
@@ -147,7 +147,7 @@ fn finished() -> Value {
 fn cancelled() -> Value {
     let message = "The submission was cancelled; completed routes are kept.";
     json!({
-        "state": "Cancelled", "attempt": 1, "reason": "Cancelled", "message": message,
+        "state": "Cancelled", "attempt": 1, "message": message,
         "resultsURL": "s3://results/v2/42", "times": {"finished": "2026-11-01T11:57:00Z"},
         "conditions": [condition("Finished", "True", "Cancelled", message), condition("Published", "True", "Published", "")],
     })

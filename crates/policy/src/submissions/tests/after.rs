@@ -22,11 +22,14 @@ fn failed() -> World {
     world
 }
 
+const PUBLISHED_AS: &str = "EvalAI has the result: 4 of 4 routes, Driving score 43.13.";
+
 #[test]
 fn evalai_first_then_the_table_then_rest() {
-    for (mut world, state, update) in [
-        (finished(), Finished, EvalaiUpdate::Finished),
-        (failed(), Failed, EvalaiUpdate::Failed),
+    // A failure has had its event at once.
+    for (mut world, state, update, told) in [
+        (finished(), Finished, EvalaiUpdate::Finished, vec![Reason::Published.into()]),
+        (failed(), Failed, EvalaiUpdate::Failed, Vec::new()),
     ] {
         let mut plan = world.pass();
         plan.actions.retain(|a| !matches!(a, Action::KeepLog { .. }));
@@ -41,7 +44,8 @@ fn evalai_first_then_the_table_then_rest() {
         let plan = world.pass();
         assert_eq!(condition(&plan, PUBLISHED).0, "True");
         assert_eq!(condition(&plan, RECORDED).0, "True");
-        assert!(plan.events.is_empty(), "the status shows it");
+        assert_eq!(events(&plan), told);
+        assert!(plan.events.iter().all(|event| event.message == PUBLISHED_AS));
         assert_eq!(
             (plan.actions.as_slice(), plan.requeue),
             ([Action::Forget].as_slice(), None)
@@ -396,13 +400,13 @@ fn a_row_that_has_gone_to_another_team_is_shown_with_its_end() {
     let mut same = world.clone();
     same.published();
     same.recorded();
-    assert!(same.pass().events.is_empty());
+    assert_eq!(events(&same.pass()), [Reason::Published]);
 
     world.in_evalai().team_id = Some("43".into());
     world.published();
     world.recorded();
     let plan = world.pass();
-    assert_eq!(events(&plan), [Reason::TeamDiffers]);
+    assert_eq!(events(&plan), [Reason::TeamDiffers, Reason::Published]);
     let shown = conditions::get(&plan.status.conditions, PUBLISHED).unwrap();
     assert!(
         shown.message.contains("team 43") && shown.message.contains("team 42"),

@@ -307,7 +307,7 @@ impl World {
     #[track_caller]
     pub fn pass_to(&mut self, state: State, reason: Reason) -> Plan {
         let plan = self.pass();
-        let shown = (plan.status.state, plan.status.reason.clone());
+        let shown = (plan.status.state, plan.status.present_reason());
         assert_eq!(shown, (Some(state), Some(reason.into())), "{:?}", plan.status.message);
         plan
     }

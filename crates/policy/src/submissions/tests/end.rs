@@ -33,6 +33,8 @@ fn complete_results_that_count_finish() {
         at(500),
         "the Job's time, not ours"
     );
+    assert_eq!(events(&plan), [Reason::Finished]);
+    assert_eq!(plan.status.reason, None, "the state says it");
     assert_eq!(condition(&plan, FINISHED), ("True".into(), Reason::Finished.into()));
     assert_eq!(condition(&plan, SUCCEEDED), ("True".into(), Reason::Finished.into()));
     assert_eq!(condition(&plan, ARCHIVED), ("True".into(), Reason::Stored.into()));

@@ -13,7 +13,8 @@ pub(super) fn finished() -> World {
     let mut world = World::evalai().running();
     world.complete();
     world.report(final_report());
-    world.pass_to(Finished, Reason::Finished);
+    let plan = world.pass_to(Finished, Reason::Finished);
+    assert!(plan.events.is_empty(), "the event is that of its publication");
     world
 }
 

@@ -7,7 +7,7 @@ use crate::view::{ObservedJob, ObservedNode, Standing, View};
 use leaderboard_api::Reason;
 use leaderboard_api::conditions::{self, FINISHED, PUBLISHED, RECORDED};
 use leaderboard_api::reasons::Class;
-use leaderboard_api::{FailureClass, PolicySource, State, SubmissionStatus};
+use leaderboard_api::{FailureClass, PolicySource, ReasonName, State, SubmissionStatus};
 
 /// Reconciles after which nothing may change any more in a world that stands still.
 const SETTLED_AFTER: usize = 5;
@@ -206,6 +206,7 @@ fn status_is_whole(plan: &Plan) {
         "the state is computed from the conditions"
     );
     assert!(status.present_reason().is_some());
+    assert_ne!(status.reason.as_ref().map(ReasonName::as_str), Some(state.as_str()));
     assert!(status.waiting.is_none() || state == State::Pending);
     let failure = status.failure.as_ref();
     let succeeded = status.condition(conditions::SUCCEEDED).map(|c| c.status.as_str());

@@ -22,7 +22,7 @@ fn back_off() -> String {
 }
 
 #[test]
-fn a_healthy_start_costs_one_write_and_no_event_until_its_agents_run() {
+fn a_healthy_start_costs_one_write_and_one_event_when_its_agents_run() {
     let mut world = World::evalai().with_pod();
     let plan = world.pass_to(Pending, Reason::Preparing);
     assert!(plan.events.is_empty());
@@ -37,9 +37,12 @@ fn a_healthy_start_costs_one_write_and_no_event_until_its_agents_run() {
     world.go_to(50);
     world.see_agents();
     let plan = world.pass_to(Running, Reason::Running);
-    assert!(events(&plan).is_empty(), "the status shows it");
-    assert_eq!(condition(&plan, RUNNING).0, "True");
+    assert_eq!(plan.status.reason, None, "the state says it");
+    assert_eq!(events(&plan), [Reason::Started]);
+    assert_eq!(plan.events[0].message, "The agents of attempt 1 run on node node-a.");
+    assert_eq!(condition(&plan, RUNNING), ("True".into(), Reason::Running.into()));
     assert_eq!(evalai_updates(&plan), [EvalaiUpdate::Running]);
+    assert!(events(&world.pass()).is_empty(), "once");
 }
 
 #[test]
