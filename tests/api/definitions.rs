@@ -90,7 +90,7 @@ async fn a_minimal_leaderboard_reads_back_whole() {
         "paused": false,
         "syncPeriodSeconds": 10,
         "ttlSecondsAfterFinished": 604_800,
-        "retention": {"finishedSeconds": 0},
+        "retention": {},
                 })
     );
 }
@@ -367,11 +367,16 @@ async fn a_null_does_not_get_around_a_rule() {
 }
 
 #[tokio::test]
-async fn no_limit_is_written_as_zero() {
+async fn nothing_is_switched_off_by_a_zero() {
     let server = server().await;
     let api = Kind::Leaderboard.api(&server.client(), &server.namespace("zero").await);
-    for field in ["runSeconds", "scheduleSeconds"] {
-        let zero = json!({"spec": {"deadlines": {field: 0}}});
+    for (part, field) in [
+        ("deadlines", "runSeconds"),
+        ("deadlines", "scheduleSeconds"),
+        ("deadlines", "finalizeSeconds"),
+        ("retention", "finishedSeconds"),
+    ] {
+        let zero = json!({"spec": {part: {field: 0}}});
         let refused = create(&api, Kind::Leaderboard.object("a", &[&zero]), true)
             .await
             .unwrap_err();

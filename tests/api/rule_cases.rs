@@ -254,7 +254,7 @@ fn times() -> Vec<Case> {
         ),
         create(
             Leaderboard,
-            "retention.finishedSeconds must be 0 or at least",
+            "retention.finishedSeconds must be at least",
             &json!({"ttlSecondsAfterFinished": 3600, "retention": {"finishedSeconds": 3600}}),
             &json!({"retention": {"finishedSeconds": 3599}}),
         ),

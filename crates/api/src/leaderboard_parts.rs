@@ -200,7 +200,7 @@ pub struct Deadlines {
     pub flush_seconds: i64,
     /// Seconds that a deleted Submission waits for its results to be published.
     #[serde(default = "defaults::finalize_seconds")]
-    #[schemars(range(min = 0, max = 604_800))]
+    #[schemars(range(min = 1, max = 604_800))]
     pub finalize_seconds: i64,
 }
 

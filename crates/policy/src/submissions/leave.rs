@@ -146,11 +146,11 @@ pub(super) fn delete_in_time(draft: &mut PlanBuilder<'_>) {
 
 /// When it is to be deleted. None: not at all, or not as it stands.
 fn deleted_at(draft: &PlanBuilder<'_>) -> Option<Timestamp> {
-    let kept = draft.leaderboard()?.retention.finished_seconds;
+    let kept = draft.leaderboard()?.retention.finished_seconds?;
     let status = &draft.status;
     let end = status.end()?;
     let has_all = status.is_delivered(conditions::PUBLISHED) && status.is_delivered(conditions::RECORDED);
-    let may_go = kept > 0 && !draft.is_deleting() && has_all && !has_job(draft);
+    let may_go = !draft.is_deleting() && has_all && !has_job(draft);
     may_go.then(|| after(end.last_transition_time.0, kept))
 }
 

@@ -18,7 +18,7 @@ const KEPT: i64 = 3600;
 /// A run that has just ended well, kept for [`KEPT`].
 fn ended_well() -> World {
     let mut world = World::evalai().running();
-    world.leaderboard().retention.finished_seconds = KEPT;
+    world.leaderboard().retention.finished_seconds = Some(KEPT);
     world.submission().metadata.resource_version = Some("7".into());
     world.complete();
     world.report(final_report());
@@ -108,7 +108,7 @@ fn it_is_deleted_when_its_time_is_over_and_not_before() {
 #[test]
 fn what_is_far_from_its_end_is_decided_on_again_within_the_hour() {
     let mut world = ended_well();
-    world.leaderboard().retention.finished_seconds = 30 * 86_400;
+    world.leaderboard().retention.finished_seconds = Some(30 * 86_400);
     world.published();
     world.pass();
     world.recorded();
@@ -121,7 +121,7 @@ type Keeps = (&'static str, fn(&mut World));
 #[test]
 fn nothing_else_is_ever_deleted() {
     let cases: [Keeps; 7] = [
-        ("retention is off", |w| w.leaderboard().retention.finished_seconds = 0),
+        ("retention is off", |w| w.leaderboard().retention.finished_seconds = None),
         ("its Leaderboard is gone", |w| w.view.leaderboard = None),
         ("a person deletes it", World::delete),
         ("its Job has not ended", |w| w.job().end = None),
@@ -167,7 +167,7 @@ fn an_end_that_evalai_refuses_is_kept() {
 #[test]
 fn a_running_one_is_never_deleted() {
     let mut world = World::local().running();
-    world.leaderboard().retention.finished_seconds = 1;
+    world.leaderboard().retention.finished_seconds = Some(1);
     world.wait(KEPT);
     assert!(!deletes(&world.pass()));
 }
@@ -175,7 +175,7 @@ fn a_running_one_is_never_deleted() {
 #[test]
 fn a_failed_one_goes_with_its_end_published_and_its_log_kept() {
     let mut world = World::evalai().running();
-    world.leaderboard().retention.finished_seconds = KEPT;
+    world.leaderboard().retention.finished_seconds = Some(KEPT);
     world.submission().metadata.resource_version = Some("7".into());
     world.see(ended("agent-1", 3, "exited", 1, 100));
     world.pass();
