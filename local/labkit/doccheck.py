@@ -34,6 +34,12 @@ PLACE = re.compile(
 NAME_IN_PLACE = re.compile(r"`([\w:]+)` in\s+`((?:[\w.-]+/)*[\w.-]+\.(?:rs|py))`")
 # A row of docs/reference/attacks.md.
 SHOWN = re.compile(r"^\| (\d+) \| `([\w./-]+\.(?:rs|py))::(\w+)` \|$", re.MULTILINE)
+REASONS = "crates/api/src/reasons/table.rs"
+MESSAGES = re.compile(r"(?:crates/[\w-]+/)?src/(?!.*tests?\b)[\w/-]*\.rs$")
+TESTS_OF_MODULE = re.compile(r"^#\[cfg\(test\)\]$", re.MULTILINE)
+PAGE_OF_MESSAGE = re.compile(r"(?:\{DOCUMENTS\}|docs/)([\w/-]+\.md)(?:#([\w-]+))?")
+# A comment may name a page by its path, and so does what includes its text.
+BARE_PAGE = re.compile(r"^(?!\s*//)(?!.*include_str!).*\b(docs/[\w/-]+\.md)", re.MULTILINE)
 KINDS = ("held", "by policy", "inherent", "open", "struck")
 # How the sums are written in the text, so that it cannot contradict its table.
 SUMS = re.compile(
@@ -126,6 +132,22 @@ def link_faults(page: Path) -> Iterator[str]:
             yield f"{page.name}: {link} leads nowhere"
         elif place and file.suffix == ".md" and place not in anchors(file.read_text()):
             yield f"{page.name}: {link}: there is no heading {place}"
+
+
+def message_faults(repository: Path, files: Sequence[str]) -> Iterator[str]:
+    """Pages of messages that do not exist, and messages that name a page without its address."""
+    for file in files:
+        if not MESSAGES.match(file):
+            continue
+        text = TESTS_OF_MODULE.split((repository / file).read_text())[0]
+        for page, place in PAGE_OF_MESSAGE.findall(text):
+            target = repository / "docs" / page
+            if not target.exists():
+                yield f"{file}: there is no docs/{page}"
+            elif place and place not in anchors(target.read_text()):
+                yield f"{file}: docs/{page} has no heading {place}"
+        if file != REASONS:
+            yield from (f"{file}: name {page} by DOCUMENTS" for page in BARE_PAGE.findall(text))
 
 
 def attacks(text: str, tests: str) -> list[Attack]:

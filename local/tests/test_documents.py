@@ -56,6 +56,30 @@ class Links(unittest.TestCase):
         self.assertEqual(lost, [])
 
 
+class Messages(unittest.TestCase):
+    def test_every_page_that_a_message_names_exists_and_has_its_address(self) -> None:
+        files = doccheck.tracked(REPOSITORY)
+        self.assertGreater(sum(bool(doccheck.MESSAGES.match(file)) for file in files), 200)
+        self.assertEqual(list(doccheck.message_faults(REPOSITORY, files)), [])
+
+    def test_a_wrong_page_of_a_message_is_named(self) -> None:
+        with tempfile.TemporaryDirectory() as folder:
+            repository = Path(folder)
+            (repository / "docs").mkdir()
+            (repository / "docs" / "a.md").write_text("# A\n## Rights\n")
+            (repository / "src").mkdir()
+            for text, faults in (
+                ('"{DOCUMENTS}a.md#rights"', []),
+                ('// docs/a.md has it.\n"{DOCUMENTS}b.md"', ["src/x.rs: there is no docs/b.md"]),
+                ('"{DOCUMENTS}a.md#wrongs"', ["src/x.rs: docs/a.md has no heading wrongs"]),
+                ('"see docs/a.md"', ["src/x.rs: name docs/a.md by DOCUMENTS"]),
+                ('"{DOCUMENTS}a.md"\n#[cfg(test)]\n"see docs/a.md"', []),
+            ):
+                with self.subTest(text):
+                    (repository / "src" / "x.rs").write_text(text)
+                    self.assertEqual(list(doccheck.message_faults(repository, ["src/x.rs"])), faults)
+
+
 class Places(unittest.TestCase):
     """Pages that lead a contributor to a file: those of hosts name the objects of a cluster and the keys of a bucket as well."""
 

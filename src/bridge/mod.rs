@@ -18,7 +18,7 @@ use kube::runtime::watcher::Config;
 use crate::intake::pollers::{Problems, Shared, follow};
 use crate::kubernetes::{Clients, Namespaces, Shape, spawn_watch};
 use crate::observability::Observability;
-use leaderboard_api::Leaderboard;
+use leaderboard_api::{GROUP, Leaderboard};
 use leaderboard_aws::clients::Aws;
 use leaderboard_base::tasks::TaskFailed;
 use leaderboard_policy::allowed::Allowed;
@@ -35,7 +35,7 @@ pub struct Scope {
 /// Writes events for a program.
 pub fn events(client: &Client, program: &str) -> Recorder {
     let reporter = Reporter {
-        controller: format!("leaderboard.carla.org/{program}"),
+        controller: format!("{GROUP}/{program}"),
         instance: std::env::var("POD_NAME").ok(),
     };
     Recorder::new(client.clone(), reporter)

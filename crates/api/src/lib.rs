@@ -62,6 +62,7 @@ pub use leaderboard::{
     EvalaiBacklog, EvalaiUse, JOB_SECONDS, Leaderboard, LeaderboardSpec, LeaderboardStatus, TableUse, TrackStatus,
 };
 pub use leaderboard_parts::*;
+pub use names::{DOCUMENTS, GROUP, VERSION};
 pub use progress::{MAX_METRICS, MAX_NAME, Metric, Progress, Score};
 pub use reasons::{Reason, ReasonName};
 pub use retention::Retention;
@@ -76,8 +77,3 @@ pub use submission_use::{Interruptions, MAX_INTERRUPTED_NODES, MAX_USING_TEAMS, 
 pub use team::{Team, TeamStatus};
 pub use waiting::{Eta, Waiting};
 pub use worker_status::{EndReason, LastEnd, WorkerState, WorkerStatus};
-
-/// API group of both kinds.
-pub const GROUP: &str = "leaderboard.carla.org";
-/// The served and stored version.
-pub const VERSION: &str = "v1alpha1";

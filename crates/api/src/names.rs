@@ -4,37 +4,57 @@
 
 use crate::JobNumber;
 
+/// The group once, for names that begin with it. The derives of both kinds, which take a literal, repeat it, and a test compares.
+macro_rules! group {
+    () => {
+        "leaderboard.carla.org"
+    };
+}
+
+/// API group of both kinds, and prefix of labels, annotations and finalizers.
+pub const GROUP: &str = group!();
+/// API version that is served and stored.
+pub const VERSION: &str = "v1alpha1";
+
+/// Address of the documents of this version, with its last slash: messages name a page by it.
+pub const DOCUMENTS: &str = concat!(
+    env!("CARGO_PKG_REPOSITORY"),
+    "/blob/v",
+    env!("CARGO_PKG_VERSION"),
+    "/docs/"
+);
+
 /// Label: name of the Submission, on Jobs and Pods.
-pub const LABEL_SUBMISSION: &str = "leaderboard.carla.org/submission";
+pub const LABEL_SUBMISSION: &str = concat!(group!(), "/submission");
 /// Label: attempt, on Jobs and Pods.
-pub const LABEL_ATTEMPT: &str = "leaderboard.carla.org/attempt";
+pub const LABEL_ATTEMPT: &str = concat!(group!(), "/attempt");
 /// Label: name of the Leaderboard, on Submissions made by the bridge, Jobs, Pods and policies.
-pub const LABEL_LEADERBOARD: &str = "leaderboard.carla.org/leaderboard";
+pub const LABEL_LEADERBOARD: &str = concat!(group!(), "/leaderboard");
 /// Label: run id, on Jobs and Pods.
-pub const LABEL_RUN: &str = "leaderboard.carla.org/run";
+pub const LABEL_RUN: &str = concat!(group!(), "/run");
 /// Label: EvalAI phase, on Submissions made by the bridge.
-pub const LABEL_PHASE: &str = "leaderboard.carla.org/phase";
+pub const LABEL_PHASE: &str = concat!(group!(), "/phase");
 /// Label of everything the operator makes.
 pub const LABEL_MANAGED_BY: &str = "app.kubernetes.io/managed-by";
 /// Value of the label above.
 pub const OPERATOR: &str = "leaderboard-operator";
 
 /// Annotation on a Submission: which message made or bumped it; see [`super::Ingested`].
-pub const ANNOTATION_INGESTED: &str = "leaderboard.carla.org/ingested";
+pub const ANNOTATION_INGESTED: &str = concat!(group!(), "/ingested");
 /// Annotation on a Submission, `true`: a person hands it over that is held back for another program; it takes up what is stored.
-pub const ANNOTATION_ADOPT: &str = "leaderboard.carla.org/adopt";
+pub const ANNOTATION_ADOPT: &str = concat!(group!(), "/adopt");
 /// Annotation on a Pod: why it is to stop, `Cancel`, `Retries` or `RunDeadline`.
-pub const ANNOTATION_STOP: &str = "leaderboard.carla.org/stop";
+pub const ANNOTATION_STOP: &str = concat!(group!(), "/stop");
 /// Annotation on a Job: which infrastructure retry of the attempt it is.
-pub const ANNOTATION_RETRY: &str = "leaderboard.carla.org/retry";
+pub const ANNOTATION_RETRY: &str = concat!(group!(), "/retry");
 
 /// Annotation on a Pod: generation of the Leaderboard that its Job was made from.
-pub const ANNOTATION_GENERATION: &str = "leaderboard.carla.org/leaderboard-generation";
+pub const ANNOTATION_GENERATION: &str = concat!(group!(), "/leaderboard-generation");
 
 /// Finalizer of a Submission: held until its end is published and recorded.
-pub const FINALIZER_SUBMISSION: &str = "leaderboard.carla.org/publish";
+pub const FINALIZER_SUBMISSION: &str = concat!(group!(), "/publish");
 /// Finalizer of a Leaderboard: held while live or unpublished Submissions refer to it.
-pub const FINALIZER_LEADERBOARD: &str = "leaderboard.carla.org/in-use";
+pub const FINALIZER_LEADERBOARD: &str = concat!(group!(), "/in-use");
 
 /// Field manager of Submission status.
 pub const MANAGER_STATUS: &str = "leaderboard-operator/status";
@@ -89,4 +109,28 @@ pub fn id_of_submission(name: &str) -> Option<i64> {
 /// Name of a Job of a submission.
 pub fn job(submission: &str, number: JobNumber) -> String {
     format!("{submission}-{}", number.suffix())
+}
+
+#[cfg(test)]
+mod tests {
+    use kube::Resource;
+
+    use super::*;
+    use crate::{Leaderboard, Submission};
+
+    #[test]
+    fn both_kinds_are_of_the_group_and_the_version() {
+        for found in [
+            [Leaderboard::group(&()), Leaderboard::version(&())],
+            [Submission::group(&()), Submission::version(&())],
+        ] {
+            assert_eq!(found, [GROUP, VERSION]);
+        }
+    }
+
+    #[test]
+    fn the_documents_are_those_of_this_version() {
+        let address = DOCUMENTS.strip_prefix("https://").expect("a link");
+        assert!(address.ends_with(concat!("/blob/v", env!("CARGO_PKG_VERSION"), "/docs/")));
+    }
 }

@@ -2,11 +2,13 @@
 //!
 //! One table. `docs/states.md` is generated from it (`make docs`),
 //! `kubectl leaderboard why` prints it, and the messages of failures take their next step from it. The texts are Markdown with
-//! code spans only; [`plain`] removes them. Pure.
+//! code spans, and pages as `docs/gpu.md`; [`plain`] makes them plain. Pure.
 
 use std::fmt;
 
 use serde::{Serialize, Serializer};
+
+use crate::DOCUMENTS;
 
 /// What kind of thing a reason explains. Each class is one table of docs/states.md.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
@@ -99,9 +101,9 @@ impl Serialize for Reason {
     }
 }
 
-/// A text of the table without its code spans.
+/// A text of the table without its code spans, its pages as addresses.
 pub fn plain(text: &str) -> String {
-    text.replace('`', "")
+    text.replace('`', "").replace("docs/", DOCUMENTS)
 }
 
 /// Makes the enum and its table: a reason cannot be in one of them only.

@@ -56,9 +56,20 @@ fn rows_of(class: Class) -> String {
             .own_after_failure()
             .map(|step| format!(" Once it has failed: {step}"));
         let after = after.unwrap_or_default();
-        writeln!(table, "| `{reason}` | {meaning} | {next_step}{after} |").unwrap();
+        writeln!(table, "{}", linked(&format!("| `{reason}` | {meaning} | {next_step}{after} |"))).unwrap();
     }
     table
+}
+
+/// A row whose pages are links.
+fn linked(row: &str) -> String {
+    let mut parts = row.split("docs/");
+    let mut linked = parts.next().unwrap_or_default().to_owned();
+    for part in parts {
+        let (page, rest) = part.split_once(".md").expect("a page");
+        write!(linked, "[{page}.md]({page}.md){rest}").unwrap();
+    }
+    linked
 }
 
 /// Whose log explains which failures.

@@ -1,8 +1,11 @@
 //! What goes wrong with S3, in words for the person who runs the bucket.
 
+use std::borrow::Cow;
+
 use aws_sdk_s3::error::{ProvideErrorMetadata, SdkError};
 
 use super::parts::PartsError;
+use leaderboard_api::DOCUMENTS;
 
 type HttpResponse = aws_sdk_s3::config::http::HttpResponse;
 
@@ -62,8 +65,8 @@ impl ArchiveError {
 
 impl Cause {
     /// What to do about it, as one sentence.
-    pub fn next_step(&self) -> &'static str {
-        match self {
+    pub fn next_step(&self) -> Cow<'static, str> {
+        let step = match self {
             Self::Denied(_) => {
                 "Give the identity s3:GetObject, s3:PutObject, s3:DeleteObject, s3:AbortMultipartUpload and \
                  s3:ListBucket for the prefix."
@@ -79,13 +82,16 @@ impl Cause {
                  the controller and its Pods then send none."
             }
             Self::Refused(_) => {
-                "Check storage.s3.bucket, storage.s3.region and storage.s3.endpoint of the leaderboard; docs/results.md has the stores that refuse \
-                 checksums."
+                return Cow::Owned(format!(
+                    "Check storage.s3.bucket, storage.s3.region and storage.s3.endpoint of the leaderboard; {DOCUMENTS}results.md has the \
+                     stores that refuse checksums."
+                ));
             }
             Self::Slow => "It is tried again later.",
             Self::Local(_) => "Check the volume of the Pod.",
             Self::Parts(_) => "The file is stored whole instead.",
-        }
+        };
+        Cow::Borrowed(step)
     }
 
     /// Whether the same request may succeed later.

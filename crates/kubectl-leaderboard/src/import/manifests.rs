@@ -5,6 +5,7 @@
 use std::collections::BTreeSet;
 use std::str::FromStr;
 
+use leaderboard_api::DOCUMENTS;
 use serde_json::{Value, json};
 
 use super::entries::{Board, EVALAI, Pipeline, Track};
@@ -166,7 +167,7 @@ fn log_group(board: &Board) -> String {
     match &board.log_group {
         Some(name) => format!(
             "  # To decide: does a program on these nodes collect what containers print (FluentD, Fluent Bit, the CloudWatch agent)?\n  \
-             # Then each line is stored twice: docs/import.md, Logs twice.\n  \
+             # Then each line is stored twice: {DOCUMENTS}import.md#logs-twice\n  \
              logs:\n    cloudWatch:\n      name: {}\n      region: {}",
             quoted(name),
             quoted(&board.place.region)

@@ -14,6 +14,7 @@ use std::path::{Path, PathBuf};
 use std::process::ExitCode;
 
 use clap::Args;
+use leaderboard_api::DOCUMENTS;
 
 use self::entries::Entries;
 use self::manifests::{Options, Queue};
@@ -72,7 +73,7 @@ fn read(path: &Path) -> Result<Entries, Error> {
     })?;
     if is_open && entries.values().any(entries::Entry::has_token) {
         return Err(Error::Unfit(format!(
-            "{shown} holds EvalAI's token, and others may read it. Run `chmod 600 {shown}`, or leave the token out (docs/import.md)"
+            "{shown} holds EvalAI's token, and others may read it. Run `chmod 600 {shown}`, or leave the token out: {DOCUMENTS}import.md"
         )));
     }
     Ok(entries)

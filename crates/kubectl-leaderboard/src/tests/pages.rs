@@ -7,6 +7,7 @@ use serde_json::{Value, json};
 use super::golden::{assert_golden, assert_shown};
 use super::{crashed, leaderboard, now, ran_with, submission, waiting, with};
 use crate::board::Observed;
+use crate::error::Error;
 use crate::logs::{Whose, in_bucket};
 use crate::output::labelled;
 use crate::text::{Frame, log_line};
@@ -93,11 +94,12 @@ fn a_report_is_printed_as_its_files_show() {
     let texts = |texts: &[&str]| texts.iter().map(|text| (*text).to_owned()).collect::<Vec<_>>();
     let all = texts(&["1 Leaderboard", "12 submissions", "3 Pods", "40 events"]);
     assert_shown("report", |frame| report::lines(file, "carla", &all, &[], frame));
-    let missing = texts(&[
-        "events: missing right: events.events.k8s.io is forbidden: User \"host\" cannot list \
-                          resource \"events\" in API group \"events.k8s.io\" in the namespace \"carla\". Check namespace and context, or \
-                          ask for the right: docs/plugin.md has a Role with all that the plugin needs",
-    ]);
+    let denied = Error::Forbidden(
+        "events.events.k8s.io is forbidden: User \"host\" cannot list resource \"events\" in API group \"events.k8s.io\" in the \
+         namespace \"carla\""
+            .to_owned(),
+    );
+    let missing = texts(&[&format!("events: {denied}")]);
     assert_shown("report-incomplete", |frame| {
         report::lines(file, "carla", &all[..3], &missing, frame)
     });

@@ -342,13 +342,14 @@ fn of_participant(reason: Reason) -> String {
 }
 
 /// The host's next step after a failure of the infrastructure that no retry has ended.
-fn of_infrastructure(reason: &ReasonName) -> &'static str {
-    match reason.known() {
+fn of_infrastructure(reason: &ReasonName) -> String {
+    let step = match reason.known() {
         // The text of `workspace` has the step before this one.
         Some(Reason::NotIsolated) => "Then resume the submission.",
         Some(reason) => reason.after_failure(),
         None => "Fix this, then resume the submission.",
-    }
+    };
+    reasons::plain(step)
 }
 
 /// All that a participant reads of a failure of the infrastructure.
