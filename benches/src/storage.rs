@@ -11,7 +11,7 @@ use axum::extract::{Request, State};
 use axum::http::{Method, StatusCode, header};
 use axum::response::{IntoResponse, Response};
 use leaderboard_api::{Attempt, Metric, WorkerState};
-use leaderboard_contract::report::{REPORT_KEY, Report, ReportWorker, SCHEMA, StoredFile};
+use leaderboard_contract::report::{Outcome, REPORT_KEY, Report, ReportWorker, SCHEMA, StoredFile};
 use tokio::net::TcpListener;
 use tokio::task::JoinHandle;
 
@@ -188,9 +188,9 @@ fn report(is_final: bool) -> Report {
         ],
         is_final,
         eligible: true,
-        entry_status: if is_final { "Finished" } else { "Started" }.into(),
+        outcome: if is_final { Outcome::Finished } else { Outcome::Running },
         stopped: None,
-        why: None,
+        refused: None,
         warnings: Vec::new(),
         logs: None,
         results: RESULTS.into(),

@@ -149,7 +149,7 @@ mod tests {
     fn report(results: &str) -> ReportDigest {
         let report: leaderboard_contract::report::Report = serde_json::from_value(json!({
             "schema": 1, "submissionUid": "u", "attempt": 1, "podUid": "p", "round": 9, "done": 1, "total": 4, "unit": "routes", "workers": [],
-            "final": true, "eligible": true, "entryStatus": "Finished", "results": results,
+            "final": true, "eligible": true, "outcome": "Finished", "results": results,
         }))
         .unwrap();
         ReportDigest::of(&report, leaderboard_contract::report::ContentId::default())

@@ -4,7 +4,7 @@
 use std::time::Duration;
 
 use leaderboard_api::{State, Submission};
-use leaderboard_contract::report::{REPORT_KEY, Report};
+use leaderboard_contract::report::{Outcome, REPORT_KEY, Report};
 use serde_json::{Value, json};
 
 use super::matrix::Case;
@@ -55,7 +55,7 @@ async fn complete_files_that_were_written_once_more_without_sensors_finish_with_
         );
         let last = report(scene, "complete").await;
         assert!(
-            last.is_final && last.eligible && last.entry_status == "Finished" && last.done == 16,
+            last.is_final && last.eligible && last.outcome == Outcome::Finished && last.done == 16,
             "{last:?}"
         );
         assert_eq!(scene.cloud.text("complete", "agent/agent_results.json").await, MERGED);

@@ -247,7 +247,7 @@ impl Run<'_> {
         if !(report.is_final && report.eligible && report.done == 20 && report.total == 20) {
             return Err(format!("it is not finished: {report:?}"));
         }
-        if report.stopped.is_some() || report.why.is_some() || !report.warnings.is_empty() {
+        if report.stopped.is_some() || report.refused.is_some() || !report.warnings.is_empty() {
             return Err(format!("it has no clean end: {report:?}"));
         }
         for (pair, (begun, allowed)) in self.kubelet.begun().iter().zip(self.allowed).enumerate() {

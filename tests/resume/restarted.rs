@@ -11,7 +11,7 @@ use super::singles::{rounds_past, until_reported};
 use super::submission::{FASTER, PAIRS, ROUTES_OF_PAIR, Submission};
 use crate::ministack::server;
 use leaderboard_api::LeaderboardVersion;
-use leaderboard_contract::report::Report;
+use leaderboard_contract::report::{Outcome, Report};
 use leaderboard_evaluation::judge::Pace;
 use leaderboard_protocol::files::{Mark, Side, StatusFile};
 
@@ -62,7 +62,7 @@ async fn until_crashed_twice(kubelet: &mut Kubelet<'_>) {
 }
 
 fn assert_complete(last: &Report, kubelet: &Kubelet<'_>) {
-    let is_complete = last.is_final && last.eligible && last.done == ROUTES && last.why.is_none();
+    let is_complete = last.is_final && last.eligible && last.done == ROUTES && last.refused.is_none();
     assert!(is_complete, "{last:?}\n{}", kubelet.story());
     for begun in kubelet.begun() {
         assert_eq!(
@@ -75,16 +75,13 @@ fn assert_complete(last: &Report, kubelet: &Kubelet<'_>) {
 
 #[tokio::test(flavor = "multi_thread", worker_threads = 2)]
 async fn evaluators_that_die_between_their_last_route_and_the_global_record_lose_nothing() {
-    for (format, entry_status) in [
-        (LeaderboardVersion::V2, "Finished"),
-        (LeaderboardVersion::V1, "Finished with agent errors"),
-    ] {
+    for format in [LeaderboardVersion::V2, LeaderboardVersion::V1] {
         let submission = submission(format, DIES_LATE).await;
         let mut kubelet = Kubelet::new(&submission);
         kubelet.make_pod();
         let last = to_the_end(&submission, &mut kubelet).await;
         assert_complete(&last, &kubelet);
-        assert_eq!(last.entry_status, entry_status);
+        assert_eq!(last.outcome, Outcome::Finished);
     }
 }
 
@@ -95,7 +92,7 @@ async fn evaluators_that_write_their_complete_files_once_more_lose_nothing() {
     kubelet.make_pod();
     let last = to_the_end(&submission, &mut kubelet).await;
     assert_complete(&last, &kubelet);
-    assert_eq!(last.entry_status, "Finished");
+    assert_eq!(last.outcome, Outcome::Finished);
 }
 
 #[tokio::test(flavor = "multi_thread", worker_threads = 2)]
@@ -123,7 +120,7 @@ async fn a_pod_that_is_replaced_after_all_routes_finishes_with_what_is_stored() 
         kubelet.make_pod();
         let last = to_the_end(&submission, &mut kubelet).await;
         assert_complete(&last, &kubelet);
-        assert_eq!(last.entry_status, "Finished", "{knobs}");
+        assert_eq!(last.outcome, Outcome::Finished, "{knobs}");
     }
 }
 
@@ -135,7 +132,7 @@ async fn a_resume_whose_last_routes_are_not_set_up_keeps_the_sensors_of_before()
     let last = to_the_end(&submission, &mut kubelet).await;
     let is_complete = last.is_final && last.eligible && last.done == ROUTES;
     assert!(
-        is_complete && last.entry_status == "Finished",
+        is_complete && last.outcome == Outcome::Finished,
         "{last:?}\n{}",
         kubelet.story()
     );
@@ -152,7 +149,7 @@ async fn a_last_route_without_a_record_is_driven_although_the_progress_counts_it
     let last = to_the_end(&submission, &mut kubelet).await;
     let is_complete = last.is_final && last.eligible && last.done == ROUTES;
     assert!(
-        is_complete && last.entry_status == "Finished",
+        is_complete && last.outcome == Outcome::Finished,
         "{last:?}\n{}",
         kubelet.story()
     );
@@ -176,7 +173,7 @@ async fn complete_files_of_a_real_evaluator_without_sensors_finish_with_the_orig
     let last = to_the_end(&submission, &mut kubelet).await;
     let is_complete = last.is_final && last.eligible && last.done == 16;
     assert!(
-        is_complete && last.entry_status == "Finished",
+        is_complete && last.outcome == Outcome::Finished,
         "{last:?}\n{}",
         kubelet.story()
     );

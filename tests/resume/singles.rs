@@ -10,6 +10,7 @@ use super::results::{report, results};
 use super::submission::{FASTER, Submission};
 use crate::ministack::{Proxy, server};
 use leaderboard_api::LeaderboardVersion;
+use leaderboard_contract::report::Outcome;
 use leaderboard_evaluation::judge::Pace;
 use leaderboard_protocol::files::{Mark, Side, StatusFile};
 
@@ -61,7 +62,7 @@ async fn a_simulation_that_crashes_in_the_last_route_is_repeated_before_anything
     assert!(in_time.is_ok(), "it does not end\n{}", kubelet.story());
     let last = report(&submission.archive).await.unwrap();
     assert!(
-        last.is_final && last.eligible && last.entry_status == "Finished",
+        last.is_final && last.eligible && last.outcome == Outcome::Finished,
         "{last:?}"
     );
     for begun in kubelet.begun() {

@@ -4,6 +4,7 @@
 //! The report is written by `logcopy` and read by the controller as hostile text: bounded in size, checked in every number. Pure.
 
 use std::collections::{BTreeMap, BTreeSet};
+use std::fmt;
 
 use jiff::Timestamp;
 use serde::{Deserialize, Serialize};
@@ -89,14 +90,14 @@ pub struct Report {
     pub is_final: bool,
     /// Whether the results count.
     pub eligible: bool,
-    /// `entry_status` of the merged file; `Crashed` and `Rejected` for V1 as well, which has no entry status for them.
-    pub entry_status: String,
+    /// How the run ended, as its results show it.
+    pub outcome: Outcome,
     /// Which stop was obeyed, if any.
     #[serde(default, skip_serializing_if = "Option::is_none")]
     pub stopped: Option<super::run::Stop>,
-    /// Why a checkpoint was refused, for the participant.
+    /// Results that are refused, for the participant.
     #[serde(default, skip_serializing_if = "Option::is_none")]
-    pub why: Option<String>,
+    pub refused: Option<RefusedResults>,
     /// What `verify` noticed.
     #[serde(default, skip_serializing_if = "Vec::is_empty")]
     pub warnings: Vec<String>,
@@ -114,6 +115,59 @@ pub struct Report {
     /// Files of `evalai/` as stored in this round, by key below the prefix.
     #[serde(default)]
     pub files: BTreeMap<String, StoredFile>,
+}
+
+/// End of a run by its results, whatever its kind of evaluation calls it.
+#[derive(Serialize, Deserialize, Clone, Copy, Debug, Default, PartialEq, Eq)]
+pub enum Outcome {
+    /// Units are missing.
+    #[default]
+    Running,
+    /// All units were done and count.
+    Finished,
+    /// The workers' host crashed, so the results do not count.
+    Crashed,
+    /// The agent used what it may not use, so the results do not count.
+    Rejected,
+    /// The results contradict themselves, so they do not count.
+    Invalid,
+}
+
+impl fmt::Display for Outcome {
+    fn fmt(&self, out: &mut fmt::Formatter<'_>) -> fmt::Result {
+        out.write_str(match self {
+            Self::Running => "Running",
+            Self::Finished => "Finished",
+            Self::Crashed => "Crashed",
+            Self::Rejected => "Rejected",
+            Self::Invalid => "Invalid",
+        })
+    }
+}
+
+/// Results that cannot be used.
+#[derive(Serialize, Deserialize, Clone, Debug, PartialEq, Eq)]
+#[serde(rename_all = "camelCase")]
+pub struct RefusedResults {
+    /// Worker that wrote them, from 1; absent where they are of several.
+    #[serde(default, skip_serializing_if = "Option::is_none")]
+    pub worker: Option<u32>,
+    /// Cause and next step, in sentences.
+    pub why: String,
+}
+
+impl RefusedResults {
+    /// Results of one worker, or of several.
+    pub fn new(worker: Option<u32>, why: impl Into<String>) -> Self {
+        let why = why.into();
+        Self { worker, why }
+    }
+}
+
+impl fmt::Display for RefusedResults {
+    fn fmt(&self, out: &mut fmt::Formatter<'_>) -> fmt::Result {
+        out.write_str(&self.why)
+    }
 }
 
 /// One worker as its status files and checkpoint show it.
@@ -185,8 +239,10 @@ impl Report {
         let line = |text: &String| one_line(text, LONGEST_TEXT);
         Self {
             unit: one_line(&self.unit, MAX_NAME),
-            entry_status: line(&self.entry_status),
-            why: self.why.as_ref().map(line),
+            refused: self.refused.as_ref().map(|refused| RefusedResults {
+                why: line(&refused.why),
+                ..*refused
+            }),
             logs: self.logs.as_ref().map(|logs| match logs {
                 Logs::Sent => Logs::Sent,
                 Logs::Refused(why) => Logs::Refused(line(why)),
@@ -204,7 +260,7 @@ impl Report {
         if self.done > self.total {
             return implausible("more units done than there are");
         }
-        if self.is_final && self.stopped.is_none() && self.why.is_none() && self.done != self.total {
+        if self.is_final && self.stopped.is_none() && self.refused.is_none() && self.done != self.total {
             return implausible("final, but units are missing");
         }
         if !self.score.iter().chain(&self.metrics).all(Metric::is_plausible) {

@@ -7,7 +7,7 @@ use std::sync::Arc;
 use bytes::Bytes;
 use leaderboard_api::{Metric, WorkerState};
 use leaderboard_contract::keys::EVALAI;
-use leaderboard_contract::report::{ReportWorker, StoredFile};
+use leaderboard_contract::report::{Outcome, RefusedResults, ReportWorker, StoredFile};
 use leaderboard_protocol::files::{Pair, Progress};
 use sha2::{Digest, Sha256};
 
@@ -91,8 +91,8 @@ pub struct Summary {
     pub has_ended: bool,
     /// The results count.
     pub eligible: bool,
-    /// How the run ended, in the words of its evaluators.
-    pub ended_as: String,
+    /// How the run ended.
+    pub outcome: Outcome,
     /// Scores that do not follow from what was recorded, one sentence each.
     pub warnings: Vec<String>,
 }
@@ -123,15 +123,19 @@ pub struct Gathered {
     pub refused: Vec<Option<String>>,
     /// True for a worker whose results this node can't read at present.
     pub unreadable: Vec<bool>,
-    /// Why the workers' results can't be merged, if they can't.
-    pub unmerged: Option<String>,
+    /// The workers' results together, if they can't be merged.
+    pub unmerged: Option<RefusedResults>,
 }
 
 impl Gathered {
-    /// The first reason why something is refused; none once nothing is missing, since what came later changes nothing.
-    pub fn why(&self) -> Option<String> {
-        let first = self.refused.iter().flatten().next().or(self.unmerged.as_ref());
-        first.filter(|_| !self.is_complete()).cloned()
+    /// The first results that are refused; none once nothing is missing, since what came later changes nothing.
+    pub fn first_refused(&self) -> Option<RefusedResults> {
+        if self.is_complete() {
+            return None;
+        }
+        let workers = (1..).zip(&self.refused);
+        let mut refused = workers.filter_map(|(id, why)| Some(RefusedResults::new(Some(id), why.as_ref()?)));
+        refused.next().or_else(|| self.unmerged.clone())
     }
 
     /// Whether nothing is missing: judged by the plan and the last good files, whatever the agents report.

@@ -6,6 +6,7 @@
 use std::time::Duration;
 
 use crate::Gathered;
+use leaderboard_contract::report::RefusedResults;
 use leaderboard_contract::run::Stop;
 
 /// How a run ended.
@@ -15,8 +16,8 @@ pub enum Ending {
     Complete,
     /// It was stopped from outside; the results are what there is.
     Stopped(Stop),
-    /// A pair has come to its end with results that can't be used: why, for the participant.
-    Invalid(String),
+    /// A worker has come to its end with results that can't be used.
+    Invalid(RefusedResults),
 }
 
 impl std::fmt::Display for Ending {
@@ -24,7 +25,7 @@ impl std::fmt::Display for Ending {
         match self {
             Self::Complete => f.write_str("the results are complete"),
             Self::Stopped(stop) => write!(f, "the run was stopped ({})", stop.as_str()),
-            Self::Invalid(why) => write!(f, "the results can't be used: {why}"),
+            Self::Invalid(refused) => write!(f, "the results can't be used: {refused}"),
         }
     }
 }
@@ -53,8 +54,8 @@ pub struct Situation {
     pub any_started: bool,
     /// A stop is requested.
     pub stop: Option<Stop>,
-    /// A pair has ended badly: why, and for how long.
-    pub spoiled: Option<(String, Duration)>,
+    /// Results of a worker that has ended badly, and for how long.
+    pub spoiled: Option<(RefusedResults, Duration)>,
     /// `simulation.cancel` is there for this long.
     pub cancelled: Option<Duration>,
     /// The agents' folders have not changed for this long.
@@ -71,7 +72,7 @@ pub fn decide(seen: &Situation, pace: &Pace, cancel: Duration) -> Step {
     let spoiled = seen.spoiled.as_ref().filter(|(_, since)| *since >= pace.quiet);
     let ending = match (seen.stop, spoiled) {
         (Some(stop), _) => Ending::Stopped(stop),
-        (None, Some((why, _))) => Ending::Invalid(why.clone()),
+        (None, Some((refused, _))) => Ending::Invalid(refused.clone()),
         (None, None) => return Step::GoOn,
     };
     if settled || seen.all_done {
@@ -94,7 +95,7 @@ pub fn decide(seen: &Situation, pace: &Pace, cancel: Duration) -> Step {
 #[derive(Debug, Default)]
 pub struct Judge {
     complete: Option<Duration>,
-    spoiled: Option<(String, Duration)>,
+    spoiled: Option<(RefusedResults, Duration)>,
     cancelled: Option<Duration>,
     quiet: Duration,
     activity: Option<u64>,
@@ -119,9 +120,9 @@ impl Judge {
         let now = outside.now;
         let whole = gathered.is_complete();
         self.complete = (whole && gathered.has_ended()).then(|| self.complete.unwrap_or(now));
-        self.spoiled = spoiled(gathered).map(|why| {
+        self.spoiled = spoiled(gathered).map(|refused| {
             let since = self.spoiled.as_ref().map_or(now, |(_, since)| *since);
-            (why, since)
+            (refused, since)
         });
         self.cancelled = outside.cancelled.then(|| self.cancelled.unwrap_or(now));
         if self.activity != Some(outside.activity) {
@@ -138,7 +139,7 @@ impl Judge {
                 .iter()
                 .any(|worker| worker.agent.started || worker.host.started),
             stop: outside.stop,
-            spoiled: self.spoiled.clone().map(|(why, then)| (why, since(then))),
+            spoiled: self.spoiled.clone().map(|(refused, then)| (refused, since(then))),
             cancelled: self.cancelled.map(since),
             quiet: since(self.quiet),
         }
@@ -148,7 +149,7 @@ impl Judge {
 /// A pair that reports it is done without complete results will not get them any more. An agent's report alone ends
 /// nothing well: it can only end its own run badly. Nothing is known of a checkpoint that this node can't read: if that lasts, the run
 /// ends without final results, which is the infrastructure's failure.
-fn spoiled(gathered: &Gathered) -> Option<String> {
+fn spoiled(gathered: &Gathered) -> Option<RefusedResults> {
     if gathered.is_complete() {
         return None;
     }
@@ -162,7 +163,8 @@ fn spoiled(gathered: &Gathered) -> Option<String> {
                 pair.id, pair.done, pair.total
             )
         };
-        return Some(refused.clone().unwrap_or_else(incomplete));
+        let why = refused.clone().unwrap_or_else(incomplete);
+        return Some(RefusedResults::new(Some(pair.id), why));
     }
     let all_done = gathered.seen.iter().all(|pair| pair.agent.done);
     gathered.unmerged.clone().filter(|_| all_done)

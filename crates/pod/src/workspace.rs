@@ -271,6 +271,7 @@ fn folders(logs: &Path) -> Result<Arc<Tree>, WorkspaceError> {
 mod tests {
     use super::*;
     use crate::isolation::Blocked;
+    use leaderboard_contract::report::RefusedResults;
     use leaderboard_contract::verdict::{NotAVerdict, VERDICT_BYTES};
     use leaderboard_evaluation::fixtures;
 
@@ -292,13 +293,11 @@ mod tests {
     #[test]
     fn what_a_report_quotes_is_one_harmless_line() {
         let mut report = first();
-        report.why = Some("pair 1: \u{1b}[2J\nbad".into());
+        report.refused = Some(RefusedResults::new(Some(1), "pair 1: \u{1b}[2J\nbad"));
         report.warnings = vec!["\u{202e}route 1".into()];
-        report.entry_status = "Started\u{7}".into();
         let read = Report::parse(&serde_json::to_vec(&report).unwrap()).unwrap();
-        assert_eq!(read.why.as_deref(), Some("pair 1: \u{fffd}[2J bad"));
+        assert_eq!(read.refused.unwrap().why, "pair 1: \u{fffd}[2J bad");
         assert_eq!(read.warnings, ["\u{fffd}route 1"]);
-        assert_eq!(read.entry_status, "Started\u{fffd}");
     }
 
     #[test]

@@ -5,7 +5,7 @@ use serde_json::{Map, Value};
 use leaderboard_api::text::one_line;
 use leaderboard_api::{Attempt, Metric, Progress, Score};
 use leaderboard_contract::keys::{METADATA, STDOUT};
-use leaderboard_contract::report::{ContentId, Logs, Report, ReportError, ReportWorker};
+use leaderboard_contract::report::{ContentId, Logs, Outcome, RefusedResults, Report, ReportError, ReportWorker};
 use leaderboard_contract::run::Stop;
 use leaderboard_evaluation::labels;
 
@@ -30,10 +30,10 @@ pub struct ReportDigest {
     pub metrics: Vec<Metric>,
     pub is_final: bool,
     pub eligible: bool,
-    pub entry_status: String,
+    pub outcome: Outcome,
     pub stopped: Option<Stop>,
-    /// Why a checkpoint was refused for good.
-    pub why: Option<String>,
+    /// Results that are refused for good.
+    pub refused: Option<RefusedResults>,
     /// The first warning.
     pub warning: Option<String>,
     /// Whether the lines of the run come to CloudWatch.
@@ -63,7 +63,7 @@ impl ReportDigest {
     /// only results that count do: another Job may go on, which stores no report of its own before its first round.
     pub fn is_verdict(&self) -> bool {
         let goes_on = matches!(self.stopped, Some(Stop::Interruption | Stop::Cancel));
-        let is_decided = self.is_complete() || (self.is_final && self.why.is_some());
+        let is_decided = self.is_complete() || (self.is_final && self.refused.is_some());
         is_decided && (self.eligible || !goes_on)
     }
 
@@ -89,9 +89,12 @@ impl ReportDigest {
             metrics: report.metrics.clone(),
             is_final: report.is_final,
             eligible: report.eligible,
-            entry_status: cut(&report.entry_status),
+            outcome: report.outcome,
             stopped: report.stopped,
-            why: report.why.as_deref().filter(|_| report.is_final).map(cut),
+            refused: report.refused.as_ref().filter(|_| report.is_final).map(|refused| {
+                let why = cut(&refused.why);
+                RefusedResults::new(refused.worker, why)
+            }),
             warning: report.warnings.first().map(|warning| cut(warning)),
             logs: report.logs.as_ref().map(|logs| match logs {
                 Logs::Sent => Logs::Sent,
@@ -153,7 +156,7 @@ mod tests {
             "done": 20, "total": 20, "unit": "routes", "workers": [worker(1), worker(2)],
             "score": {"name": "Driving score", "value": "43.13"},
             "metrics": [{"name": "Route completion", "value": "80.00"}, {"name": "Infraction penalty", "value": "0.515"}], "final": is_final, "eligible": is_final,
-            "entryStatus": "Finished", "why": "w".repeat(9_000), "warnings": vec!["v".repeat(9_000); 9],
+            "outcome": "Finished", "refused": {"why": "w".repeat(9_000)}, "warnings": vec!["v".repeat(9_000); 9],
             "results": json!([{"accuracies": accuracies}]).to_string(), "partialResults": "p".repeat(40_000),
             "files": {"evalai/stdout.txt": {"size": 9, "sha256": "0".repeat(64)}},
         })
@@ -164,8 +167,7 @@ mod tests {
     fn size(digest: &ReportDigest) -> usize {
         let texts = [
             Some(&digest.pod_uid),
-            Some(&digest.entry_status),
-            digest.why.as_ref(),
+            digest.refused.as_ref().map(|refused| &refused.why),
             digest.warning.as_ref(),
         ];
         let workers = digest.workers.len() * size_of::<ReportWorker>();
@@ -180,7 +182,7 @@ mod tests {
         assert!(bytes.len() > 80_000);
         let digest = ReportDigest::read(&bytes, "u").unwrap().unwrap();
         assert!(size(&digest) < 1536, "{} bytes", size(&digest));
-        assert_eq!((digest.accuracies, digest.why), (None, None));
+        assert_eq!((digest.accuracies, digest.refused), (None, None));
         let score = digest.score.map(|score| score.value);
         assert_eq!(
             (digest.done, digest.workers.len(), score.as_deref()),
@@ -193,7 +195,7 @@ mod tests {
         let digest = ReportDigest::read(&report(true), "u").unwrap().unwrap();
         let metrics = digest.accuracies.unwrap();
         assert_eq!(serde_json::to_string(&metrics).unwrap(), r#"{"Driving score":43.125}"#);
-        assert_eq!(digest.why.unwrap().chars().count(), LONGEST);
+        assert_eq!(digest.refused.unwrap().why.chars().count(), LONGEST);
     }
 
     #[test]

@@ -141,6 +141,26 @@ impl Refusal {
         )
     }
 
+    /// Position of the pair whose file it is, from 0; none where it is of several.
+    pub fn pair(&self) -> Option<usize> {
+        match self {
+            Self::Limit { pair, .. }
+            | Self::NotUtf8 { pair }
+            | Self::Shape { pair, .. }
+            | Self::Total { pair, .. }
+            | Self::TooManyRecords { pair, .. }
+            | Self::Record { pair, .. } => Some(*pair),
+            Self::Sensor { pair, .. } => *pair,
+            Self::Plan { .. }
+            | Self::Output { .. }
+            | Self::SensorsDiffer { .. }
+            | Self::Duplicate { .. }
+            | Self::Gap { .. }
+            | Self::Statistics { .. }
+            | Self::Metric { .. } => None,
+        }
+    }
+
     /// What the reader can do about it, as one sentence.
     pub fn next_step(&self) -> &'static str {
         match self {

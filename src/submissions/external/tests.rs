@@ -123,7 +123,7 @@ fn last() -> ObservedReport {
     let results = json!([{"split": "leaderboard", "accuracies": {"Driving score": 43.125}}]);
     let report = json!({
         "schema": 1, "submissionUid": "uid-of-sub", "attempt": 1, "podUid": "p", "round": 9, "done": 4, "total": 4,
-        "unit": "routes", "workers": [], "final": true, "eligible": true, "entryStatus": "Finished", "results": results.to_string(),
+        "unit": "routes", "workers": [], "final": true, "eligible": true, "outcome": "Finished", "results": results.to_string(),
     });
     let report: leaderboard_contract::report::Report = serde_json::from_value(report).unwrap();
     ObservedReport::Ours(Arc::new(ReportDigest::of(&report, ContentId::default())))

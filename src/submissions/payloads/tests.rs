@@ -37,7 +37,7 @@ struct Bench {
 fn report(stdout: &str) -> String {
     json!({
         "schema": 1, "submissionUid": "u", "attempt": 1, "podUid": "p", "round": 9, "done": 4, "total": 4,
-        "unit": "routes", "workers": [], "final": true, "eligible": true, "entryStatus": "Finished", "results": "[1]", "partialResults": "[2]",
+        "unit": "routes", "workers": [], "final": true, "eligible": true, "outcome": "Finished", "results": "[1]", "partialResults": "[2]",
         "files": {"evalai/stdout.txt": {"size": stdout.len(), "sha256": hex::encode(Sha256::digest(stdout))}},
     })
     .to_string()

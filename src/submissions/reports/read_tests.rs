@@ -59,7 +59,7 @@ async fn bench() -> Bench {
 fn report(stdout: &str) -> String {
     json!({
         "schema": 1, "submissionUid": "uid-of-sub", "attempt": 1, "podUid": "p", "round": 9, "done": 4, "total": 4,
-        "unit": "routes", "workers": [], "final": true, "eligible": true, "entryStatus": "Finished", "results": "[1]",
+        "unit": "routes", "workers": [], "final": true, "eligible": true, "outcome": "Finished", "results": "[1]",
         "files": {"evalai/stdout.txt": {"size": stdout.len(), "sha256": hex::encode(Sha256::digest(stdout))}},
     })
     .to_string()

@@ -60,8 +60,8 @@ async fn whatever_is_in_the_place_of_a_checkpoint_the_last_good_one_stays_and_th
             logcopy.end().await;
             continue;
         }
-        let report = pod.reported(|report| report.why.is_some()).await;
-        let reason = report.why.unwrap();
+        let report = pod.reported(|report| report.refused.is_some()).await;
+        let reason = report.refused.unwrap().why;
         assert!(reason.contains(why), "{what}: {reason}");
         assert_eq!((report.done, report.is_final), (3, false), "{what}");
         // Its runner never reports done; a host or the retries end it.

@@ -1,6 +1,7 @@
 //! The sidecar, from the first round to SIGTERM.
 
 use leaderboard_api::WorkerState;
+use leaderboard_contract::report::Outcome;
 
 use super::*;
 
@@ -42,11 +43,11 @@ async fn a_whole_run_ends_with_the_final_report_and_the_original_layout() {
     pod.until_has(StatusFile::Stored).await;
     // It was stored before logcopy.done was written.
     let report = pod.report().await.unwrap();
-    assert!(report.is_final && report.eligible && report.stopped.is_none() && report.why.is_none());
+    assert!(report.is_final && report.eligible && report.stopped.is_none() && report.refused.is_none());
     assert_eq!(report.partial_results, None);
     assert_eq!(
-        (report.done, report.total, report.entry_status.as_str()),
-        (4, 4, "Finished")
+        (report.done, report.total, report.outcome),
+        (4, 4, Outcome::Finished)
     );
     assert!(report.workers.iter().all(|pair| pair.state == WorkerState::Done));
     assert_eq!(
@@ -209,13 +210,13 @@ async fn a_pair_that_ends_with_refused_results_ends_the_run_as_invalid() {
     let bad = checkpoint(0, 2, 2).replace("RouteScenario_1_", "RouteScenario_3_");
     pod.put("agent/agent1/agent_results.json", bad.as_bytes());
     let logcopy = pod.logcopy();
-    let report = pod.reported(|report| report.why.is_some()).await;
+    let report = pod.reported(|report| report.refused.is_some()).await;
     assert!(!report.is_final);
     pod.mark(Side::Agent, 1, Mark::Done);
     pod.until_has(StatusFile::Stored).await;
     let report = pod.report().await.unwrap();
     assert!(report.is_final && !report.eligible && report.stopped.is_none());
-    let why = report.why.unwrap();
+    let why = report.refused.unwrap().why;
     assert!(why.contains("outside this pair's routes 0-1"), "{why}");
     assert!(pod.has(StatusFile::Cancel), "the other pair is stopped");
     logcopy.end().await;

@@ -10,7 +10,7 @@ use futures::future::BoxFuture;
 use kube::ResourceExt;
 use leaderboard_api::{Attempt, Metric, WorkerState, names};
 use leaderboard_aws::archive::Archive;
-use leaderboard_contract::report::{REPORT_KEY, Report, ReportWorker, SCHEMA};
+use leaderboard_contract::report::{Outcome, REPORT_KEY, Report, ReportWorker, SCHEMA};
 use serde_json::json;
 use tokio::time::{Instant, interval_at};
 
@@ -121,9 +121,9 @@ pub fn report(submission_uid: String, pod_uid: String, done: u32) -> Report {
         metrics: Vec::new(),
         is_final: is_last,
         eligible: is_last,
-        entry_status: if is_last { "Finished" } else { "Started" }.into(),
+        outcome: if is_last { Outcome::Finished } else { Outcome::Running },
         stopped: None,
-        why: None,
+        refused: None,
         warnings: Vec::new(),
         logs: None,
         results: json!([{"split": "leaderboard", "show_to_participant": true, "accuracies": accuracies}]).to_string(),

@@ -12,7 +12,7 @@ use crate::carla::results_format;
 use crate::{Gathered, Object, Objects, Refused, Results, Summary, Texts, WorkerSeen};
 use leaderboard_api::Verify;
 use leaderboard_contract::keys::{MERGED, METADATA, STDOUT, checkpoint_path};
-use leaderboard_contract::report::ReportWorker;
+use leaderboard_contract::report::{Outcome, RefusedResults, ReportWorker};
 use leaderboard_contract::run::{Run, STATUS_FOLDER};
 use leaderboard_evidence::{Stamp, Tree, TreeError};
 use leaderboard_protocol::files::{KEPT_CHECKPOINT, Pair};
@@ -94,9 +94,20 @@ impl From<&Merged> for Summary {
             is_complete: merged.is_final,
             has_ended: merged.pairs.iter().all(|pair| pair.ended),
             eligible: merged.eligible,
-            ended_as: merged.ended_as().to_owned(),
+            outcome: outcome(merged.outcome),
             warnings: merged.warnings.clone(),
         }
+    }
+}
+
+fn outcome(of_results: leaderboard_results::Outcome) -> Outcome {
+    use leaderboard_results::Outcome as Of;
+    match of_results {
+        Of::Running => Outcome::Running,
+        Of::Finished => Outcome::Finished,
+        Of::Crashed => Outcome::Crashed,
+        Of::Rejected => Outcome::Rejected,
+        Of::Invalid => Outcome::Invalid,
     }
 }
 
@@ -128,7 +139,7 @@ pub struct Gatherer {
     merged: Option<Arc<Summary>>,
     texts: Arc<Texts>,
     objects: Objects,
-    unmerged: Option<String>,
+    unmerged: Option<RefusedResults>,
 }
 
 impl Results for Gatherer {
@@ -292,9 +303,10 @@ impl Gatherer {
                 self.unmerged = None;
             }
             Err(refusal) => {
-                let reason = reason(&refusal);
-                tracing::warn!("the checkpoints are not merged: {reason}");
-                self.unmerged = Some(reason);
+                let worker = refusal.pair().and_then(|pair| u32::try_from(pair + 1).ok());
+                let refused = RefusedResults::new(worker, reason(&refusal));
+                tracing::warn!("the checkpoints are not merged: {refused}");
+                self.unmerged = Some(refused);
             }
         }
     }

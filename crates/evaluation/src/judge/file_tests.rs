@@ -12,6 +12,7 @@ use crate::carla::gather::Gatherer;
 use crate::fixtures::{checkpoint, put_checkpoint, put_status, run};
 use leaderboard_api::RouteSlice;
 use leaderboard_contract::keys::MERGED;
+use leaderboard_contract::report::Outcome;
 use leaderboard_evidence::Tree;
 
 /// The file as a real evaluator of V2 writes it when it is started once more on it.
@@ -34,14 +35,14 @@ fn a_complete_run_stays_complete_when_all_its_evaluators_are_started_once_more()
     }
     let (after, seen) = volume.round();
     assert_eq!(after.objects, before.objects, "what is stored is what was complete");
-    assert_eq!(after.merged.as_ref().unwrap().ended_as, "Finished");
-    assert_eq!((seen.complete, after.why()), (Some(Duration::from_secs(10)), None));
+    assert_eq!(after.merged.as_ref().unwrap().outcome, Outcome::Finished);
+    assert_eq!((seen.complete, after.first_refused()), (Some(Duration::from_secs(10)), None));
 
     // A logcopy that has begun after that finds nothing else.
     let tree = Arc::new(Tree::open(volume.folder.path()).unwrap());
     let gathered = Gatherer::new(&run(), tree).unwrap().round();
     let merged = gathered.merged.as_ref().unwrap();
-    assert_eq!((merged.eligible, merged.ended_as.as_str()), (true, "Finished"));
+    assert_eq!((merged.eligible, merged.outcome), (true, Outcome::Finished));
     let original = r#""entry_status": "Invalid""#;
     assert!(
         text(&gathered, MERGED).contains(original),
@@ -115,8 +116,8 @@ fn a_resumed_pair_whose_rest_fails_before_its_set_up_counts() {
         let gathered = read_in_turn(1, &[before, vec![rest_failed.clone()]].concat());
         let merged = gathered.merged.unwrap();
         assert_eq!(
-            (merged.is_complete, merged.eligible, merged.ended_as.as_str()),
-            (true, true, "Finished")
+            (merged.is_complete, merged.eligible, merged.outcome),
+            (true, true, Outcome::Finished)
         );
     }
 }
@@ -126,8 +127,8 @@ fn an_agent_that_names_no_sensors_from_its_beginning_does_not_count() {
     let files = [checkpoint(0, 0, 2), checkpoint(0, 1, 2), checkpoint(0, 2, 2)].map(|file| started_once_more(&file));
     let merged = read_in_turn(1, &files).merged.unwrap();
     assert_eq!(
-        (merged.is_complete, merged.eligible, merged.ended_as.as_str()),
-        (true, false, "Invalid")
+        (merged.is_complete, merged.eligible, merged.outcome),
+        (true, false, Outcome::Invalid)
     );
 }
 
@@ -139,7 +140,7 @@ fn a_later_checkpoint_with_fewer_routes_does_not_replace_the_one_before() {
     for done in [0, 1] {
         put_checkpoint(volume.folder.path(), 1, &checkpoint(0, done, 2));
         let (gathered, _) = volume.round();
-        assert_eq!((gathered.workers[0].done, gathered.why()), (2, None));
+        assert_eq!((gathered.workers[0].done, gathered.first_refused()), (2, None));
         assert_eq!(text(&gathered, "agent/agent1/agent_results.json"), checkpoint(0, 2, 2));
     }
     // As many as before are the evaluator's newest word, whole.
@@ -166,7 +167,7 @@ fn a_checkpoint_that_the_node_cannot_read_is_tried_again_and_spoils_nothing() {
         *tree.disk.lock().unwrap() = Some(trouble);
         for _ in 0..2 {
             let (gathered, seen) = volume.round();
-            assert_eq!((gathered.why(), seen.spoiled), (None, None), "{trouble}");
+            assert_eq!((gathered.first_refused(), seen.spoiled), (None, None), "{trouble}");
             assert_eq!(gathered.workers[1].done, 1);
         }
         *tree.disk.lock().unwrap() = None;
@@ -184,8 +185,8 @@ fn a_checkpoint_that_its_agent_has_shut_is_the_agents() {
         put_status(volume.folder.path(), Side::Agent, 1, Mark::Done);
         *tree.disk.lock().unwrap() = Some(trouble);
         let (gathered, seen) = volume.round();
-        let why = gathered.why().unwrap();
-        assert!(why.starts_with("pair 1: the checkpoint can't be read: "), "{why}");
-        assert_eq!(seen.spoiled, Some((why, Duration::ZERO)), "{trouble}");
+        let refused = gathered.first_refused().unwrap();
+        assert!(refused.why.starts_with("pair 1: the checkpoint can't be read: "), "{refused}");
+        assert_eq!(seen.spoiled, Some((refused, Duration::ZERO)), "{trouble}");
     }
 }

@@ -99,8 +99,8 @@ fn nothing_is_waited_for_when_nothing_has_begun() {
 
 #[test]
 fn a_pair_that_ended_badly_ends_the_run() {
-    let why = "pair 2 ended".to_owned();
-    let end = Step::Finish(Ending::Invalid(why.clone()));
+    let refused = RefusedResults::new(Some(2), "pair 2 ended");
+    let end = Step::Finish(Ending::Invalid(refused.clone()));
     let table = [
         (secs(4), None, false, Step::GoOn),
         (secs(5), None, false, Step::Cancel),
@@ -109,7 +109,7 @@ fn a_pair_that_ended_badly_ends_the_run() {
     ];
     for (since, cancelled, all_done, expected) in table {
         let seen = Situation {
-            spoiled: Some((why.clone(), since)),
+            spoiled: Some((refused.clone(), since)),
             cancelled,
             all_done,
             quiet: secs(10),
@@ -131,6 +131,7 @@ pub(super) mod seen_on_a_volume {
     use crate::fixtures::{checkpoint, put_checkpoint, put_status, run};
     use leaderboard_api::{RouteSlice, WorkerState};
     use leaderboard_contract::keys::{EVALAI, MERGED, checkpoint_path};
+    use leaderboard_contract::report::Outcome;
     use leaderboard_evidence::Tree;
 
     pub(crate) struct Volume {
@@ -213,7 +214,7 @@ pub(super) mod seen_on_a_volume {
         for text in ["", "{\"_checkpoint\": {", "null"] {
             put_checkpoint(volume.folder.path(), 1, text);
             let (gathered, _) = volume.round();
-            assert_eq!((gathered.workers[0].done, gathered.why()), (1, None), "{text:?}");
+            assert_eq!((gathered.workers[0].done, gathered.first_refused()), (1, None), "{text:?}");
         }
         fs::remove_file(volume.folder.path().join("agent/agent1/agent_results.json")).unwrap();
         assert_eq!(volume.round().0.workers[0].done, 1);
@@ -288,7 +289,7 @@ pub(super) mod seen_on_a_volume {
             );
         put_checkpoint(volume.folder.path(), 2, &crashed);
         let (gathered, seen) = volume.round();
-        assert_eq!(gathered.merged.as_ref().unwrap().ended_as, "Crashed");
+        assert_eq!(gathered.merged.as_ref().unwrap().outcome, Outcome::Crashed);
         assert!(!gathered.has_ended() && seen.whole && seen.complete.is_none());
         put_checkpoint(volume.folder.path(), 2, &checkpoint(2, 2, 2));
         let (gathered, seen) = volume.round();
@@ -349,7 +350,7 @@ pub(super) mod seen_on_a_volume {
         let limit = results_plan(&run()).unwrap().limits_of(0).bytes;
         put_checkpoint(volume.folder.path(), 1, &(checkpoint(0, 2, 2) + &" ".repeat(limit)));
         let (gathered, _) = volume.round();
-        let why = gathered.why().unwrap();
+        let why = gathered.first_refused().unwrap().why;
         assert!(why.contains(&format!("more than the {limit} that are read")), "{why}");
         assert_eq!(gathered.workers[0].done, 1);
         assert_eq!(
@@ -380,20 +381,22 @@ pub(super) mod seen_on_a_volume {
         volume.round();
         put_checkpoint(volume.folder.path(), 2, &checkpoint(2, 2, 2).replace("100.0", "1000.0"));
         let (gathered, seen) = volume.round();
-        let why = gathered.why().unwrap();
+        let refused = gathered.first_refused().unwrap();
+        let why = &refused.why;
         assert!(
             why.starts_with("pair 2, route RouteScenario_2_rep0: ") && why.contains("1000"),
             "{why}"
         );
+        assert_eq!(refused.worker, Some(2));
         assert_eq!((gathered.workers[1].done, seen.spoiled), (1, None));
         put_status(volume.folder.path(), Side::Agent, 2, Mark::Done);
         let (_, seen) = volume.round();
-        assert_eq!(seen.spoiled, Some((why.clone(), Duration::ZERO)));
+        assert_eq!(seen.spoiled, Some((refused.clone(), Duration::ZERO)));
         let (_, seen) = volume.round();
-        assert_eq!(seen.spoiled, Some((why, Duration::from_secs(10))));
+        assert_eq!(seen.spoiled, Some((refused, Duration::from_secs(10))));
         put_checkpoint(volume.folder.path(), 2, &checkpoint(2, 2, 2));
         let (gathered, seen) = volume.round();
-        assert_eq!((gathered.why(), seen.spoiled), (None, None));
+        assert_eq!((gathered.first_refused(), seen.spoiled), (None, None));
     }
 
     #[test]
@@ -405,7 +408,9 @@ pub(super) mod seen_on_a_volume {
         }
         let (gathered, seen) = volume.round();
         assert!(!gathered.is_complete() && seen.all_done && seen.complete.is_none());
-        let (why, _) = seen.spoiled.unwrap();
+        let (refused, _) = seen.spoiled.unwrap();
+        let why = &refused.why;
+        assert_eq!(refused.worker, Some(1));
         assert!(why.starts_with("pair 1 ended with 1 of its 2 route runs."), "{why}");
     }
 
@@ -415,7 +420,7 @@ pub(super) mod seen_on_a_volume {
         let folder = volume.folder.path().join("agent/agent1");
         fs::create_dir_all(&folder).unwrap();
         std::os::unix::fs::symlink("/etc/passwd", folder.join("agent_results.json")).unwrap();
-        let why = volume.round().0.why().unwrap();
+        let why = volume.round().0.first_refused().unwrap().why;
         assert!(why.contains("not a regular file"), "{why}");
     }
 

@@ -3,7 +3,7 @@
 use std::collections::BTreeMap;
 
 use leaderboard_api::text::one_line;
-use leaderboard_contract::report::{LONGEST_TEXT, MAX_BYTES, Report, SCHEMA};
+use leaderboard_contract::report::{LONGEST_TEXT, MAX_BYTES, RefusedResults, Report, SCHEMA};
 use leaderboard_contract::run::Run;
 use leaderboard_evaluation::Gathered;
 use leaderboard_evaluation::judge::Ending;
@@ -16,7 +16,7 @@ const WARNINGS: usize = 50;
 pub fn describe(run: &Run, pod_uid: &str, gathered: &Gathered, ending: Option<&Ending>) -> Report {
     let merged = gathered.merged.as_deref();
     let invalid = match ending {
-        Some(Ending::Invalid(why)) => Some(why.clone()),
+        Some(Ending::Invalid(refused)) => Some(refused.clone()),
         _ => None,
     };
     let stopped = match ending {
@@ -44,9 +44,14 @@ pub fn describe(run: &Run, pod_uid: &str, gathered: &Gathered, ending: Option<&E
         metrics: merged.map(|merged| merged.metrics.clone()).unwrap_or_default(),
         is_final: ending.is_some(),
         eligible: counts && merged.is_some_and(|merged| merged.eligible),
-        entry_status: merged.map_or("Started", |merged| merged.ended_as.as_str()).to_owned(),
+        outcome: merged.map(|merged| merged.outcome).unwrap_or_default(),
         stopped,
-        why: invalid.or_else(|| gathered.why()).map(|why| shorten(&why)),
+        refused: invalid
+            .or_else(|| gathered.first_refused())
+            .map(|refused| RefusedResults {
+                why: shorten(&refused.why),
+                ..refused
+            }),
         warnings: warnings.iter().take(WARNINGS).map(|warning| shorten(warning)).collect(),
         logs: None,
         results: gathered.texts.results.clone(),

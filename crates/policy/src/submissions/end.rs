@@ -138,8 +138,8 @@ fn cancel_reason(draft: &PlanBuilder<'_>) -> Reason {
 fn cause(draft: &PlanBuilder<'_>, report: Option<&ReportDigest>, job_end: Option<&JobEnd>) -> Failure {
     // A refused checkpoint may still be fixed while the run goes on; only the last one counts.
     let verdict = report.filter(|r| r.is_verdict());
-    if let Some(why) = verdict.and_then(|r| r.why.as_deref()) {
-        return failure::invalid_results(why);
+    if let Some(refused) = verdict.and_then(|r| r.refused.as_ref()) {
+        return failure::invalid_results(refused);
     }
     if let Some(report) = verdict {
         return failure::not_eligible(report, &draft.status);

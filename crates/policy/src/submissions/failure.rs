@@ -9,6 +9,7 @@ use leaderboard_api::{
     EndReason, Failure, FailureClass, Reason, ReasonName, SubmissionStatus, WorkerStatus, names, reasons,
 };
 use leaderboard_contract::keys::agent_log;
+use leaderboard_contract::report::{Outcome, RefusedResults};
 use leaderboard_contract::run::{Stop, console};
 use leaderboard_evaluation::{Words, words};
 
@@ -100,26 +101,20 @@ pub(super) fn results_not_stored() -> Failure {
     )
 }
 
-pub(super) fn invalid_results(why: &str) -> Failure {
-    let what = format!("The results cannot be used: {}", sentence(why));
+pub(super) fn invalid_results(refused: &RefusedResults) -> Failure {
+    let what = format!("The results cannot be used: {}", sentence(&refused.why));
     Failure {
-        worker: pair_named(why),
+        worker: refused.worker.map(clamp),
         ..charged(Reason::InvalidResults, &what)
     }
 }
 
-/// The pair whose checkpoint logcopy speaks of: `pair 2: …` or `pair 2, record …`.
-fn pair_named(why: &str) -> Option<i32> {
-    let (number, _) = why.strip_prefix("pair ")?.split_once([':', ','])?;
-    number.parse().ok()
-}
-
 /// Results that are complete but do not count.
 pub(super) fn not_eligible(report: &ReportDigest, status: &SubmissionStatus) -> Failure {
-    if report.entry_status == "Crashed" {
+    if report.outcome == Outcome::Crashed {
         return named_crash(report, status);
     }
-    let what = format!("The run ended as {}, so its results do not count.", report.entry_status);
+    let what = format!("The run ended as {}, so its results do not count.", report.outcome);
     charged(Reason::NotEligible, &what)
 }
 
@@ -179,7 +174,7 @@ pub(super) fn worst(status: &SubmissionStatus) -> Option<Failure> {
 pub(super) fn is_refusal(status: &SubmissionStatus, found: &Failure, report: &ReportDigest) -> bool {
     let by_itself = |worker: &WorkerStatus| matches!(cause_of(worker), Some(EndReason::Exited | EndReason::Incomplete));
     let is_of_results = found.reason.is_one_of(&[Reason::AgentCrashed, Reason::InvalidResults]);
-    is_of_results && status.workers.iter().any(by_itself) && report.is_verdict() && report.why.is_some()
+    is_of_results && status.workers.iter().any(by_itself) && report.is_verdict() && report.refused.is_some()
 }
 
 pub(super) fn cause_of(worker: &WorkerStatus) -> Option<EndReason> {

@@ -20,7 +20,7 @@ use leaderboard_api::{
     Attempt, Leaderboard, LeaderboardSpec, Metric, Reason, ReasonName, State, Submission, SubmissionStatus,
     WorkerState, names,
 };
-use leaderboard_contract::report::{Report, ReportWorker};
+use leaderboard_contract::report::{Outcome, Report, ReportWorker};
 use leaderboard_contract::run::Stop;
 use leaderboard_protocol::verdict::{Verdict, What};
 
@@ -409,9 +409,9 @@ pub fn report(done: u32) -> Report {
         },
         is_final: false,
         eligible: false,
-        entry_status: "Started".into(),
+        outcome: Outcome::Running,
         stopped: None,
-        why: None,
+        refused: None,
         warnings: Vec::new(),
         logs: None,
         results: "[]".into(),
@@ -426,7 +426,7 @@ pub fn final_report() -> Report {
     Report {
         is_final: true,
         eligible: true,
-        entry_status: "Finished".into(),
+        outcome: Outcome::Finished,
         score: Some(Metric::new("Driving score", 43.129, 2)),
         ..report(4)
     }

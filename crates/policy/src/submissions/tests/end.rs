@@ -10,7 +10,7 @@ use leaderboard_api::Reason;
 use leaderboard_api::State::{Cancelled, Failed, Finished, Pending, Running};
 use leaderboard_api::conditions::{ARCHIVED, FINISHED, RUNNING, STALLED, SUCCEEDED};
 use leaderboard_api::{Attempt, Failure, JobNumber};
-use leaderboard_contract::report::Report;
+use leaderboard_contract::report::{Outcome, RefusedResults, Report};
 
 #[test]
 fn complete_results_that_count_finish() {
@@ -98,7 +98,7 @@ fn every_other_end_of_a_run_waits_for_its_job() {
     };
     let ineligible = Report {
         eligible: false,
-        entry_status: "Rejected".into(),
+        outcome: Outcome::Rejected,
         ..final_report()
     };
     for told in [foreign, ineligible, report(4), report(3)] {
@@ -137,14 +137,14 @@ fn completes_with(report: Option<Report>, reason: Reason) -> Failure {
 
 #[test]
 fn each_end_without_that_has_its_class_and_reason() {
-    let ineligible = |status: &str| Report {
+    let ineligible = |outcome| Report {
         eligible: false,
-        entry_status: status.into(),
+        outcome,
         ..final_report()
     };
     let refused = |is_final| Report {
         is_final,
-        why: Some("a score of NaN.".into()),
+        refused: Some(RefusedResults::new(None, "a score of NaN.")),
         ..report(3)
     };
     for (report, reason) in [
@@ -170,7 +170,7 @@ fn each_end_without_that_has_its_class_and_reason() {
 fn names_a_crash() -> Report {
     let mut told = Report {
         eligible: false,
-        entry_status: "Crashed".into(),
+        outcome: Outcome::Crashed,
         ..final_report()
     };
     told.workers[1].names_crash = true;
@@ -249,7 +249,7 @@ fn a_crash_of_an_earlier_job_whose_record_is_kept_is_nobodys_fault() {
 fn an_older_pod_that_names_no_pair_of_a_crash_is_believed() {
     let told = Report {
         eligible: false,
-        entry_status: "Crashed".into(),
+        outcome: Outcome::Crashed,
         ..final_report()
     };
     let failure = completes_with(Some(told), Reason::SimulationCrashed);
@@ -260,7 +260,7 @@ fn an_older_pod_that_names_no_pair_of_a_crash_is_believed() {
 fn an_agent_that_ends_by_itself_with_a_refused_checkpoint_gets_what_is_wrong_with_it() {
     let refused = Report {
         is_final: true,
-        why: Some("the records are not a list.".into()),
+        refused: Some(RefusedResults::new(None, "the records are not a list.")),
         ..report(3)
     };
     for (word, told, reason) in [
@@ -391,7 +391,7 @@ fn what_is_stored_of_the_first_job_is_no_verdict_on_the_second() {
     let mut world = World::local().running();
     let crashed = Report {
         eligible: false,
-        entry_status: "Crashed".into(),
+        outcome: Outcome::Crashed,
         ..final_report()
     };
     world.complete();

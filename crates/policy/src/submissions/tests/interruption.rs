@@ -5,7 +5,7 @@ use crate::submissions::Action;
 use crate::view::{JobEnd, ObservedNode, PodView};
 use leaderboard_api::State::{Finished, Pending, Running};
 use leaderboard_api::{Attempt, Interruptions, JobNumber, Reason, conditions};
-use leaderboard_contract::report::Report;
+use leaderboard_contract::report::{RefusedResults, Report};
 use leaderboard_contract::run::Stop;
 
 const TAINT: &str = "karpenter.sh/disrupted";
@@ -216,7 +216,7 @@ fn followed(mut world: World, stop: Stop) -> World {
     world.complete();
     world.report(Report {
         is_final: true,
-        why: Some("nonsense".into()),
+        refused: Some(RefusedResults::new(None, "nonsense")),
         stopped: Some(stop),
         ..report(2)
     });

@@ -5,7 +5,7 @@ use crate::submissions::{Action, EvalaiUpdate, Plan};
 use crate::view::{JobEnd, LogAt, LogPlace, ObservedReport};
 use leaderboard_api::Reason;
 use leaderboard_api::State::{Cancelled, Failed, Pending, Running};
-use leaderboard_contract::report::Report;
+use leaderboard_contract::report::{Outcome, RefusedResults, Report};
 
 /// The places of a request, in short: `node agent-1`, `last simulator-1` for the run before, `s3 agent/agent1/leaderboard.log`.
 fn places(plan: &Plan) -> Vec<String> {
@@ -78,7 +78,7 @@ fn a_failure_of_the_whole_run_is_explained_by_a_pair_that_was_not_done() {
 
     let refused = Report {
         is_final: true,
-        why: Some("pair 2, record 1: its score is no number.".into()),
+        refused: Some(RefusedResults::new(Some(2), "pair 2, record 1: its score is no number.")),
         ..report(1)
     };
     let mut world = World::local().running();
@@ -87,21 +87,18 @@ fn a_failure_of_the_whole_run_is_explained_by_a_pair_that_was_not_done() {
     let plan = world.pass_to(Failed, Reason::InvalidResults);
     assert_eq!(plan.status.failure.as_ref().unwrap().worker, Some(2));
     assert_eq!(places(&plan)[0], "s3 agent/agent2/leaderboard.log", "the refused one");
-    for why in [
-        "pairs 1 and 2 have different sensors",
-        "route 3 has more than one record",
-        "pair",
-    ] {
-        let why = Some(why.to_owned());
-        let mut world = World::local().running();
-        world.complete();
-        world.report(Report { why, ..refused.clone() });
-        assert_eq!(world.pass().status.failure.unwrap().worker, None);
-    }
+    let of_several = Some(RefusedResults::new(None, "pairs 1 and 2 have different sensors"));
+    let mut world = World::local().running();
+    world.complete();
+    world.report(Report {
+        refused: of_several,
+        ..refused.clone()
+    });
+    assert_eq!(world.pass().status.failure.unwrap().worker, None);
 
     let ineligible = Report {
         eligible: false,
-        entry_status: "Rejected".into(),
+        outcome: Outcome::Rejected,
         ..final_report()
     };
     let mut world = World::local().running();

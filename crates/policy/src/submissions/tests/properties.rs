@@ -14,7 +14,7 @@ use crate::view::{
     PodView, Stage, Standing, Suspension, Turn,
 };
 use leaderboard_api::evalai_status::Status;
-use leaderboard_contract::report::Report;
+use leaderboard_contract::report::{Outcome, RefusedResults, Report};
 use leaderboard_contract::run::Stop;
 
 /// One change of the world, after which there is a reconcile.
@@ -193,14 +193,14 @@ fn pod_view() -> impl Strategy<Value = PodView> {
 }
 
 fn observed_report() -> impl Strategy<Value = ObservedReport> {
-    let status = select(vec!["Finished", "Rejected", "Crashed", "Invalid"]);
+    let outcome = select(vec![Outcome::Finished, Outcome::Rejected, Outcome::Crashed, Outcome::Invalid]);
     let flags = (any::<bool>(), any::<bool>(), any::<bool>(), 0u32..6);
-    let ours = (0u32..=4, flags, status).prop_map(|(done, (is_final, eligible, is_refused, crashes), status)| {
+    let ours = (0u32..=4, flags, outcome).prop_map(|(done, (is_final, eligible, is_refused, crashes), outcome)| {
         let mut told = Report {
             is_final,
             eligible: eligible && is_final,
-            entry_status: status.into(),
-            why: is_refused.then(|| "nonsense".into()),
+            outcome,
+            refused: is_refused.then(|| RefusedResults::new(None, "nonsense")),
             ..report(done)
         };
         told.workers[0].crashes = crashes;

@@ -6,7 +6,7 @@ use crate::view::{JobEnd, ObservedNode, ObservedReport, Standing, Turn};
 use leaderboard_api::State::{Cancelled, Finished, Pending, Resumed, Running};
 use leaderboard_api::conditions::{FINISHED, PUBLISHED, RECORDED};
 use leaderboard_api::{Attempt, JobNumber, Reason};
-use leaderboard_contract::report::Report;
+use leaderboard_contract::report::{RefusedResults, Report};
 use leaderboard_contract::run::Stop;
 
 /// A run of a Leaderboard that retries nothing; its second attempt is asked for at second 100.
@@ -112,7 +112,7 @@ fn what_else_ends_a_run_meanwhile_is_forgiven() {
         world.complete();
         world.report(Report {
             is_final: true,
-            why: Some("nonsense".into()),
+            refused: Some(RefusedResults::new(None, "nonsense")),
             stopped: Some(Stop::Interruption),
             ..report(2)
         });
