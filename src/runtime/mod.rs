@@ -56,6 +56,7 @@ use context::Context;
 use leader::{Leader, Leadership};
 use leaderboard_api::Leaderboard;
 use leaderboard_aws::clients::Aws;
+use leaderboard_aws::table::Tables;
 use leaderboard_base::object_key::ObjectKey;
 use leaderboard_base::tasks::TaskFailed;
 use leaderboard_evalai::{Changed, Hub, Options, PayloadReader, SweepRow, Timeouts, Timing};
@@ -170,10 +171,11 @@ impl Parts {
         }
         let queues = Queues::new(self.settings.concurrency, &self.telemetry.metrics);
         let (evalai, changed) = mpsc::unbounded_channel();
-        let external = self.external(&leader.fence(), evalai, &queues);
+        let tables = Arc::new(Tables::new(self.aws.clone()));
+        let external = self.external(&leader.fence(), Arc::clone(&tables), evalai, &queues);
         let hub = external.hub.clone();
         let shared = Arc::new(Shared {
-            context: Arc::new(self.context(&leader.fence(), external, &queues)),
+            context: Arc::new(self.context(&leader.fence(), tables, external, &queues)),
             queues,
             backoff: BackoffMap::default(),
             telemetry: self.telemetry.clone(),
@@ -195,6 +197,7 @@ impl Parts {
     fn external(
         &self,
         fence: &leader::Fence,
+        tables: Arc<Tables>,
         evalai: mpsc::UnboundedSender<Changed>,
         queues: &Queues,
     ) -> ExternalSystems {
@@ -205,7 +208,7 @@ impl Parts {
         telemetry.tasks.stay("inbox", inbox);
         let fence = fence.clone();
         let wake = by_key(events::waking(&queues.submissions, &self.watches.submissions.store));
-        let records = records::start(&self.aws, move || fence.may_write(), &telemetry.tasks, wake);
+        let records = records::start(tables, move || fence.may_write(), &telemetry.tasks, wake);
         ExternalSystems::new(hub, records, self.settings.allowed.clone())
     }
 
@@ -234,7 +237,13 @@ impl Parts {
     }
 
     /// What all reconciles share.
-    fn context(&self, fence: &leader::Fence, external: ExternalSystems, queues: &Queues) -> Context {
+    fn context(
+        &self,
+        fence: &leader::Fence,
+        tables: Arc<Tables>,
+        external: ExternalSystems,
+        queues: &Queues,
+    ) -> Context {
         let fence = fence.clone();
         let (aws, client, tasks) = (&self.aws, &self.client, &self.telemetry.tasks);
         let submissions = &self.watches.submissions.store;
@@ -250,7 +259,7 @@ impl Parts {
             settings: self.settings.clone(),
             stores: self.watches.stores(),
             memory: Memory::default(),
-            workers: Workers::start(aws, client, tasks, answered),
+            workers: Workers::start(aws, tables, client, tasks, answered),
             causes: self.causes(queues),
             slots: Arc::new(Slots::new(self.watches.stores(), turned)),
             leaderboards: LeaderboardState::default(),

@@ -7,7 +7,6 @@ use std::time::Duration;
 
 use crate::ask::{Asker, Wake};
 use leaderboard_api::DynamoTable;
-use leaderboard_aws::clients::Aws;
 use leaderboard_aws::table::{Row, TableError, Tables, Written};
 use leaderboard_base::backoff::Backoff;
 use leaderboard_base::object_key::ObjectKey;
@@ -60,12 +59,12 @@ impl Ask for Record {
 
 /// Starts the task that writes. `may_write` is asked right before each write.
 pub fn start(
-    aws: &Aws,
+    tables: Arc<Tables>,
     may_write: impl Fn() -> bool + Send + Sync + 'static,
     tasks: &Tasks,
     wake: Wake,
 ) -> Asker<Record> {
-    let shared = Arc::new((Tables::new(aws.clone()), may_write));
+    let shared = Arc::new((tables, may_write));
     Asker::start("records", tasks, wake, move |asked| {
         let shared = Arc::clone(&shared);
         async move {

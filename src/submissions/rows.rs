@@ -4,7 +4,6 @@
 use std::sync::Arc;
 
 use crate::ask::{Asker, Wake};
-use leaderboard_aws::clients::Aws;
 use leaderboard_aws::table::{ObservedRow, TableError, Tables};
 use leaderboard_base::tasks::Tasks;
 use leaderboard_policy::ask::Failure;
@@ -14,8 +13,7 @@ use leaderboard_policy::questions::{ForeignRun, Row};
 const UNDER_WAY: [&str; 2] = ["SUBMITTED", "RUNNING"];
 
 /// Starts the task that reads.
-pub fn start(aws: &Aws, tasks: &Tasks, wake: Wake) -> Asker<Row> {
-    let tables = Arc::new(Tables::new(aws.clone()));
+pub fn start(tables: Arc<Tables>, tasks: &Tasks, wake: Wake) -> Asker<Row> {
     Asker::start("rows", tasks, wake, move |asked| {
         let tables = Arc::clone(&tables);
         async move { read(&tables, &asked.question).await }

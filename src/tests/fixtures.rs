@@ -36,6 +36,7 @@ use crate::submissions::observe::workers::Workers;
 use crate::submissions::records;
 use leaderboard_api::{Attempt, JobNumber, Leaderboard, State, Submission, SubmissionStatus, Times, effective, names};
 use leaderboard_aws::clients::Aws;
+use leaderboard_aws::table::Tables;
 use leaderboard_base::shutdown::Stop;
 use leaderboard_base::tasks::Tasks;
 use leaderboard_evalai::{Hub, Options};
@@ -110,19 +111,20 @@ pub async fn surroundings(cluster: Cluster, endpoint: &str) -> Surroundings {
     let (waking, woken) = mpsc::unbounded_channel();
     let stores = stores(cluster);
     let (turning, _) = mpsc::unbounded_channel();
+    let tables = Arc::new(Tables::new(aws.clone()));
     let context = Context {
         writer: Writer::new(client.clone(), || true),
         settings: settings(),
         slots: Arc::new(Slots::new(stores.clone(), noting(&turning))),
         stores,
         memory: Memory::default(),
-        workers: Workers::start(&aws, &client, &tasks, || noting(&answering)),
+        workers: Workers::start(&aws, Arc::clone(&tables), &client, &tasks, || noting(&answering)),
         causes: Causes::default(),
         leaderboards: LeaderboardState::default(),
         asks: Asks::start(&client, &aws, &settings(), &tasks, || {
             by_key(noting::<Leaderboard>(&waking))
         }),
-        external: external(&aws, &tasks),
+        external: external(tables, &tasks),
         recorder: EventRecorder::new(client.clone(), Reporter::from("test")),
         metrics: Arc::default(),
         traces: Traces::default(),
@@ -178,9 +180,9 @@ pub fn stores(cluster: Cluster) -> Stores {
 }
 
 /// Services that nobody listens to.
-fn external(aws: &Aws, tasks: &Tasks) -> ExternalSystems {
+fn external(tables: Arc<Tables>, tasks: &Tasks) -> ExternalSystems {
     let hub = Hub::new(Options::unheard(tasks, || true));
-    let records = records::start(aws, || true, tasks, Box::new(|_| {}));
+    let records = records::start(tables, || true, tasks, Box::new(|_| {}));
     ExternalSystems::new(hub, records, Allowed::default())
 }
 

@@ -13,6 +13,7 @@ use crate::submissions::reports::{self, Report, RunFiles};
 use crate::submissions::rows;
 use leaderboard_api::{Submission, SubmissionStatus};
 use leaderboard_aws::clients::Aws;
+use leaderboard_aws::table::Tables;
 use leaderboard_base::tasks::Tasks;
 use leaderboard_policy::questions::Row;
 use leaderboard_policy::view::{LogPlace, ReportDemand};
@@ -27,12 +28,18 @@ pub struct Workers {
 
 impl Workers {
     /// Starts them. What `wake` makes is called for each submission that has its answer.
-    pub fn start(aws: &Aws, client: &Client, tasks: &Tasks, wake: impl Fn() -> Wake<Submission>) -> Self {
+    pub fn start(
+        aws: &Aws,
+        tables: Arc<Tables>,
+        client: &Client,
+        tasks: &Tasks,
+        wake: impl Fn() -> Wake<Submission>,
+    ) -> Self {
         Self {
             reports: reports::start(aws, tasks, by_key(wake())),
             fences: fences::start(aws, tasks, by_key(wake())),
             logs: failure_log::start(client, aws, tasks, by_key(wake())),
-            rows: rows::start(aws, tasks, by_key(wake())),
+            rows: rows::start(tables, tasks, by_key(wake())),
         }
     }
 

@@ -46,7 +46,7 @@ use leaderboard_api::{
 };
 use leaderboard_contract::run::{Isolation, Run, SCHEMA};
 use leaderboard_evaluation::Evaluation;
-use leaderboard_evaluation::workload::{Asked, literal};
+use leaderboard_evaluation::workload::{Asked, Workload, literal};
 
 /// Seconds the containers have between SIGTERM and SIGKILL: the agents' 20 s, then logcopy's last upload.
 const GRACE_SECONDS: i64 = 600;
@@ -130,10 +130,11 @@ impl JobInput<'_> {
 /// survive there.
 pub fn build_object(input: &JobInput<'_>) -> DynamicObject {
     // Maps with text as keys and finite numbers always become JSON.
-    let mut spec = serde_json::to_value(ours(input)).unwrap_or_default();
+    let workloads = workers::workloads(input);
+    let mut spec = serde_json::to_value(ours(input, &workloads)).unwrap_or_default();
     let template = &mut spec["template"];
     pod_overlay::lay(template, input.spec(), &input.kind().reserved());
-    settle(template, input);
+    settle(template, input, &workloads);
     skip_strangers(template);
     DynamicObject {
         types: Some(TypeMeta::resource::<Job>()),
@@ -189,7 +190,7 @@ fn isolation(leaderboard: &Leaderboard, now: Timestamp) -> Option<Isolation> {
     })
 }
 
-fn ours(input: &JobInput<'_>) -> JobSpec {
+fn ours(input: &JobInput<'_>, workloads: &[Workload]) -> JobSpec {
     JobSpec {
         completions: Some(1),
         parallelism: Some(1),
@@ -197,7 +198,7 @@ fn ours(input: &JobInput<'_>) -> JobSpec {
         // The default starts the next Pod while the old one still writes.
         pod_replacement_policy: Some("Failed".into()),
         ttl_seconds_after_finished: Some(input.spec().job_seconds()),
-        template: template(input),
+        template: template(input, workloads),
         ..JobSpec::default()
     }
 }
@@ -259,7 +260,7 @@ fn active_deadline(deadlines: &Deadlines) -> Option<i64> {
     Some(seconds.min(i32::MAX.into()))
 }
 
-fn template(input: &JobInput<'_>) -> PodTemplateSpec {
+fn template(input: &JobInput<'_>, workloads: &[Workload]) -> PodTemplateSpec {
     PodTemplateSpec {
         metadata: Some(ObjectMeta {
             labels: Some(labels(input)),
@@ -271,7 +272,7 @@ fn template(input: &JobInput<'_>) -> PodTemplateSpec {
             ])),
             ..ObjectMeta::default()
         }),
-        spec: Some(pod(input)),
+        spec: Some(pod(input, workloads)),
     }
 }
 
@@ -279,7 +280,7 @@ fn generation(input: &JobInput<'_>) -> i64 {
     input.leaderboard.metadata.generation.unwrap_or_default()
 }
 
-fn pod(input: &JobInput<'_>) -> PodSpec {
+fn pod(input: &JobInput<'_>, workloads: &[Workload]) -> PodSpec {
     let identity = input.spec().pod_identity.as_ref();
     PodSpec {
         restart_policy: Some("OnFailure".into()),
@@ -289,8 +290,8 @@ fn pod(input: &JobInput<'_>) -> PodSpec {
             init::contents(input),
             init::logcopy(input),
         ]),
-        containers: workers::all(input),
-        volumes: Some(volumes::all(input)),
+        containers: workers::all(input, workloads),
+        volumes: Some(volumes::all(input, workloads)),
         active_deadline_seconds: active_deadline(&input.deadlines()),
         termination_grace_period_seconds: Some(GRACE_SECONDS),
         service_account_name: identity.and_then(|identity| identity.service_account_name.clone()),
@@ -331,13 +332,13 @@ fn tolerations(input: &JobInput<'_>) -> Vec<Toleration> {
 }
 
 /// What depends on all that the host says: filled in where nothing is said, in the containers of the overlay too.
-fn settle(template: &mut Value, input: &JobInput<'_>) {
+fn settle(template: &mut Value, input: &JobInput<'_>, workloads: &[Workload]) {
     let pod = &mut template["spec"];
     let gpus = source(input.spec());
     for list in ["initContainers", "containers"] {
         for container in pod[list].as_array_mut().into_iter().flatten() {
             gpu::hide(container, gpus);
-            workers::settle(container, input);
+            workers::settle(container, workloads);
             security::settle(container);
         }
     }

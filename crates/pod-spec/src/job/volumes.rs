@@ -6,7 +6,7 @@ use k8s_openapi::api::core::v1::{
 };
 use k8s_openapi::apimachinery::pkg::api::resource::Quantity;
 
-use super::{JobInput, workers};
+use super::JobInput;
 use crate::layout::{
     CONTENTS_LOG_FOLDER, IDENTITY_VOLUME, LOGS_VOLUME, PODINFO_VOLUME, SHM, SHM_VOLUME, STATUS, TOOLS_VOLUME,
 };
@@ -14,7 +14,7 @@ use leaderboard_api::{ByteQuantity, names};
 use leaderboard_contract::run::{
     IDENTITY, IDENTITY_TOKEN_FILE, LOGS, NAME_FILES, PODINFO, STATUS_FOLDER, STOP_FILE, TOOLS,
 };
-use leaderboard_evaluation::workload::Mount;
+use leaderboard_evaluation::workload::{Mount, Workload};
 use leaderboard_protocol::files::{Member, Pair, Side};
 
 const AUDIENCE: &str = "sts.amazonaws.com";
@@ -24,7 +24,7 @@ const TOKEN_SECONDS: i64 = 3600;
 const LOGS_MARGIN: u64 = 1 << 30;
 
 /// Every volume of the Pod.
-pub(super) fn all(input: &JobInput<'_>) -> Vec<Volume> {
+pub(super) fn all(input: &JobInput<'_>, workloads: &[Workload]) -> Vec<Volume> {
     let contents = input
         .kind()
         .reserved()
@@ -40,23 +40,21 @@ pub(super) fn all(input: &JobInput<'_>) -> Vec<Volume> {
     let shared = input.spec().agent.shm_size.iter();
     let shared = shared.flat_map(|size| Pair::first(input.workers()).map(|worker| memory(worker, size)));
     let all = contents.chain(own).chain(identity);
-    all.chain(of_node(input)).chain(shared).collect()
+    all.chain(of_node(workloads)).chain(shared).collect()
 }
 
 /// Folders of the node that a worker's containers mount, which are the same for all workers.
-fn of_node(input: &JobInput<'_>) -> Vec<Volume> {
-    let workload = Pair::first(input.workers())
-        .next()
-        .map(|worker| workers::workload(input, worker));
-    let roles = workload
-        .into_iter()
-        .flat_map(|workload| [Some(workload.host), workload.agent]);
-    let mounts = roles.flatten().flat_map(|role| role.mounts);
+fn of_node(workloads: &[Workload]) -> Vec<Volume> {
+    let roles = workloads
+        .iter()
+        .take(1)
+        .flat_map(|workload| [Some(&workload.host), workload.agent.as_ref()]);
+    let mounts = roles.flatten().flat_map(|role| &role.mounts);
     let volumes = mounts.filter_map(|mount| match mount {
         Mount::OfNode { volume, path } => Some(Volume {
-            name: volume.into(),
+            name: (*volume).into(),
             host_path: Some(HostPathVolumeSource {
-                path: path.into(),
+                path: (*path).into(),
                 type_: Some("Directory".into()),
             }),
             ..Volume::default()

@@ -12,38 +12,42 @@ use leaderboard_contract::run::{RUNNER, TOOLS};
 use leaderboard_evaluation::workload::{Role, Workload};
 use leaderboard_protocol::files::{Member, Pair, Side};
 
-pub(super) fn workload(input: &JobInput<'_>, pair: Pair) -> Workload {
-    input.kind().workload(&input.asked(), pair)
+/// Containers of all workers, in their order.
+pub(super) fn workloads(input: &JobInput<'_>) -> Vec<Workload> {
+    let (kind, asked) = (input.kind(), input.asked());
+    Pair::first(input.workers())
+        .map(|worker| kind.workload(&asked, worker))
+        .collect()
 }
 
-fn role(input: &JobInput<'_>, member: Member) -> Option<Role> {
-    let workload = workload(input, member.pair);
+fn role(workloads: &[Workload], member: Member) -> Option<&Role> {
+    let workload = workloads.get(member.pair.index())?;
     match member.side {
-        Side::Host => Some(workload.host),
-        Side::Agent => workload.agent,
+        Side::Host => Some(&workload.host),
+        Side::Agent => workload.agent.as_ref(),
     }
 }
 
 /// The hosts' containers of all workers, then the agents'.
-pub(super) fn all(input: &JobInput<'_>) -> Vec<Container> {
+pub(super) fn all(input: &JobInput<'_>, workloads: &[Workload]) -> Vec<Container> {
     let workers = Pair::first(input.workers());
     let members = workers.clone().map(Pair::host).chain(workers.map(Pair::agent));
     members
-        .filter_map(|member| Some(container(input, member, role(input, member)?)))
+        .filter_map(|member| Some(container(input, member, role(workloads, member)?)))
         .collect()
 }
 
-fn container(input: &JobInput<'_>, member: Member, role: Role) -> Container {
+fn container(input: &JobInput<'_>, member: Member, role: &Role) -> Container {
     let (gpus, name) = (source(input.spec()), member.to_string());
     let hosts = input.spec().given(input.track(), part(member.side));
     let env = role.env.iter().map(|(name, value)| variable(name, value));
     let env = env.chain(gpu::variables(gpus, member)).collect();
-    let flags = role.flags.into_iter().chain(gpu::flags(gpus, member.side, role.draws));
+    let flags = role.flags.iter().cloned().chain(gpu::flags(gpus, member.side, role.draws));
     Container {
-        image: Some(role.image),
+        image: Some(role.image.clone()),
         // Kubernetes asks for `latest` anew before each container: a worker, or a restart, could get another image.
         image_pull_policy: (member.side == Side::Agent).then(|| "IfNotPresent".into()),
-        command: Some(behind_runner(member, flags, role.command)),
+        command: Some(behind_runner(member, flags, &role.command)),
         env: Some(merged(env, hosts.env, input.kind().reserved().env)),
         resources: gpu::resources(gpus, member, hosts.resources),
         security_context: Some(context(hosts.security)),
@@ -60,7 +64,7 @@ pub(super) fn part(side: Side) -> Part {
     }
 }
 
-fn behind_runner(member: Member, flags: impl IntoIterator<Item = String>, words: Vec<String>) -> Vec<String> {
+fn behind_runner(member: Member, flags: impl IntoIterator<Item = String>, words: &[String]) -> Vec<String> {
     let start = [
         format!("{TOOLS}/{RUNNER}"),
         member.side.name().to_owned(),
@@ -71,7 +75,7 @@ fn behind_runner(member: Member, flags: impl IntoIterator<Item = String>, words:
         .into_iter()
         .chain(flags)
         .chain(["--".to_owned()])
-        .chain(words)
+        .chain(words.iter().cloned())
         .collect()
 }
 
@@ -90,8 +94,8 @@ fn merged(mut ours: Vec<EnvVar>, hosts: &[EnvVar], reserved: &[&str]) -> Vec<Env
 }
 
 /// Takes variables of its image from a container. A Pod cannot remove a variable, so the runner does; what the host sets stays.
-pub(super) fn settle(container: &mut Value, input: &JobInput<'_>) {
-    let Some(role) = gpu::member(container).and_then(|member| role(input, member)) else {
+pub(super) fn settle(container: &mut Value, workloads: &[Workload]) {
+    let Some(role) = gpu::member(container).and_then(|member| role(workloads, member)) else {
         return;
     };
     let env = container["env"].as_array().map(Vec::as_slice).unwrap_or_default();
