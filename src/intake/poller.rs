@@ -134,8 +134,10 @@ impl<S: Source> Poller<S> {
     async fn receive(&mut self) -> Result<Vec<Received>, String> {
         let mut stop = self.stop.clone();
         let received = tokio::select! {
-            _ = stop.wait_for(|stop| *stop) => return Ok(Vec::new()),
+            biased;
+            // A message that was handed out would wait until its time is over.
             received = self.source.receive(self.each) => received?,
+            _ = stop.wait_for(|stop| *stop) => return Ok(Vec::new()),
         };
         if !self.is_over() {
             self.shared.problems.set(&self.queue, None);

@@ -153,7 +153,8 @@ async fn ask(reviews: &Api<SelfSubjectAccessReview>, need: &Need<'_>) -> Option<
 /// False: the process was stopped.
 async fn pause(time: Duration, telemetry: &Observability) -> bool {
     tokio::select! {
-        () = sleep(time) => true,
+        biased;
         () = telemetry.stop.wait() => false,
+        () = sleep(time) => true,
     }
 }

@@ -186,6 +186,7 @@ impl<K: Watchable> Task<K> {
         let mut events = source::all(apis, &config);
         loop {
             let event = tokio::select! {
+                biased;
                 () = stop.wait() => break,
                 event = events.next() => event,
             };

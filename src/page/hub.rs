@@ -75,10 +75,12 @@ impl Hub {
     pub(super) async fn run(self, source: Arc<dyn Source>, stop: Stop) {
         loop {
             tokio::select! {
+                biased;
                 () = stop.wait() => return,
                 () = self.0.come.notified() => {}
             }
             tokio::select! {
+                biased;
                 () = stop.wait() => return,
                 () = self.show(source.as_ref()) => {}
             }
@@ -99,6 +101,7 @@ impl Hub {
                 shown = view;
             }
             tokio::select! {
+                biased;
                 () = latest.closed() => break,
                 () = next(&mut changes) => {}
             }

@@ -164,7 +164,11 @@ impl Parts {
         if !await_lead(leader, &self.telemetry).await? {
             return Ok(true);
         }
-        tokio::select! { () = self.watches.synced() => {}, () = self.telemetry.stop.wait() => return Ok(true) }
+        tokio::select! {
+            biased;
+            () = self.telemetry.stop.wait() => return Ok(true),
+            () = self.watches.synced() => {}
+        }
         // Prometheus sees no increase in a sample that begins with 1.
         for phase in Phase::ALL {
             self.telemetry.metrics.submissions.phases.of([phase.as_str()]);
@@ -352,6 +356,7 @@ async fn await_lead(leader: &Leader, telemetry: &Observability) -> Result<bool, 
             Leadership::Standby => {}
         }
         tokio::select! {
+            biased;
             () = telemetry.stop.wait() => return Ok(false),
             // The task of the Lease has failed, which ends the process.
             changed = leadership.changed() => if changed.is_err() { telemetry.stop.wait().await },

@@ -103,7 +103,7 @@ pub(super) async fn run(submissions: Events<Submission>, leaderboards: Events<Le
         )
     };
     let events = async {
-        tokio::select! { _ = events => {}, () = stop.wait() => {} }
+        tokio::select! { biased; () = stop.wait() => {}, _ = events => {} }
     };
     let of_submission = |turn| reconcile_submission(turn, Arc::clone(&shared));
     let of_leaderboard = |turn| reconcile_leaderboard(turn, Arc::clone(&shared));

@@ -52,6 +52,7 @@ pub fn on_signals() -> io::Result<Stop> {
 
 async fn listen(sender: watch::Sender<bool>, mut terminate: Signal, mut interrupt: Signal) {
     let name = tokio::select! {
+        biased;
         _ = terminate.recv() => "SIGTERM",
         _ = interrupt.recv() => "SIGINT",
     };

@@ -61,7 +61,7 @@ impl Tasks {
     pub fn until_stop(&self, name: &'static str, work: impl Future<Output = ()> + Send + 'static) {
         let stop = self.stop.clone();
         self.stay(name, async move {
-            tokio::select! { () = stop.wait() => {}, () = work => {} }
+            tokio::select! { biased; () = stop.wait() => {}, () = work => {} }
         });
     }
 

@@ -167,13 +167,14 @@ pub(super) async fn run(task: Task) -> bool {
         shared.publish(&outlets);
         let until = wait.map_or_else(|| Instant::now() + Duration::from_hours(1), |at| shared.start + at);
         tokio::select! {
+            biased;
+            _ = closing.changed() => {}
             Some((ticket, reply)) = in_flight.next(), if !in_flight.is_empty() => take(&shared, &outlets, &ticket, reply),
             Some((key, payload)) = reads.next(), if !reads.is_empty() => {
                 shared.queue().took_payload(&key, payload, shared.now());
             }
             () = shared.notify.notified() => {}
             () = tokio::time::sleep_until(until) => {}
-            _ = closing.changed() => {}
         }
     }
     let answers = async {

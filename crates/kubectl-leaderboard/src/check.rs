@@ -55,11 +55,12 @@ pub async fn check(cluster: &Cluster, wanted: &Check) -> Result<ExitCode, Error>
     let created = cluster.create(&object).await?;
     let name = created.name_any();
     let followed = tokio::select! {
+        biased;
+        _ = tokio::signal::ctrl_c() => Err(Error::Interrupted),
         followed = follow(cluster, &name, |check, board| lines(check, board.observed(), frame())) => followed,
         () = tokio::time::sleep(Duration::from_secs(wanted.timeout)) => Err(Error::Unfit(format!(
             "{name} did not end within {} s (--timeout). Do what is named above, and run the check again", wanted.timeout
         ))),
-        _ = tokio::signal::ctrl_c() => Err(Error::Interrupted),
     };
     if wanted.keep {
         note(&format!("{name} is kept, for `{}`.", command("why", &created)));

@@ -116,6 +116,7 @@ pub async fn follow(
     let mut ticks = tokio::time::interval(TICK);
     loop {
         let change = tokio::select! {
+            biased;
             change = changes.next() => change,
             _ = ticks.tick(), if Screen::is_live() => {
                 if let Some((submission, leaderboard)) = &last {

@@ -74,8 +74,9 @@ pub async fn dashboard(cluster: &Cluster, wanted: &Dashboard) -> Result<(), Erro
         "Everyone on this machine can open it while this command runs. Ctrl-C ends it.".to_owned(),
     ]);
     tokio::select! {
-        () = accept(listener, forwards) => Ok(()),
+        biased;
         ended = tokio::signal::ctrl_c() => ended.map_err(Error::Runtime),
+        () = accept(listener, forwards) => Ok(()),
     }
 }
 
@@ -169,6 +170,7 @@ impl Forwards {
             }
         };
         let result = tokio::select! {
+            biased;
             // Either side may end a connection at any time.
             _ = copy_bidirectional(&mut browser, &mut page) => Ok(()),
             Some(why) = failed => {

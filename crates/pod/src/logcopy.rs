@@ -198,6 +198,7 @@ async fn keep_going(mut rounds: Rounds, shutdown: impl Future<Output = ()>) -> R
             }
         };
         tokio::select! {
+            biased;
             () = &mut shutdown => break,
             () = rounds.wake(pause) => {}
         }

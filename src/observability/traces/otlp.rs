@@ -150,13 +150,15 @@ impl Sender {
         let mut batch = Vec::with_capacity(BATCH);
         while is_open {
             tokio::select! {
-                found = spans.recv_many(&mut batch, BATCH) => if found == 0 { return },
+                biased;
                 _ = &mut closed => is_open = false,
+                found = spans.recv_many(&mut batch, BATCH) => if found == 0 { return },
             }
             if is_open {
                 tokio::select! {
-                    () = tokio::time::sleep(FILL) => {}
+                    biased;
                     _ = &mut closed => is_open = false,
+                    () = tokio::time::sleep(FILL) => {}
                 }
             }
             while let Ok(span) = spans.try_recv() {

@@ -74,11 +74,12 @@ impl Elector {
                 Next::End(loss) => return self.lose(&loss.to_string()),
             };
             tokio::select! {
-                () = sleep(pause) => {}
+                biased;
                 asked = &mut release => return match asked {
                     Ok(()) => self.hand_over().await,
                     Err(_) => self.lose("the election was abandoned by its process"),
                 },
+                () = sleep(pause) => {}
             }
         }
     }

@@ -107,9 +107,10 @@ impl Queue {
                 }
             };
             tokio::select! {
+                biased;
                 () = &mut stopped => {}
-                () = self.changed.notified() => {}
                 Some(ended) = running.join_next() => self.finish(ended.ok()),
+                () = self.changed.notified() => {}
                 () = due => {}
             }
             while let Some(ended) = running.try_join_next() {

@@ -72,13 +72,8 @@ impl Following<'_> {
         pods: &mut (impl Stream<Item = Result<Pod, watcher::Error>> + Unpin),
     ) -> Result<(), Error> {
         tokio::select! {
-            line = self.lines.next(), if !self.lines.is_empty() => match line {
-                // The last log has ended.
-                None => {}
-                Some((source, Ok(line))) => print_labelled(source.stream, &source.label, &log_line(&line)),
-                Some((_, Err(error @ (Error::Forbidden(_) | Error::Credentials(_))))) => return Err(error),
-                Some((source, Err(error))) => note(&format!("the log of {} was interrupted: {error}", source.container)),
-            },
+            // A log that never pauses hides no change.
+            biased;
             Some(change) = changes.next() => match change {
                 Ok(Some(submission)) => self.submission = submission,
                 Ok(None) => return Err(Error::Gone(self.wanted.name.clone())),
@@ -87,6 +82,13 @@ impl Following<'_> {
             Some(pod) = pods.next() => match pod {
                 Ok(pod) => self.begin(&pod),
                 Err(error) => note_interruption(error, &mut self.printed)?,
+            },
+            line = self.lines.next(), if !self.lines.is_empty() => match line {
+                // The last log has ended.
+                None => {}
+                Some((source, Ok(line))) => print_labelled(source.stream, &source.label, &log_line(&line)),
+                Some((_, Err(error @ (Error::Forbidden(_) | Error::Credentials(_))))) => return Err(error),
+                Some((source, Err(error))) => note(&format!("the log of {} was interrupted: {error}", source.container)),
             },
             else => return Err(Error::Api("the watch has ended".to_owned())),
         }

@@ -171,11 +171,12 @@ impl Rounds {
             }
         };
         tokio::select! {
-            () = tokio::time::sleep(pause) => {}
-            () = changed => {}
+            biased;
             stopped = self.stop.changed() => if stopped.is_err() {
                 tokio::time::sleep(pause).await;
             },
+            () = changed => {}
+            () = tokio::time::sleep(pause) => {}
         }
         let spacing = self.setting.pace.least.saturating_sub(self.last.elapsed());
         tokio::time::sleep(spacing).await;
@@ -340,9 +341,10 @@ impl Rounds {
                 is_last: false,
             };
             return tokio::select! {
-                sent = self.uploader.sync(&files, window) => sent.map(drop),
+                biased;
                 // The results come first then; the last logs read everything once more.
                 () = before_node_goes(self.stop.clone()) => Ok(()),
+                sent = self.uploader.sync(&files, window) => sent.map(drop),
             };
         };
         for file in &mut files {
