@@ -186,7 +186,10 @@ async fn sixteen_pairs_with_the_largest_checkpoints_stay_below_logcopys_memory()
         put(&logs, pair, &checkpoint(pair, 63 << 20, 0, "z"));
     }
     reported(&sink, pid, |report| {
-        report.refused.as_ref().is_some_and(|refused| refused.why.contains("that are read"))
+        report
+            .refused
+            .as_ref()
+            .is_some_and(|refused| refused.why.contains("that are read"))
     })
     .await;
     println!(

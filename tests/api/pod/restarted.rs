@@ -41,7 +41,10 @@ async fn a_complete_run_whose_evaluators_were_all_started_once_more_is_finished(
     let logcopy = pod.logcopy();
     pod.until_has(StatusFile::Stored).await;
     let report = pod.report().await.unwrap();
-    assert!(report.is_final && report.eligible && report.refused.is_none(), "{report:?}");
+    assert!(
+        report.is_final && report.eligible && report.refused.is_none(),
+        "{report:?}"
+    );
     let score = report.score.as_ref().map(|score| score.value.as_str());
     assert_eq!((report.done, report.total, score), (16, 16, Some(SCORE)));
     assert_eq!(report.outcome, Outcome::Finished);

@@ -45,10 +45,7 @@ async fn a_whole_run_ends_with_the_final_report_and_the_original_layout() {
     let report = pod.report().await.unwrap();
     assert!(report.is_final && report.eligible && report.stopped.is_none() && report.refused.is_none());
     assert_eq!(report.partial_results, None);
-    assert_eq!(
-        (report.done, report.total, report.outcome),
-        (4, 4, Outcome::Finished)
-    );
+    assert_eq!((report.done, report.total, report.outcome), (4, 4, Outcome::Finished));
     assert!(report.workers.iter().all(|pair| pair.state == WorkerState::Done));
     assert_eq!(
         pod.stored("evalai/results.json").await.unwrap(),

@@ -56,7 +56,12 @@ fn rows_of(class: Class) -> String {
             .own_after_failure()
             .map(|step| format!(" Once it has failed: {step}"));
         let after = after.unwrap_or_default();
-        writeln!(table, "{}", linked(&format!("| `{reason}` | {meaning} | {next_step}{after} |"))).unwrap();
+        writeln!(
+            table,
+            "{}",
+            linked(&format!("| `{reason}` | {meaning} | {next_step}{after} |"))
+        )
+        .unwrap();
     }
     table
 }

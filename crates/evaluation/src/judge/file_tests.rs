@@ -36,7 +36,10 @@ fn a_complete_run_stays_complete_when_all_its_evaluators_are_started_once_more()
     let (after, seen) = volume.round();
     assert_eq!(after.objects, before.objects, "what is stored is what was complete");
     assert_eq!(after.merged.as_ref().unwrap().outcome, Outcome::Finished);
-    assert_eq!((seen.complete, after.first_refused()), (Some(Duration::from_secs(10)), None));
+    assert_eq!(
+        (seen.complete, after.first_refused()),
+        (Some(Duration::from_secs(10)), None)
+    );
 
     // A logcopy that has begun after that finds nothing else.
     let tree = Arc::new(Tree::open(volume.folder.path()).unwrap());
@@ -186,7 +189,10 @@ fn a_checkpoint_that_its_agent_has_shut_is_the_agents() {
         *tree.disk.lock().unwrap() = Some(trouble);
         let (gathered, seen) = volume.round();
         let refused = gathered.first_refused().unwrap();
-        assert!(refused.why.starts_with("pair 1: the checkpoint can't be read: "), "{refused}");
+        assert!(
+            refused.why.starts_with("pair 1: the checkpoint can't be read: "),
+            "{refused}"
+        );
         assert_eq!(seen.spoiled, Some((refused, Duration::ZERO)), "{trouble}");
     }
 }

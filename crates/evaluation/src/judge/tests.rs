@@ -214,7 +214,11 @@ pub(super) mod seen_on_a_volume {
         for text in ["", "{\"_checkpoint\": {", "null"] {
             put_checkpoint(volume.folder.path(), 1, text);
             let (gathered, _) = volume.round();
-            assert_eq!((gathered.workers[0].done, gathered.first_refused()), (1, None), "{text:?}");
+            assert_eq!(
+                (gathered.workers[0].done, gathered.first_refused()),
+                (1, None),
+                "{text:?}"
+            );
         }
         fs::remove_file(volume.folder.path().join("agent/agent1/agent_results.json")).unwrap();
         assert_eq!(volume.round().0.workers[0].done, 1);

@@ -42,7 +42,11 @@ fn container(input: &JobInput<'_>, member: Member, role: &Role) -> Container {
     let hosts = input.spec().given(input.track(), part(member.side));
     let env = role.env.iter().map(|(name, value)| variable(name, value));
     let env = env.chain(gpu::variables(gpus, member)).collect();
-    let flags = role.flags.iter().cloned().chain(gpu::flags(gpus, member.side, role.draws));
+    let flags = role
+        .flags
+        .iter()
+        .cloned()
+        .chain(gpu::flags(gpus, member.side, role.draws));
     Container {
         image: Some(role.image.clone()),
         // Kubernetes asks for `latest` anew before each container: a worker, or a restart, could get another image.

@@ -7,12 +7,13 @@
 //! ```
 //!
 //! `cause` and `blame` decide whose fault a start or a crash was, `failure` makes it a sentence with its next step. `waits` has how long anything
-//! is waited for. All write into one `status`; `write` decides whether a changed one is worth a write, `plan` is the result.
+//! is waited for. All write into one `status`; `write` decides whether a changed one is worth a write, `events` has its events, and `plan` is the result.
 
 mod accept;
 mod blame;
 mod cause;
 mod end;
+mod events;
 mod failure;
 mod gates;
 mod leave;

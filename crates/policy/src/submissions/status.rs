@@ -5,8 +5,8 @@ use std::time::Duration;
 use jiff::Timestamp;
 use k8s_openapi::apimachinery::pkg::apis::meta::v1::Time;
 
+use super::events;
 use super::plan::{Action, Event, Plan, StatusWrite, job_name};
-use super::publish;
 use super::waits::Wait;
 use super::write::{self, Change};
 use crate::view::{EvalaiInfo, ObservedJob, ReportDemand, View};
@@ -16,15 +16,6 @@ use leaderboard_api::{
     State, Submission, SubmissionSpec, SubmissionStatus, effective, names,
 };
 use leaderboard_evaluation::{Words, words};
-
-/// Reasons that Kubernetes' own events, the event `Started` and the status show anyway: a write for each would cost every submission the same
-/// again.
-const WITHOUT_EVENT: [Reason; 4] = [
-    Reason::Preparing,
-    Reason::AskingEvalAI,
-    Reason::Running,
-    Reason::Resumed,
-];
 
 /// A plan in the making.
 pub(super) struct PlanBuilder<'a> {
@@ -460,8 +451,8 @@ impl<'a> PlanBuilder<'a> {
         if self.status.attempt.is_some() {
             self.status.state = Some(self.status.state_of_conditions());
             self.status.reason = self.status.reason.take().filter(|reason| !self.status.repeats(reason));
-            self.note_start();
-            self.note_transition();
+            let old = self.submission().status.as_ref();
+            self.events.extend(events::of_change(old, &self.status));
         }
         self.status.fit();
         Plan {
@@ -499,38 +490,6 @@ impl<'a> PlanBuilder<'a> {
         let has_succeeded = Truth::from(reason == Reason::Finished);
         self.condition(conditions::FINISHED, Truth::True, reason.clone(), message);
         self.condition(conditions::SUCCEEDED, has_succeeded, reason, "");
-    }
-
-    /// Publishes the start of the agents, of each Job once.
-    fn note_start(&mut self) {
-        let is_running = |status: &SubmissionStatus| status.is_true(conditions::RUNNING);
-        let was_running = self.submission().status.as_ref().is_some_and(is_running);
-        let Some(attempt) = self.status.attempt.filter(|_| is_running(&self.status) && !was_running) else {
-            return;
-        };
-        let node = self.status.node_name.as_ref().map(|node| format!(" on node {node}"));
-        let message = format!("The agents of attempt {attempt} run{}.", node.unwrap_or_default());
-        self.event(false, Reason::Started, message);
-    }
-
-    /// Publishes a changed state or reason, once. The event of a good end is that of its publication, where there is one.
-    fn note_transition(&mut self) {
-        let shown = |status: &SubmissionStatus| {
-            let awaits = status.state_of_conditions() == State::Finished && publish::is_awaited(status);
-            (status.state_of_conditions(), status.present_reason(), awaits)
-        };
-        let (state, reason, awaits) = shown(&self.status);
-        let old = self.submission().status.as_ref().map(shown);
-        let is_shown = old.is_some_and(|old| old == (state, reason.clone(), awaits));
-        let Some(reason) = reason.filter(|reason| !is_shown && !awaits && !reason.is_one_of(&WITHOUT_EVENT)) else {
-            return;
-        };
-        let message = self.status.message.clone();
-        let message = message.unwrap_or_else(|| state.as_str().into());
-        if state == State::Finished && self.status.is_true(conditions::PUBLISHED) {
-            return self.event(false, Reason::Published, format!("EvalAI has the result: {message}"));
-        }
-        self.event(state == State::Failed, reason, message);
     }
 }
 

@@ -78,7 +78,10 @@ fn a_failure_of_the_whole_run_is_explained_by_a_pair_that_was_not_done() {
 
     let refused = Report {
         is_final: true,
-        refused: Some(RefusedResults::new(Some(2), "pair 2, record 1: its score is no number.")),
+        refused: Some(RefusedResults::new(
+            Some(2),
+            "pair 2, record 1: its score is no number.",
+        )),
         ..report(1)
     };
     let mut world = World::local().running();

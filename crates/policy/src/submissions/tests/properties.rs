@@ -193,7 +193,12 @@ fn pod_view() -> impl Strategy<Value = PodView> {
 }
 
 fn observed_report() -> impl Strategy<Value = ObservedReport> {
-    let outcome = select(vec![Outcome::Finished, Outcome::Rejected, Outcome::Crashed, Outcome::Invalid]);
+    let outcome = select(vec![
+        Outcome::Finished,
+        Outcome::Rejected,
+        Outcome::Crashed,
+        Outcome::Invalid,
+    ]);
     let flags = (any::<bool>(), any::<bool>(), any::<bool>(), 0u32..6);
     let ours = (0u32..=4, flags, outcome).prop_map(|(done, (is_final, eligible, is_refused, crashes), outcome)| {
         let mut told = Report {

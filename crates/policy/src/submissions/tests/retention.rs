@@ -121,7 +121,9 @@ type Keeps = (&'static str, fn(&mut World));
 #[test]
 fn nothing_else_is_ever_deleted() {
     let cases: [Keeps; 7] = [
-        ("retention is off", |w| w.leaderboard().retention.finished_seconds = None),
+        ("retention is off", |w| {
+            w.leaderboard().retention.finished_seconds = None
+        }),
         ("its Leaderboard is gone", |w| w.view.leaderboard = None),
         ("a person deletes it", World::delete),
         ("its Job has not ended", |w| w.job().end = None),

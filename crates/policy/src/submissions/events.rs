@@ -1,0 +1,68 @@
+//! Events of a changed status. Each costs a write, so that a good run has two: `Started`, and the one of its end.
+//!
+//! Pure.
+
+use super::plan::Event;
+use super::publish;
+use leaderboard_api::conditions;
+use leaderboard_api::{Reason, ReasonName, State, SubmissionStatus};
+
+/// Reasons that Kubernetes' own events, the event `Started` and the status show anyway.
+const WITHOUT_EVENT: [Reason; 4] = [
+    Reason::Preparing,
+    Reason::AskingEvalAI,
+    Reason::Running,
+    Reason::Resumed,
+];
+
+/// Events of the step from a stored status to the next.
+pub(super) fn of_change(old: Option<&SubmissionStatus>, new: &SubmissionStatus) -> impl Iterator<Item = Event> {
+    [start(old, new), transition(old, new)].into_iter().flatten()
+}
+
+/// The start of the agents, of each Pod once.
+fn start(old: Option<&SubmissionStatus>, new: &SubmissionStatus) -> Option<Event> {
+    let is_running = |status: &SubmissionStatus| status.is_true(conditions::RUNNING);
+    if old.is_some_and(is_running) || !is_running(new) {
+        return None;
+    }
+    let node = new.node_name.as_ref().map(|node| format!(" on node {node}"));
+    let message = format!(
+        "The agents of attempt {} run{}.",
+        new.attempt?,
+        node.unwrap_or_default()
+    );
+    Some(event(false, Reason::Started, message))
+}
+
+/// A changed state or reason. The event of a good end is that of its publication, where there is one.
+fn transition(old: Option<&SubmissionStatus>, new: &SubmissionStatus) -> Option<Event> {
+    let shown = |status: &SubmissionStatus| {
+        let state = status.state_of_conditions();
+        let awaits = state == State::Finished && publish::is_awaited(status);
+        (state, status.present_reason(), awaits)
+    };
+    let (state, reason, awaits) = shown(new);
+    if awaits || old.map(shown) == Some((state, reason.clone(), awaits)) {
+        return None;
+    }
+    let reason = reason.filter(|reason| !reason.is_one_of(&WITHOUT_EVENT))?;
+    let message = new.message.as_deref().unwrap_or(state.as_str());
+    if state == State::Finished && new.is_true(conditions::PUBLISHED) {
+        return Some(event(
+            false,
+            Reason::Published,
+            format!("EvalAI has the result: {message}"),
+        ));
+    }
+    Some(event(state == State::Failed, reason, message.to_owned()))
+}
+
+fn event(warning: bool, reason: impl Into<ReasonName>, message: String) -> Event {
+    let reason = reason.into();
+    Event {
+        warning,
+        reason,
+        message,
+    }
+}
