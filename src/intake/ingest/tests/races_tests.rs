@@ -1,10 +1,103 @@
-//! More races on a mock API server, and requests that fail.
+//! Requests and races on a mock API server.
 
 use tracing::Instrument;
 
 use super::*;
 use crate::observability::logging::tests::Lines;
 use leaderboard_base::trace_id::TraceId;
+
+/// Answers each request in turn by `script`, and returns what was asked.
+async fn against(
+    script: Vec<(u16, Value)>,
+    incoming: Incoming,
+) -> (Result<Outcome, IngestError>, Vec<(String, Value)>) {
+    let (service, mut handle) =
+        tower_test::mock::pair::<http::Request<kube::client::Body>, http::Response<kube::client::Body>>();
+    let client = kube::Client::new(service, "ns");
+    let server = tokio::spawn(async move {
+        let mut asked = Vec::new();
+        for (code, body) in script {
+            let (request, send) = handle.next_request().await.unwrap();
+            let line = format!("{} {}", request.method(), request.uri().path());
+            let bytes = request.into_body().collect_bytes().await.unwrap();
+            asked.push((line, serde_json::from_slice(&bytes).unwrap_or(Value::Null)));
+            let body = serde_json::to_vec(&body).unwrap();
+            send.send_response(http::Response::builder().status(code).body(body.into()).unwrap());
+        }
+        asked
+    });
+    let api = Api::namespaced(client, "ns");
+    let outcome = apply(&api, BOARD, &incoming).await;
+    // Ends a script that was not asked for to its end.
+    drop(api);
+    (outcome, server.await.unwrap())
+}
+
+fn refusal(code: u16, reason: &str) -> (u16, Value) {
+    let body = json!({"kind": "Status", "apiVersion": "v1", "status": "Failure", "code": code, "reason": reason, "message": format!("{reason} indeed")});
+    (code, body)
+}
+
+fn object(submission: &Submission) -> (u16, Value) {
+    (200, serde_json::to_value(submission).unwrap())
+}
+
+const ALL: &str = "/apis/leaderboard.carla.org/v1alpha1/namespaces/ns/submissions";
+const ONE: &str = "/apis/leaderboard.carla.org/v1alpha1/namespaces/ns/submissions/submission-3";
+
+#[tokio::test]
+async fn a_new_one_costs_one_request() {
+    let first = message("a", 100);
+    let (outcome, asked) = against(vec![object(&made_by(&first))], first).await;
+    assert_eq!(outcome.unwrap(), Outcome::Created);
+    assert_eq!(asked[0].0, format!("POST {ALL}"));
+    assert_eq!(
+        asked[0].1["metadata"]["finalizers"],
+        json!([names::FINALIZER_SUBMISSION])
+    );
+}
+
+#[tokio::test]
+async fn of_two_replicas_at_once_the_second_finds_a_repeat() {
+    let first = message("a", 100);
+    let script = vec![refusal(409, "AlreadyExists"), object(&made_by(&first))];
+    let (outcome, asked) = against(script, first).await;
+    assert_eq!(outcome.unwrap(), Outcome::Repeat);
+    assert_eq!(asked[1].0, format!("GET {ONE}"));
+}
+
+#[tokio::test]
+async fn a_bump_is_one_patch_bound_to_what_was_read() {
+    let failed = with_state(made_by(&message("a", 100)), State::Failed);
+    let script = vec![refusal(409, "AlreadyExists"), object(&failed), object(&failed)];
+    let (outcome, asked) = against(script, message("b", 200)).await;
+    assert_eq!(outcome.unwrap(), Outcome::Bumped(Attempt(2)));
+    assert_eq!(asked[2].0, format!("PATCH {ONE}"));
+    let record = json!({"message": "b", "sent": 200, "attempt": 2}).to_string();
+    let want = json!({
+        "metadata": {"resourceVersion": "10", "annotations": {names::ANNOTATION_INGESTED: record}},
+        "spec": {"attempt": 2, "cancel": false},
+    });
+    assert_eq!(asked[2].1, want);
+}
+
+#[tokio::test]
+async fn a_refusal_is_noted_and_changes_no_attempt() {
+    let failed = with_state(made_by(&message("a", 100_000)), State::Failed);
+    let script = vec![refusal(409, "AlreadyExists"), object(&failed), object(&failed)];
+    let (outcome, asked) = against(script, sweep(300_000)).await;
+    assert_eq!(outcome.unwrap(), Outcome::Refused);
+    let record =
+        json!({"message": "a", "sent": 100_000, "attempt": 1, "refused": {"attempt": 2, "at": 300_000}}).to_string();
+    let want = json!({
+        "metadata": {"resourceVersion": "10", "annotations": {names::ANNOTATION_INGESTED: record}},
+        "spec": {},
+    });
+    assert_eq!(
+        (asked[2].0.as_str(), &asked[2].1),
+        (format!("PATCH {ONE}").as_str(), &want)
+    );
+}
 
 #[tokio::test]
 async fn the_sweep_leaves_a_hosts_cancel_as_it_is() {
