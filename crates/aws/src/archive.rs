@@ -63,7 +63,7 @@ pub enum Fetched {
     Found(Object),
 }
 
-/// What has to be there for an object to be stored in its place.
+/// Condition under which an object is stored in a place.
 #[derive(Clone, Debug, PartialEq, Eq)]
 enum Before {
     /// No object.
@@ -115,7 +115,7 @@ impl Archive {
         &self.bucket
     }
 
-    /// The same bucket by the same client, below another prefix.
+    /// This bucket by this client, below another prefix.
     #[must_use]
     pub fn at_prefix(&self, prefix: impl Into<String>) -> Self {
         Self {
@@ -255,7 +255,7 @@ impl Archive {
         }))
     }
 
-    /// What lies below `folder` (empty: everything), at most `limit` objects.
+    /// Lists `folder` (empty: everything), at most `limit` objects.
     pub async fn list(&self, folder: &str, limit: usize) -> Result<Listing, ArchiveError> {
         let mut objects = Vec::new();
         let mut next = None;
@@ -282,7 +282,7 @@ impl Archive {
         }
     }
 
-    /// Whether nothing lies below the prefix.
+    /// True if nothing lies below the prefix.
     pub async fn prefix_is_empty(&self) -> Result<bool, ArchiveError> {
         Ok(self.list("", 1).await?.objects.is_empty())
     }

@@ -88,13 +88,13 @@ impl Aws {
         }
     }
 
-    /// The same way, whose calls are counted.
+    /// This way, with its calls counted.
     #[must_use]
     pub fn counted_by(self, meter: Meter) -> Self {
         Self { meter, ..self }
     }
 
-    /// Who counts the calls.
+    /// Meter of the calls.
     pub fn meter(&self) -> &Meter {
         &self.meter
     }

@@ -1,4 +1,4 @@
-//! What a failed AWS call means: whether a person has to act, and a sentence for people.
+//! Meaning of a failed AWS call: whether a person has to act, and a sentence for people.
 //!
 //! Called by everything that talks to AWS. Knows no service: error codes and HTTP statuses only.
 
@@ -25,7 +25,7 @@ pub enum Fault {
 }
 
 impl Fault {
-    /// Whether the same request may succeed later, though nobody acts.
+    /// True if the same request may succeed later by itself.
     pub fn is_passing(self) -> bool {
         matches!(self, Self::Throttled | Self::Unavailable | Self::Conflict)
     }

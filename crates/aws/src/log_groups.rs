@@ -20,9 +20,9 @@ use leaderboard_base::meter::Meter;
 pub struct LogGroupError {
     /// Its name.
     pub name: String,
-    /// What was asked of CloudWatch Logs.
+    /// Operation of CloudWatch Logs.
     pub action: &'static str,
-    /// What kind of failure.
+    /// Kind of failure.
     pub fault: Fault,
     /// Its message.
     pub text: String,

@@ -15,7 +15,7 @@ use leaderboard_api::LogGroup;
 const MAX_EVENTS: usize = 10_000;
 /// Bytes of one request, each event counted with its overhead.
 pub const MAX_BYTES: usize = 1 << 20;
-/// What each event costs beyond its text.
+/// Bytes that each event costs beyond its text.
 pub const OVERHEAD: usize = 26;
 /// Bytes of one event's text.
 pub const MAX_TEXT: usize = (256 << 10) - OVERHEAD;
@@ -40,7 +40,7 @@ pub struct LogEvent {
 #[derive(thiserror::Error, Debug)]
 #[error("{op} {group}/{stream} in CloudWatch Logs: {}", .miss.after(.why))]
 pub struct LogsError {
-    /// What was done.
+    /// Operation, as a verb.
     op: &'static str,
     /// The group.
     group: String,
@@ -48,11 +48,11 @@ pub struct LogsError {
     stream: String,
     /// Its message, or the client's.
     why: String,
-    /// What that means for the events.
+    /// Consequence for the events.
     pub miss: Miss,
 }
 
-/// What a failed request means for its events.
+/// Consequence of a failed request for its events.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 pub enum Miss {
     /// They are refused.
@@ -80,7 +80,7 @@ const HINT: &str = "Check that logs.cloudWatch of the leaderboard exists (the co
                     results do not depend on it.";
 
 impl LogsError {
-    /// Whether the same request may succeed in a moment.
+    /// True if the same request may succeed in a moment.
     pub fn is_transient(&self) -> bool {
         matches!(self.miss, Miss::Throttled | Miss::Unanswered)
     }

@@ -8,7 +8,7 @@ use aws_sdk_sqs::error::{ProvideErrorMetadata, SdkError};
 use super::fault;
 use leaderboard_base::meter::Meter;
 
-/// What a [`Meter`] does for clients of AWS.
+/// Clients of AWS whose calls a [`Meter`] counts.
 pub trait Metered {
     /// Counts a call of AWS.
     fn aws<T, E>(

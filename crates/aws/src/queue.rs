@@ -1,4 +1,4 @@
-//! Whether an SQS queue exists, and how much of it is in flight. Called by the controller's checks of a Leaderboard; messages are the
+//! An SQS queue: that it exists, and how much of it is in flight. Called by the controller's checks of a Leaderboard; messages are the
 //! bridge's alone.
 
 use std::collections::HashMap;
@@ -16,7 +16,7 @@ use leaderboard_api as api;
 pub struct QueueError {
     /// Its URL.
     pub url: String,
-    /// What kind of failure.
+    /// Kind of failure.
     pub fault: Fault,
     /// SQS's message.
     pub text: String,
@@ -39,7 +39,7 @@ impl QueueError {
     }
 }
 
-/// What SQS shows of a queue. Its numbers are approximate, and up to a minute old.
+/// A queue as SQS shows it. Its numbers are approximate, and up to a minute old.
 #[derive(Clone, Debug, Default, PartialEq, Eq)]
 pub struct Reading {
     /// Messages that a receive would get.

@@ -37,7 +37,7 @@ const ENDS: [&str; 3] = ["FINISHED", "FAILED", "CANCELLED"];
 /// A row is written only over an older attempt, or over the same one before its end.
 const CONDITION: &str = "attribute_not_exists(#attempt) OR #attempt < :attempt \
      OR (#attempt = :attempt AND NOT (#status IN (:end0, :end1, :end2)))";
-/// What a cancelled submission's row shows.
+/// Status in a cancelled submission's row.
 const CANCELLED: &str = ENDS[2];
 /// A cancel that EvalAI shows after it has refused a result is written over the end that the row had. Nothing leads back from it.
 const OR_CANCELLED: &str = " OR (#attempt = :attempt AND #status IN (:end0, :end1))";
@@ -104,7 +104,7 @@ impl Row {
     }
 }
 
-/// What must hold of the row that is there.
+/// Condition on the row that is there.
 fn condition(row: &Row) -> String {
     let is_cancelled = row.submission_status == CANCELLED;
     let or_cancelled = if is_cancelled { OR_CANCELLED } else { "" };
@@ -114,7 +114,7 @@ fn condition(row: &Row) -> String {
 /// Columns and their values; those without one are removed.
 type Columns<'a> = BTreeMap<&'a str, Option<&'a str>>;
 
-/// What became of a write.
+/// Outcome of a write.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 pub enum Written {
     /// The row is stored, now or by an earlier try.

@@ -1,4 +1,4 @@
-//! What an answer of EvalAI means: done, refused, broken, throttled, or none at all; and its error as one sentence.
+//! Meaning of an answer of EvalAI: done, refused, broken, throttled, or none at all; and its error as one sentence.
 //!
 //! Called by `client`, read by `queue`. Pure.
 
@@ -34,7 +34,7 @@ pub enum Answer<T> {
 /// A refusal.
 #[derive(Clone, Debug, PartialEq, Eq)]
 pub struct Refusal {
-    /// What it is about.
+    /// Its object.
     pub about: About,
     /// HTTP status code.
     pub status: u16,
@@ -43,13 +43,13 @@ pub struct Refusal {
 }
 
 impl Refusal {
-    /// Of one submission, to a host of the challenge whose queue named it: EvalAI says that only of another challenge's.
+    /// True for the answer about one submission that EvalAI gives a host of the challenge only where the submission is another challenge's.
     pub fn is_of_another_challenge(&self) -> bool {
         self.about == About::Request && self.status == 401 && self.message.contains(NOT_AUTHORIZED)
     }
 }
 
-/// What a refusal is about.
+/// Object of a refusal.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 pub enum About {
     /// The token: every request would be refused.
@@ -95,7 +95,7 @@ impl<T> Answer<T> {
         }
     }
 
-    /// The same end with another content.
+    /// This end with another content.
     pub fn and_then<U>(self, f: impl FnOnce(T) -> Answer<U>) -> Answer<U> {
         match self {
             Self::Done(content) => f(content),
@@ -106,7 +106,7 @@ impl<T> Answer<T> {
         }
     }
 
-    /// The same answer to a request that every host of a challenge may make, and that is about nothing else: EvalAI refuses
+    /// This answer to a request that every host of a challenge may make, and that is about nothing else: EvalAI refuses
     /// others with another text, with status 400 or 401. Of one submission the same text may mean another challenge's.
     pub(super) fn of_hosts(self) -> Self {
         match self {
@@ -227,7 +227,7 @@ fn sentence(status: u16, body: &Body) -> String {
     format!("EvalAI answered {status}: {text}{next}")
 }
 
-/// What helps, where EvalAI's own text misleads or is empty.
+/// Next step, where EvalAI's own text misleads or is empty.
 fn next_step(status: u16, body: &Body) -> Option<&'static str> {
     let has = |part: &str| body.text().contains(part);
     match body.about(status) {

@@ -71,7 +71,7 @@ impl Client {
         })
     }
 
-    /// The same client, whose requests are counted.
+    /// This client, with its requests counted.
     #[must_use]
     pub fn counted_by(self, meter: Meter) -> Self {
         Self { meter, ..self }

@@ -66,7 +66,7 @@ impl Files {
         )))
     }
 
-    /// What reads this address; an error if nothing may.
+    /// Client that may read this address; an error if none may.
     fn client(&self, url: &Url) -> Result<&reqwest::Client, Answer<ImageAnswer>> {
         if !["http", "https"].contains(&url.scheme()) {
             return Err(refused("the address of the uploaded file is neither http nor https"));

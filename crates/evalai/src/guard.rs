@@ -1,4 +1,4 @@
-//! What may be started, written or ended, given what EvalAI shows: the server itself enforces nothing.
+//! Verdicts on starts, writes and ends, given what EvalAI shows: the server itself enforces nothing.
 //!
 //! Called by `queue` with each read. Pure: a status in, a verdict out.
 //!
@@ -26,7 +26,7 @@ pub struct Attempt {
     pub under_way: bool,
 }
 
-/// Whether an attempt may run.
+/// Verdict on the start of an attempt.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 pub enum Start {
     /// It may.
@@ -37,7 +37,7 @@ pub enum Start {
     Unclear,
 }
 
-/// What becomes of an update to `queued`, `running` or partial results.
+/// Verdict on an update to `queued`, `running` or partial results.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 pub enum Interim {
     /// Write.
@@ -50,7 +50,7 @@ pub enum Interim {
     Ended(Status),
 }
 
-/// What becomes of an update to the end.
+/// Verdict on an update to the end.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 pub enum End {
     /// Write.
@@ -65,7 +65,7 @@ pub enum End {
     Wait,
 }
 
-/// Whether this attempt may run.
+/// Judges the start of this attempt.
 pub fn start(status: Status, attempt: Attempt) -> Start {
     match standing(status, attempt) {
         Status::Unknown => Start::Unclear,
@@ -76,7 +76,7 @@ pub fn start(status: Status, attempt: Attempt) -> Start {
     }
 }
 
-/// Whether `queued` or `running` is written. `is_known`: EvalAI has stored this attempt. Before that, a later attempt writes even over
+/// Judges an update to `queued` or `running`. `is_known`: EvalAI has stored this attempt. Before that, a later attempt writes even over
 /// `running`, which an earlier one has written.
 pub fn progress(status: Status, attempt: Attempt, is_known: bool, wanted: Progress) -> Interim {
     match start(status, attempt) {
@@ -87,7 +87,7 @@ pub fn progress(status: Status, attempt: Attempt, is_known: bool, wanted: Progre
     }
 }
 
-/// Whether partial results are written. An earlier attempt's end is first overwritten by `queued` or `running`.
+/// Judges partial results. An earlier attempt's end is first overwritten by `queued` or `running`.
 pub fn partial(status: Status, attempt: Attempt) -> Interim {
     match start(status, attempt) {
         Start::Drop(status) => Interim::Ended(status),
@@ -97,7 +97,7 @@ pub fn partial(status: Status, attempt: Attempt) -> Interim {
     }
 }
 
-/// Whether the end is written.
+/// Judges the update to the end.
 pub fn end(status: Status, attempt: Attempt, wanted: Outcome) -> End {
     match (standing(status, attempt), wanted) {
         (Status::Unknown, _) => End::Wait,

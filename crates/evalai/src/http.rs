@@ -1,4 +1,4 @@
-//! What every connection to EvalAI and to participants' files has in common: its limits, and how its errors are classified.
+//! Connections to EvalAI and to participants' files: their limits, and the classes of their errors.
 
 use std::time::Duration;
 
@@ -31,7 +31,7 @@ impl Default for Timeouts {
 #[error("no HTTP client could be made: {0}; check the machine's trusted certificates")]
 pub struct ClientError(String);
 
-/// What all clients have in common.
+/// Builder with the settings of all clients.
 pub(super) fn builder(timeouts: Timeouts) -> reqwest::ClientBuilder {
     // A program that has installed one already keeps it.
     let _ = rustls::crypto::ring::default_provider().install_default();
@@ -50,7 +50,7 @@ pub(super) fn made(builder: reqwest::ClientBuilder) -> Result<reqwest::Client, C
         .map_err(|e| ClientError(leaderboard_api::text::chain(&e)))
 }
 
-/// What of an answer is worth something.
+/// Part of an answer that is needed.
 #[derive(Clone, Copy, PartialEq, Eq)]
 pub(super) enum Need {
     /// A read is nothing without its body.
@@ -112,7 +112,7 @@ pub(super) fn silence(error: reqwest::Error) -> Silence {
     }
 }
 
-/// Whether the connection was closed before a byte of the request was sent on it.
+/// True if the connection was closed before a byte of the request was sent on it.
 pub(super) fn is_canceled(error: &(dyn std::error::Error + 'static)) -> bool {
     let mut causes = std::iter::successors(Some(error), |error| error.source());
     causes.any(|cause| {

@@ -26,7 +26,7 @@ use leaderboard_base::lock::lock;
 use leaderboard_base::meter::Meter;
 use leaderboard_base::tasks::Tasks;
 
-/// What a hub needs.
+/// Surroundings of a hub.
 pub struct Options {
     pub write_guard: Arc<dyn WriteGuard>,
     /// Reads what a bucket holds of a result.
@@ -47,7 +47,7 @@ pub struct Options {
 
 #[cfg(any(test, feature = "fixtures"))]
 impl Options {
-    /// Those of a hub to whose news nobody listens.
+    /// Options of a hub without a listener to its news.
     pub fn unheard(tasks: &Tasks, write_guard: impl WriteGuard) -> Self {
         Self {
             write_guard: Arc::new(write_guard),
@@ -254,7 +254,7 @@ impl Hub {
         });
     }
 
-    /// What is known of a submission.
+    /// State of a submission, as far as it is known.
     pub fn view(&self, key: &Key) -> Option<SubmissionState> {
         self.place(key)?.queue().view(key)
     }
@@ -265,7 +265,7 @@ impl Hub {
             .map_or((None, None), |shared| shared.queue().labels(leaderboard))
     }
 
-    /// Whether partial results are on the leaderboards of a phase; no as long as that is not known.
+    /// True if partial results are on the leaderboards of a phase; false as long as that is not known.
     pub fn shows_partial(&self, leaderboard: &Key, phase: i64) -> bool {
         self.place(leaderboard)
             .is_some_and(|shared| shared.queue().shows_partial(leaderboard, phase))

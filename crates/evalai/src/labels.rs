@@ -1,4 +1,4 @@
-//! Whether a Leaderboard fits its challenge: phases, splits and metrics.
+//! Comparison of a Leaderboard with its challenge: phases, splits and metrics.
 //!
 //! Called by `hub` with what `queue` has read. Pure.
 
@@ -10,7 +10,7 @@ use super::row::{Phase, Split};
 use super::types::Target;
 use leaderboard_api::{Order, Ranking};
 
-/// What EvalAI shows of a challenge.
+/// A challenge as EvalAI shows it.
 #[derive(Clone, Debug, PartialEq)]
 pub struct Catalog {
     /// When it was read.
@@ -30,14 +30,14 @@ pub struct Catalog {
 pub struct Labels {
     /// When EvalAI was read.
     pub at: Timestamp,
-    /// What does not fit.
+    /// Differences, in the order in which they were found.
     pub problems: Vec<Misfit>,
     /// How each phase ranks, where its leaderboard names a metric.
     pub rankings: BTreeMap<i64, Ranking>,
 }
 
 impl Labels {
-    /// Whether results can be published.
+    /// True if results can be published.
     pub fn ok(&self) -> bool {
         self.problems.iter().all(|problem| !problem.prevents())
     }
@@ -61,7 +61,7 @@ pub enum Misfit {
 }
 
 impl Misfit {
-    /// Whether it keeps results from being published.
+    /// True if it keeps results from being published.
     fn prevents(&self) -> bool {
         !matches!(self, Self::Unsent { .. })
     }

@@ -1,4 +1,4 @@
-//! What is about to be sent: results name the split of their Leaderboard, and are checked, because the server's own checks are
+//! Results before they are sent: they name the split of their Leaderboard, and are checked, because the server's own checks are
 //! incomplete: it takes results without metrics, and results for the leaderboard of a foreign phase.
 //!
 //! Called by `queue`. Pure.
@@ -15,7 +15,7 @@ struct Entry {
     accuracies: Map<String, Value>,
 }
 
-/// The same results for this split. A Pod does not know it: what it stores names the original's, in S3 for good.
+/// Results for this split. A Pod does not know it: what it stores names the original's, in S3 for good.
 pub fn for_split(payload: Payload, split: &str) -> Payload {
     let result = named(&payload.result, split).unwrap_or(payload.result);
     Payload { result, ..payload }

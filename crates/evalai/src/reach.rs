@@ -49,7 +49,7 @@ impl Reach {
             .dns_resolver(Arc::new(Resolver { reach: self, proxies }))
     }
 
-    /// Whether an address in a URL may be connected to. A name is judged when it is looked up.
+    /// Refuses an address in a URL that may not be connected to. A name is judged when it is looked up.
     pub fn check(self, url: &Url) -> Result<(), NotPublic> {
         let host = url.host_str().unwrap_or_default();
         let address = host.trim_start_matches('[').trim_end_matches(']').parse();
@@ -63,7 +63,7 @@ impl Reach {
     }
 }
 
-/// Whether a request has failed because of where it would have gone.
+/// Refused address, if a request has failed because of where it would have gone.
 pub fn cause(error: &reqwest::Error) -> Option<&NotPublic> {
     std::iter::successors(error.source(), |error| (*error).source()).find_map(|cause| cause.downcast_ref())
 }

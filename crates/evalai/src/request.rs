@@ -23,7 +23,7 @@ pub struct SubmissionRef {
     pub log: LogSpan,
 }
 
-/// What a list is asked for.
+/// Purpose of a list.
 #[derive(Clone, Copy, Debug, PartialEq, Eq, PartialOrd, Ord, Hash)]
 pub enum Purpose {
     /// `cancelled`: whose runs are to stop.
@@ -73,12 +73,12 @@ pub enum Request {
 }
 
 impl Request {
-    /// Whether it changes anything.
+    /// True if it changes anything.
     pub fn is_write(&self) -> bool {
         matches!(self, Self::Progress(..) | Self::Partial(..) | Self::Final(..))
     }
 
-    /// Whether the server counts it.
+    /// True if the server counts it.
     pub fn counts(&self) -> bool {
         !matches!(self, Self::Image(..))
     }

@@ -1,4 +1,4 @@
-//! What EvalAI shows of a submission, a phase and a split, parsed at the edge.
+//! Submissions, phases and splits as EvalAI shows them, parsed at the edge.
 //!
 //! Called by `client`. Pure. Only an id and a status are required: a field that changes its form must not blind us to
 //! a cancellation.
@@ -59,7 +59,7 @@ impl Row {
         self.resumed_at.or(self.submitted_at)
     }
 
-    /// Whether this Job was ever named to EvalAI.
+    /// True if this Job was ever named to EvalAI.
     pub fn names(&self, job: &str) -> bool {
         let job = job.to_lowercase();
         self.jobs.contains(&job)
@@ -207,7 +207,7 @@ pub struct Received {
     /// Its text, as JSON.
     #[serde(default)]
     pub body: Value,
-    /// What deletes it.
+    /// Handle that deletes it.
     #[serde(default)]
     pub receipt_handle: Option<String>,
 }

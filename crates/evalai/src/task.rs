@@ -22,7 +22,7 @@ use leaderboard_base::lock::lock;
 /// How long answers are waited for at the end: longer than a write may take.
 const DRAIN: Duration = Duration::from_secs(70);
 
-/// What the hub and the task of one token share.
+/// State that the hub and the task of one token share.
 pub(super) struct Shared {
     queue: Mutex<Queue>,
     token: Arc<Token>,
@@ -30,7 +30,7 @@ pub(super) struct Shared {
     pub notify: Notify,
     /// The queue's time counts from here.
     start: Instant,
-    /// Who waits for the answers to requests that the queue makes for others, by their number.
+    /// Waiters for the answers to requests that the queue makes for others, by their number.
     waiters: Mutex<HashMap<u64, oneshot::Sender<Reply>>>,
 }
 
@@ -125,7 +125,7 @@ impl Payloads {
     }
 }
 
-/// What a task works with.
+/// Parts of a task.
 pub(super) struct Task {
     pub shared: Arc<Shared>,
     pub client: Client,

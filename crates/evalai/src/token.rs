@@ -108,7 +108,7 @@ impl Token {
         self.expires
     }
 
-    /// Whether it ends within [`WARN_BEFORE`], or has ended.
+    /// True if it ends within [`WARN_BEFORE`], or has ended.
     pub fn ends_soon(&self, now: Timestamp) -> bool {
         self.expires.is_some_and(|at| at.duration_since(now) <= WARN_BEFORE)
     }

@@ -1,4 +1,4 @@
-//! What the controller hands in, and what it gets back.
+//! Types that the controller hands in, and that it gets back.
 //!
 //! Pure. A [`Key`] names the object that is woken, a [`Run`] the attempt that an update is about.
 
@@ -104,7 +104,7 @@ pub struct Run {
     pub log: LogSpan,
 }
 
-/// What EvalAI is to show.
+/// Status that EvalAI is to show.
 #[derive(Clone, Debug)]
 pub enum DesiredUpdate {
     /// The run waits for its Pod.
@@ -117,7 +117,7 @@ pub enum DesiredUpdate {
     Final(Outcome, Arc<Outline>),
 }
 
-/// What a result or an end is sent with, but for what the bucket holds: that is read right before.
+/// Content of a result or an end, but for what the bucket holds: that is read right before.
 #[derive(Clone, Debug, Default, PartialEq, Eq)]
 pub struct Outline {
     /// Phase whose leaderboard gets the results.
@@ -180,14 +180,14 @@ impl Payload {
 pub enum PayloadProblem {
     /// The bucket does not give it out.
     Unread(String),
-    /// What is stored is not what the report names, or another report: the Pod ended between the two, or goes on.
+    /// The bucket holds another content than the report names, or another report: the Pod ended between the two, or goes on.
     Unfit(String),
 }
 
 /// Reads what an outline lacks.
 pub type PayloadReader = Arc<dyn Fn(Arc<Outline>) -> BoxFuture<'static, Result<Payload, PayloadProblem>> + Send + Sync>;
 
-/// What is known of a submission in EvalAI. Memory only.
+/// State of a submission in EvalAI, as far as it is known. Memory only.
 #[derive(Clone, Debug, Default, PartialEq)]
 pub struct SubmissionState {
     /// Its row, as last read.
@@ -196,7 +196,7 @@ pub struct SubmissionState {
     pub read_at: Option<Timestamp>,
     /// The newest attempt whose `ask` the row answers.
     pub answered: Option<Attempt>,
-    /// What the uploaded file names as the image; none before it was asked for and answered.
+    /// Image that the uploaded file names; none before it was asked for and answered.
     pub image: Option<ImageAnswer>,
     /// The attempt that all below is about.
     pub attempt: Attempt,
@@ -207,7 +207,7 @@ pub struct SubmissionState {
     /// EvalAI may yet show another status: a write of ours was under way when it was ended there and may have undone that, or it was
     /// deleted, which ends nothing there.
     pub overtaken: bool,
-    /// What became of the update to an end.
+    /// Outcome of the update to an end.
     pub end: Option<Ended>,
     /// When partial results were last taken.
     pub partial_at: Option<Timestamp>,
@@ -221,7 +221,7 @@ pub struct SubmissionState {
     pub unanswered_until: Option<Timestamp>,
 }
 
-/// What the uploaded file names as the image.
+/// Image that the uploaded file names, or why it names none.
 #[derive(Clone, Debug, PartialEq, Eq)]
 pub enum ImageAnswer {
     /// It names this one.
@@ -232,7 +232,7 @@ pub enum ImageAnswer {
     Unread(String),
 }
 
-/// What became of an update to an end.
+/// Outcome of an update to an end.
 #[derive(Clone, Debug, PartialEq, Eq)]
 pub enum Ended {
     /// EvalAI has taken it.
@@ -259,7 +259,7 @@ pub struct Usage {
     pub last_expected: Option<Timestamp>,
 }
 
-/// What has changed, to wake its object.
+/// A change, by the object that it wakes.
 #[derive(Clone, Debug, PartialEq, Eq, PartialOrd, Ord)]
 pub enum Changed {
     /// The view of a Submission.
@@ -268,7 +268,7 @@ pub enum Changed {
     Leaderboard(Key),
 }
 
-/// What kind of run a swept row asks for. Its participant can edit all of it but when it was submitted.
+/// Kind of run that a swept row asks for. Its participant can edit all of it but when it was submitted.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 pub enum Swept {
     /// `submitted`, and nothing of it was ever run.

@@ -1,4 +1,4 @@
-//! What goes wrong with S3, in words for the person who runs the bucket.
+//! Errors of S3, in words for the person who runs the bucket.
 
 use std::borrow::Cow;
 
@@ -13,7 +13,7 @@ type HttpResponse = aws_sdk_s3::config::http::HttpResponse;
 #[derive(thiserror::Error, Debug)]
 #[error("{op} s3://{object}: {cause}. {}", .cause.next_step())]
 pub struct ArchiveError {
-    /// What was done.
+    /// Operation, as a verb.
     pub op: &'static str,
     /// Bucket and key.
     pub object: String,
@@ -57,14 +57,14 @@ pub enum Cause {
 }
 
 impl ArchiveError {
-    /// Whether there is more than was to be read.
+    /// True if there is more than was to be read.
     pub fn is_too_large(&self) -> bool {
         matches!(self.cause, Cause::TooLarge(_))
     }
 }
 
 impl Cause {
-    /// What to do about it, as one sentence.
+    /// Next step, as one sentence.
     pub fn next_step(&self) -> Cow<'static, str> {
         let step = match self {
             Self::Denied(_) => {
@@ -94,12 +94,12 @@ impl Cause {
         Cow::Borrowed(step)
     }
 
-    /// Whether the same request may succeed later.
+    /// True if the same request may succeed later.
     pub fn is_transient(&self) -> bool {
         matches!(self, Self::Away(_))
     }
 
-    /// What the SDK's error means.
+    /// Cause of an error of the SDK.
     pub(super) fn of<E>(error: &SdkError<E, HttpResponse>) -> Self
     where
         E: ProvideErrorMetadata + std::error::Error + 'static,

@@ -1,4 +1,4 @@
-//! What a list of S3 shows.
+//! Lists of S3.
 
 use aws_sdk_s3::primitives::DateTime;
 use jiff::Timestamp;
@@ -16,7 +16,7 @@ pub struct Listed {
     pub stored: Option<Timestamp>,
 }
 
-/// What lies below a prefix.
+/// Objects below a prefix.
 #[derive(Clone, Debug, PartialEq, Eq)]
 pub struct Listing {
     /// In the order of their keys.

@@ -16,7 +16,7 @@ use super::{Archive, ArchiveError, Cause, Kept, Part, parts};
 
 /// Time S3 may take for copying a part or joining them.
 const LONG_TRY: Duration = Duration::from_mins(5);
-/// What stays as it is in `x-amz-copy-source`.
+/// Characters that stay as they are in `x-amz-copy-source`.
 const PLAIN: &AsciiSet = &NON_ALPHANUMERIC
     .remove(b'-')
     .remove(b'_')

@@ -12,7 +12,7 @@ const START: &str = "start_time";
 /// Column with the time of the submission.
 const SUBMITTED: &str = "submitted_time";
 
-/// What the row of a submission shows.
+/// Row of a submission.
 #[derive(Clone, Debug, Default, PartialEq, Eq)]
 pub struct ObservedRow {
     /// As it is stored: anyone who may write to the table may have put any text there.

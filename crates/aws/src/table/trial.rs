@@ -1,4 +1,4 @@
-//! Whether a table would take a row: asked by an update whose condition never holds, so that nothing is written.
+//! Trial of a table's rights: an update whose condition never holds, so that nothing is written.
 
 use aws_sdk_dynamodb::operation::update_item::UpdateItemError;
 

@@ -1,4 +1,4 @@
-//! What an answer about one submission changes.
+//! Changes of the queue by an answer about one submission.
 //!
 //! Owned by `queue`; what concerns a whole challenge is in `lists`. Pure.
 
@@ -58,7 +58,7 @@ impl Queue {
         }
     }
 
-    /// What every answer shows about the token.
+    /// Notes the part of every answer that is about the token.
     fn note(&mut self, answer: &Answer<()>, now: &Now) {
         match answer {
             Answer::Throttled(wait) => self.share.budget(|budget| budget.close_until(now.at + *wait)),

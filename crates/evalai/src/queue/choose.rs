@@ -43,7 +43,7 @@ enum Class {
 }
 
 impl Class {
-    /// Of the read that a write follows.
+    /// Place of the read that a write follows.
     fn of(write: Write) -> Self {
         match write {
             Write::End => Self::End,
@@ -77,7 +77,7 @@ enum What<'a> {
     Payload(&'a Key),
     List(i64, Purpose),
     Check(i64),
-    /// What others wait for.
+    /// A request that others wait for.
     Passing,
 }
 
@@ -202,7 +202,7 @@ impl Queue {
             .max(interval.saturating_mul(live.saturating_mul(REFRESH_SHARE)))
     }
 
-    /// What a submission waits for. One read serves all that wants one, at the first place of these.
+    /// Requests that a submission waits for. One read serves all that wants one, at the first place of these.
     fn offers_of<'a>(
         &self,
         key: &'a Key,

@@ -17,7 +17,7 @@ use crate::types::{Changed, Key, SweepRow, Swept};
 use leaderboard_api::evalai_status::Status;
 use leaderboard_api::names;
 
-/// What the sweep has found is not handed out again for so long.
+/// Time during which a find of the sweep is not handed out again.
 const SWEPT_FOR: Duration = Duration::from_mins(10);
 /// Before a failed check is retried.
 const RETRY_CHECK: Duration = Duration::from_mins(1);
@@ -25,7 +25,7 @@ const RETRY_CHECK: Duration = Duration::from_mins(1);
 /// How far before its Leaderboard a re-run or resumed submission may first have been submitted: it keeps that time.
 const SWEEP_REACH: SignedDuration = SignedDuration::from_hours(180 * 24);
 
-/// What kind of run a row asks for. EvalAI makes a re-run's row by copying the old one: it keeps the Jobs of the old one's id,
+/// Kind of run that a row asks for. EvalAI makes a re-run's row by copying the old one: it keeps the Jobs of the old one's id,
 /// when that was submitted and when it ended.
 fn kind_of(row: &Row, since: Timestamp) -> Swept {
     let own = format!("{}-", names::submission(row.id));

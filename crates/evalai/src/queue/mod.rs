@@ -1,7 +1,7 @@
-//! What one token is to ask and to write, and in which order: all of it as a state machine without network and clock.
+//! Requests of one token, and their order: all of it as a state machine without network and clock.
 //!
 //! `hub` puts updates in, `task` takes requests out ([`Queue::next`]) and brings their answers back ([`Queue::answered`]).
-//! What holds for every request:
+//! Each request has:
 //!
 //! - the budget of the token's user, and the one order of [`choose`];
 //! - one request in flight for a submission, whatever it is, and [`MAX_IN_FLIGHT`] in all;
@@ -46,7 +46,7 @@ use leaderboard_api::evalai_status::{Outcome, Progress};
 const MAX_IN_FLIGHT: usize = 4;
 /// A read for each, and the write that follows it, and in between a list of cancelled submissions.
 const REQUESTS_OF_FOUR_ENDS: u32 = 9;
-/// Of so many requests one at most is a list of cancelled submissions, which may go before most others: a write takes two, and
+/// Requests among which one at most is a list of cancelled submissions, which may go before most others: a write takes two, and
 /// would never get them if a short period asked for each.
 const LIST_SHARE: u32 = 3;
 
@@ -91,7 +91,7 @@ impl Default for Timing {
     }
 }
 
-/// What to do next.
+/// Next step of the task.
 #[derive(Debug)]
 pub enum Next {
     /// Send this, and hand it back with its answer.
@@ -213,7 +213,7 @@ impl Queue {
         }
     }
 
-    /// Whether a write was not answered and the server may still be working on it.
+    /// True if a write was not answered and the server may still be working on it.
     pub fn is_unsure(&self, now: Now) -> bool {
         self.settled_at(now).is_some()
     }
@@ -317,12 +317,12 @@ impl Queue {
         }
     }
 
-    /// What is known of a submission.
+    /// State of a submission, as far as it is known.
     pub fn view(&self, key: &Key) -> Option<SubmissionState> {
         self.subs.get(key).map(|sub| sub.view.clone())
     }
 
-    /// Whether partial results are on the leaderboards of a phase.
+    /// True if partial results are on the leaderboards of a phase.
     pub fn shows_partial(&self, leaderboard: &Key, phase: i64) -> bool {
         let check = self
             .served
@@ -397,7 +397,7 @@ impl Queue {
         std::mem::take(&mut self.changes)
     }
 
-    /// What the sweep has found.
+    /// Takes the finds of the sweep.
     pub fn take_sweep(&mut self) -> Vec<SweepRow> {
         std::mem::take(&mut self.sweep)
     }

@@ -47,7 +47,7 @@ impl Held {
 }
 
 impl Queue {
-    /// Whether the next write of a submission lacks its payload.
+    /// True if the next write of a submission lacks its payload.
     pub(super) fn lacks_payload(&self, key: &Key, sub: &Sub) -> bool {
         let is_stored = sub.outline().is_some_and(|outline| outline.stored.is_some());
         let held = self.held.get(key);
@@ -66,7 +66,7 @@ impl Queue {
         kept.filter(|until| *until > now.at).min()
     }
 
-    /// What the next write of a submission is sent with; none if that is to be read.
+    /// Payload of a submission's next write; none if that is to be read.
     pub(super) fn payload(&self, key: &Key, outline: &Outline) -> Option<Arc<Payload>> {
         if outline.stored.is_none() {
             return Some(Arc::new(Payload::bare(outline)));

@@ -1,4 +1,4 @@
-//! What is polled for a whole challenge: lists, and what its leaderboards are.
+//! Polls of a whole challenge: lists, and its leaderboards.
 //!
 //! Owned by `queue`. Pure.
 
@@ -63,7 +63,7 @@ pub(super) struct Challenge {
     /// When each of its lists is due. One that was never asked for is due at once.
     pub lists: BTreeMap<Purpose, Poll>,
     pub check: ChallengeCheck,
-    /// What the sweep has handed out, so that it is handed out once: when it asked to be run, and when it was handed out.
+    /// Finds of the sweep that were handed out, so that each is once: when it asked to be run, and when it was handed out.
     pub swept: BTreeMap<i64, (Timestamp, Duration)>,
     /// Ids that the last list of cancelled submissions had and that have their end here, and when it was asked for.
     pub cancelled: (Timestamp, BTreeSet<i64>),
@@ -81,7 +81,7 @@ impl Challenge {
         }
     }
 
-    /// The same challenge with what was read of it, and nothing on its way.
+    /// This challenge with what was read of it, and nothing on its way.
     pub fn known(&self) -> Self {
         let check = ChallengeCheck {
             wanted: self.check.wanted.clone(),

@@ -18,7 +18,7 @@ struct Inner {
     budget: Budget,
     /// Requests a minute that each share may use; the smallest holds.
     limits: BTreeMap<u64, u32>,
-    /// Of the last share.
+    /// Time of the last share.
     last: u64,
 }
 

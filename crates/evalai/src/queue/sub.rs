@@ -26,7 +26,7 @@ pub(super) struct Pending<T> {
     pub since: Duration,
 }
 
-/// What is written of a submission.
+/// Kind of write of a submission.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 pub(super) enum Write {
     Progress,
@@ -126,7 +126,7 @@ impl Sub {
         };
     }
 
-    /// Whether this attempt has come to its end, published or not.
+    /// True if this attempt has come to its end, published or not.
     pub fn has_end(&self) -> bool {
         self.end.is_some() || self.view.end.is_some() || self.is_over()
     }
@@ -136,12 +136,12 @@ impl Sub {
         self.end.as_ref().and(self.run.ended)
     }
 
-    /// Whether an end waits that EvalAI has not refused.
+    /// True if an end waits that EvalAI has not refused.
     pub fn has_end_to_publish(&self) -> bool {
         self.end.is_some() && self.view.end.is_none()
     }
 
-    /// Whether this attempt needs no further update.
+    /// True if this attempt needs no further update.
     pub fn is_over(&self) -> bool {
         self.view.ended.is_some()
             || self
@@ -151,7 +151,7 @@ impl Sub {
                 .is_some_and(|end| !matches!(end, Ended::Refused(_)))
     }
 
-    /// What is written next, and since when it is wanted.
+    /// Next write, and since when it is wanted.
     pub fn next_write(&self) -> Option<(Write, Duration)> {
         let end = self.end.as_ref().map(|want| (Write::End, want.since));
         let progress = self.progress.as_ref().map(|want| (Write::Progress, want.since));
@@ -162,7 +162,7 @@ impl Sub {
             .or_else(|| partial.map(|want| (Write::Partial, want.since)))
     }
 
-    /// Whether the row, as last read, allows it.
+    /// True if the row, as last read, allows it.
     pub fn may_write(&self, write: Write) -> bool {
         match write {
             Write::Progress => self.of_progress() == Some(Interim::Send),
@@ -180,7 +180,7 @@ impl Sub {
         }
     }
 
-    /// Whether the uploaded file is to be read: until it was read, and for nothing that has come to its end.
+    /// True while the uploaded file is to be read: until it was read, and for nothing that has come to its end.
     pub fn wants_image(&self) -> bool {
         let unread = matches!(self.view.image, None | Some(ImageAnswer::Unread(_)));
         let has_file = self.view.row.as_ref().is_some_and(|row| row.input_file.is_some());
@@ -192,12 +192,12 @@ impl Sub {
         self.view.row.as_ref().and_then(|row| row.submitted_at).or(self.live)
     }
 
-    /// Whether EvalAI had stored this attempt when a read was made.
+    /// True if EvalAI had stored this attempt when a read was made.
     fn is_known(&self, row: &Row, requested: Duration) -> bool {
         row.names(&self.run.job) || self.known_at.is_some_and(|known| requested > known)
     }
 
-    /// Whether the end of an earlier attempt could no longer stand when a read was made.
+    /// True if the end of an earlier attempt could no longer stand when a read was made.
     fn begun(&self, row: &Row, requested: Duration) -> bool {
         self.is_known(row, requested) || self.live_at.is_some_and(|live| requested > live)
     }
@@ -328,7 +328,7 @@ impl Sub {
         }
     }
 
-    /// What becomes of the update of progress; none without one, or without a row.
+    /// Verdict on the update of progress; none without one, or without a row.
     fn of_progress(&self) -> Option<Interim> {
         let (row, read) = (self.view.row.as_ref()?, self.read?);
         let wanted = self.progress.as_ref()?.what;
@@ -336,14 +336,14 @@ impl Sub {
         Some(guard::progress(row.status, attempt, is_known, wanted))
     }
 
-    /// What becomes of partial results; none without some, or without a row.
+    /// Verdict on partial results; none without some, or without a row.
     fn of_partial(&self) -> Option<Interim> {
         let (row, read) = (self.view.row.as_ref()?, self.read?);
         self.partial.as_ref()?;
         Some(guard::partial(row.status, self.attempt(row, read)))
     }
 
-    /// What becomes of the update to an end; none without one, or without a read since.
+    /// Verdict on the update to an end; none without one, or without a read since.
     fn of_end(&self) -> Option<End> {
         let (row, read, want) = (self.view.row.as_ref()?, self.read?, self.end.as_ref()?);
         let since = !self.outdated && read >= want.since && read >= self.wrote_at;
@@ -411,7 +411,7 @@ impl Sub {
         self.view.last_error = Some(why);
     }
 
-    /// What the bucket holds of the end could not be read: the next try is later each time.
+    /// Notes that the bucket's part of the end could not be read: the next try is later each time.
     pub fn payload_failed(&mut self, why: String, now: &Now) {
         self.retry_at = now.at + pause(self.write_failures);
         self.write_failures = self.write_failures.saturating_add(1);

@@ -8,9 +8,9 @@ const ENDS: i64 = 1000;
 const LIVE: std::ops::RangeInclusive<i64> = 2001..=2010;
 /// Submissions of which it is asked whether they may run.
 const ASKED: std::ops::RangeInclusive<i64> = 3001..=3020;
-/// What a list of cancelled ones holds.
+/// Ids of a list of cancelled submissions.
 const OLD: std::ops::RangeInclusive<i64> = 5001..=7000;
-/// What a list of 2,000 rows takes the real server.
+/// Seconds that a list of 2,000 rows takes the real server.
 const SLOW_LIST: f64 = 23.0;
 
 /// When a request was sent, and which.

@@ -1,4 +1,4 @@
-//! Whose cancellation counts, and that none is overwritten knowingly.
+//! Cancellations: which of them count, and that none is overwritten knowingly.
 
 use super::*;
 

@@ -1,4 +1,4 @@
-//! What is written of a submission, and when it is not.
+//! Writes of a submission over its life.
 
 use super::*;
 

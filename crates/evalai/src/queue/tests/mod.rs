@@ -121,7 +121,7 @@ fn results_in(bucket: &str, score: f64) -> Arc<Outline> {
     })
 }
 
-/// What that bucket gives out.
+/// Payload that the bucket gives out.
 fn stored(outline: &Outline) -> Payload {
     let score = &outline.stored.as_ref().unwrap().prefix;
     Payload {
@@ -218,7 +218,7 @@ impl Bench {
         self.next_or_wait().ok()
     }
 
-    /// The same, or until when there is nothing to send.
+    /// Next request, or until when there is nothing to send.
     fn next_or_wait(&mut self) -> Result<(String, Ticket), Option<Duration>> {
         let now = self.now();
         match next(&mut self.queue, now, true) {

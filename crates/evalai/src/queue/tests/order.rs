@@ -1,4 +1,4 @@
-//! What comes first, how much at once, and what is asked for a whole challenge.
+//! Order of requests, how many go at once, and requests for a whole challenge.
 
 use serde_json::Value;
 

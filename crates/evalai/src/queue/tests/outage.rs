@@ -8,7 +8,7 @@ use crate::budget::WINDOW;
 
 const SUBMISSIONS: i64 = 20;
 const OUTAGE: Duration = Duration::from_hours(1);
-/// What the server asks for with a 429.
+/// Pause that the server asks for with a 429.
 const RETRY_AFTER: Duration = Duration::from_secs(56);
 /// One way to the server and back.
 const WAY: Duration = Duration::from_millis(200);

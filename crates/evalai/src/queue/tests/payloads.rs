@@ -1,4 +1,4 @@
-//! What a bucket holds of a result: when it is read, how much of it is held, and what becomes of it.
+//! Payloads from a bucket: when they are read, how much of them is held, and what becomes of them.
 
 use super::*;
 
@@ -11,7 +11,7 @@ fn hangs() -> PayloadProblem {
 }
 
 impl Bench {
-    /// What is to be read next has to be of this submission.
+    /// Next read, which has to be of this submission.
     fn reads(&mut self, pk: i64) -> Arc<Outline> {
         let now = self.now();
         match self.queue.next(now, true) {

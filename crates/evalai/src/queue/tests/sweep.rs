@@ -1,4 +1,4 @@
-//! What a sweep of a phase answers and hands out.
+//! Sweeps of a phase: their answers and finds.
 
 use super::*;
 use crate::types::Swept;

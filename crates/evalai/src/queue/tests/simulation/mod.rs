@@ -17,9 +17,9 @@ use crate::row::Row;
 use leaderboard_api::evalai_status::Status;
 
 const SUBMISSIONS: i64 = 12;
-/// Those that their participant deletes at some time.
+/// Submissions that their participant deletes at some time.
 const DELETED: [i64; 2] = [11, 12];
-/// Those that their participant edits to finished at some times.
+/// Submissions that their participant edits to finished at some times.
 const FINISHED: [i64; 3] = [8, 9, 10];
 const MINUTE_LIMIT: usize = 54;
 /// Faults, cancellations and new attempts end here; what is left must come to its end after it.
@@ -74,7 +74,7 @@ enum Event {
     Wake,
 }
 
-/// What the controller has of a submission.
+/// A submission as the controller has it.
 #[derive(Clone, Debug, Default)]
 struct Actor {
     attempt: i64,
@@ -263,7 +263,7 @@ impl World {
         }
     }
 
-    /// What must hold for every request.
+    /// Checks what must hold for every request.
     fn check_sent(&mut self, ticket: &Ticket) {
         let at = self.at;
         if ticket.request.counts() {
@@ -331,7 +331,7 @@ impl World {
         self.queue.answered(ticket, reply, now);
     }
 
-    /// What the controller does with a submission in each reconcile.
+    /// Acts for a submission as the controller does in each reconcile.
     fn reconcile(&mut self, pk: i64) {
         let actor = self.actors[&pk].clone();
         if actor.settled {
