@@ -34,7 +34,7 @@ pub trait Watchable: Lookup<DynamicType = ()> + Clone + fmt::Debug + Send + Sync
     /// Stores texts once that many objects have.
     fn share(&mut self, _texts: &mut Texts) {}
 
-    /// Whether nothing has changed since `before` that anybody reads.
+    /// True if nothing has changed since `before` that anybody reads.
     fn is_same(&self, _before: &Self) -> bool {
         false
     }

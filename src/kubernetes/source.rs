@@ -41,7 +41,7 @@ impl<K> Source<K> {
         }
     }
 
-    /// Whether an object of this key is one that it shows.
+    /// True if an object of this key is one that it shows.
     pub(super) fn has(&self, object: &str) -> bool {
         self.namespace
             .as_deref()

@@ -97,7 +97,7 @@ impl<K: Watchable> Clone for Watch<K> {
 }
 
 impl<K: Watchable> Watch<K> {
-    /// Whether the store holds every object, each as it is.
+    /// True if the store holds every object, each as it is.
     pub fn is_complete(&self) -> bool {
         self.synced.is_true() && self.unreadable.is_empty()
     }

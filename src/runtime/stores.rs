@@ -55,7 +55,7 @@ impl Stores {
         all
     }
 
-    /// Whether the policy that a Leaderboard's present spec asks for is seen to be there.
+    /// True if the policy that a Leaderboard's present spec asks for is seen to be there.
     pub fn shows_policy(&self, leaderboard: &Leaderboard) -> bool {
         if !self.policies_synced.is_true() {
             return false;

@@ -1,4 +1,4 @@
-//! What was sent to a service on a day, by purse: requests and bytes cost money, and have a bound for each day. Pure.
+//! Requests and bytes sent to a service on a day, by purse: they cost money, and have a bound for each day. Pure.
 //!
 //! Used for S3 (`upload`) and CloudWatch (`ship`), which note it next to the files, so that a restart does not begin anew.
 
@@ -29,13 +29,13 @@ impl Spent {
         }
     }
 
-    /// Whether neither is more than what is allowed.
+    /// True if neither is more than what is allowed.
     pub fn fits(self, allowed: Self) -> bool {
         self.requests <= allowed.requests && self.bytes <= allowed.bytes
     }
 }
 
-/// What was spent on one day.
+/// Requests and bytes of one day.
 #[derive(Serialize, Deserialize, Clone, Debug, Default, PartialEq, Eq)]
 pub struct Daily {
     day: u64,
@@ -53,7 +53,7 @@ impl Daily {
         }
     }
 
-    /// What a purse has spent.
+    /// Requests and bytes of a purse.
     pub fn of(&self, purse: &str) -> Spent {
         self.spent.get(purse).copied().unwrap_or_default()
     }

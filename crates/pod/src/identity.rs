@@ -1,4 +1,4 @@
-//! Who the Pod's own programs are towards AWS: the keys in their environment, or a role assumed with the Pod's token and
+//! Identity of the Pod's own programs towards AWS: the keys in their environment, or a role assumed with the Pod's token and
 //! narrowed to this run.
 //!
 //! Called by `workspace` and `logcopy` at their start. Knows no keys of objects.
@@ -19,7 +19,7 @@ pub async fn aws(setting: &Setting, program: &str) -> Aws {
     for_run(Aws::load(program).await, setting)
 }
 
-/// The same from a way to AWS that is there already.
+/// This identity from a way to AWS that is there already.
 pub fn for_run(base: Aws, setting: &Setting) -> Aws {
     let Some(role_arn) = &setting.role_arn else {
         return base;
@@ -92,7 +92,7 @@ fn session_name(run: &Run) -> String {
     format!("leaderboard-{}", id.collect::<String>())
 }
 
-/// What is left of the role's rights: this run's objects and log streams.
+/// Policy that leaves of the role's rights this run's objects and log streams.
 fn session_policy(run: &Run, partition: &str) -> String {
     let bucket = format!("arn:{partition}:s3:::{}", run.plan.storage.s3.bucket);
     let prefix = key_prefix(&run.plan.storage.s3, &run.plan.run_id);

@@ -27,10 +27,10 @@ const FAILURES: u32 = 3;
 /// Where a Pod before has waited in vain: a plugin that is some seconds late must not be called absent again each time.
 const KNOWN_OPEN: Duration = Duration::from_secs(10);
 
-/// What was found.
+/// Result of the measurement.
 #[derive(Clone, Debug, PartialEq, Eq)]
 pub enum Finding {
-    /// What the policy forbids cannot be reached, and how that showed.
+    /// Forbidden addresses cannot be reached, and how that showed.
     Enforced(SocketAddr, Blocked),
     /// It can.
     Open(SocketAddr),
@@ -117,7 +117,7 @@ fn address(asked: &Isolation, api_server: Option<SocketAddr>) -> Result<SocketAd
     Ok(address)
 }
 
-/// What one try has shown.
+/// Result of one try.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 enum Try {
     /// A connection was made, the only proof that packets come through.
@@ -201,7 +201,7 @@ mod tests {
         }
     }
 
-    /// Whether it is found to be enforced, and after how many milliseconds, where connections are made until `until`, and
+    /// True if it is found to be enforced, and after how many milliseconds, where connections are made until `until`, and
     /// once at each of `also`.
     async fn found(until: Duration, also: &[u64], patience: Duration) -> (bool, u128) {
         let began = Instant::now();
@@ -217,7 +217,7 @@ mod tests {
         (found == Measured::Blocked(Blocked::Silent), began.elapsed().as_millis())
     }
 
-    /// What is found where the tries show this, one after the other, and the last again and again; and after how many seconds.
+    /// Finding where the tries show this, one after the other, and the last again and again; and after how many seconds.
     async fn of(tries: &[Try], patience: Duration) -> (Measured, u64) {
         let (began, mut next) = (Instant::now(), 0);
         let reach = async || {

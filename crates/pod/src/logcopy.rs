@@ -36,7 +36,7 @@ use round::{News, Rounds, Why};
 
 /// Longest last flush after SIGTERM; the Pod's grace is 600 s and the containers had their part of it.
 const LAST_FLUSH: Duration = Duration::from_mins(5);
-/// What a round under way has to land after SIGTERM. A request that is dropped may still be served, and then replace the newer
+/// Time for a round under way to land after SIGTERM. A request that is dropped may still be served, and then replace the newer
 /// log that the last flush has stored meanwhile.
 const LANDING: Duration = Duration::from_secs(3);
 /// How often the stop file is read where inotify reports nothing.
@@ -44,7 +44,7 @@ const STOP_POLL: Duration = Duration::from_secs(2);
 /// Time between two rounds over the logs for CloudWatch.
 const SHIP_PERIOD: Duration = Duration::from_secs(5);
 
-/// What logcopy can't work without.
+/// Errors that logcopy can't work with.
 #[derive(thiserror::Error, Debug)]
 pub enum LogcopyError {
     /// The plan does not hold; `workspace` has refused it before.
@@ -75,7 +75,7 @@ pub async fn main(setting: Setting, shutdown: impl Future<Output = ()>) -> Resul
     work(setting, &aws, archive, shutdown).await
 }
 
-/// The same with ready clients.
+/// This work with ready clients.
 pub async fn work(
     setting: Setting,
     aws: &Aws,

@@ -26,7 +26,7 @@ pub struct Places {
     pub podinfo: PathBuf,
     /// The projected token.
     pub token: PathBuf,
-    /// What the kubelet copies into the container's status.
+    /// File that the kubelet copies into the container's status.
     pub termination_log: PathBuf,
 }
 
@@ -87,7 +87,7 @@ pub enum SettingError {
     /// Not what the controller writes.
     #[error("{ENV_RUN} is not the description of a run: {0}. Operator and Pod must be of the same version")]
     Malformed(#[from] serde_json::Error),
-    /// Of a version that this program does not know.
+    /// Document of a version that this program does not know.
     #[error(
         "{ENV_RUN} has schema {0}, and this program reads {SCHEMA}. Operator and Pod must be of the \
          same version"

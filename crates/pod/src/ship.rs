@@ -47,7 +47,7 @@ struct Mark {
     offset: u64,
 }
 
-/// What is noted next to the files.
+/// Note next to the files.
 #[derive(Serialize, Deserialize, Clone, Debug, Default, PartialEq, Eq)]
 struct Note {
     /// By path.
@@ -56,7 +56,7 @@ struct Note {
     sent: Daily,
 }
 
-/// What may have been sent: a batch whose answer never came.
+/// Batch whose answer never came, so that it may have been sent.
 #[derive(Clone, Debug)]
 struct Doubt {
     path: String,
@@ -160,7 +160,7 @@ impl Shipper {
         }
     }
 
-    /// What a round shows of the lines; nothing while CloudWatch does not answer, or nothing was printed.
+    /// State of the lines for the report; none while CloudWatch does not answer, or nothing was printed.
     fn what_of(&self, sent: &Result<(), LogsError>) -> Option<Logs> {
         match sent {
             Err(error) if error.is_transient() => None,

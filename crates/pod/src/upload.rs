@@ -34,14 +34,14 @@ const MEMORY: &str = "logcopy/.stored.json";
 /// Largest memory that is read back, in bytes.
 const MEMORY_LIMIT: u64 = 64 << 20;
 
-/// What is known of a stored object.
+/// A stored object, as far as it is known.
 #[derive(Serialize, Deserialize, Clone, Debug, PartialEq, Eq)]
 pub struct Stored {
     /// The file as it was when it was stored.
     pub stamp: Stamp,
     /// The object's entity tag, if S3 gave one.
     pub etag: Option<String>,
-    /// Of the stored bytes; see [`fingerprint`].
+    /// Fingerprint of the stored bytes; see [`fingerprint`].
     pub fingerprint: String,
     /// When, on the clock of this process; zero for what an earlier one stored.
     #[serde(skip)]
@@ -67,14 +67,14 @@ impl Stored {
     }
 }
 
-/// What is done with a file.
+/// Decision on a file.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 pub enum Decision {
     /// Nothing, for now.
     Keep,
     /// All of it is sent.
     PutWhole,
-    /// What is stored is kept, and what comes after this byte is sent, provided that the beginning is still the same.
+    /// The stored part is kept, and the rest after this byte is sent, provided that the beginning is still the same.
     Append {
         /// First byte to send.
         from: u64,
@@ -90,7 +90,7 @@ pub enum Haste {
     Soon,
 }
 
-/// What is done with a file now. `now` is on the clock of [`Stored::at`].
+/// Decides on a file. `now` is on the clock of [`Stored::at`].
 pub fn decide_upload(found: &Stamp, stored: Option<&Stored>, now: Duration, haste: Haste) -> Decision {
     let Some(stored) = stored.filter(|stored| !stored.is_unknown()) else {
         return Decision::PutWhole;
@@ -136,17 +136,17 @@ fn hash_range(digest: &mut Sha256, file: &File, from: u64, len: u64) -> io::Resu
     Ok(())
 }
 
-/// What is stored, and what was sent today.
+/// Stored objects, and today's requests and bytes.
 #[derive(Serialize, Deserialize, Clone, Debug, Default, PartialEq, Eq)]
 pub struct Memory {
     /// By key.
     pub stored: BTreeMap<String, Stored>,
-    /// What was sent, by purse.
+    /// Requests and bytes, by purse.
     pub sent: Daily,
 }
 
 impl Memory {
-    /// What an earlier program of this Pod left; nothing if that can't be read, which costs one upload of everything.
+    /// Memory that an earlier program of this Pod left; none if that can't be read, which costs one upload of everything.
     pub fn load(tree: &Tree) -> Self {
         let read = tree.read(MEMORY, MEMORY_LIMIT).ok().flatten();
         let memory = read.and_then(|(bytes, _)| serde_json::from_slice(&bytes).ok());

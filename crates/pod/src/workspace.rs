@@ -34,7 +34,7 @@ const FOLDERS: [&str; 4] = ["agent", STATUS_FOLDER, "logcopy", "contents"];
 const PREPARED: &str = "logcopy/.prepared";
 /// Tries while S3 does not answer, before the kubelet is left to start this again.
 const TRIES: u32 = 6;
-/// What a Pod that goes on reports of its isolation.
+/// Verdict on the isolation of a Pod that goes on.
 fn verdict_of(finding: &Finding) -> WorkspaceVerdict {
     let reason = match finding {
         Finding::Enforced(..) => WorkspaceReason::Enforced,
@@ -124,7 +124,7 @@ async fn measure_and_prepare(setting: &Setting) -> Result<Option<Finding>, Works
     Ok(finding)
 }
 
-/// Whether the Pod's NetworkPolicy is enforced; an error if the run may not go on as it is.
+/// Measures whether the Pod's NetworkPolicy is enforced; an error if the run may not go on as it is.
 async fn measure(setting: &Setting) -> Result<Option<Finding>, WorkspaceError> {
     let Some(asked) = &setting.run.isolation else {
         return Ok(None);
@@ -200,7 +200,7 @@ fn is_prepared(tree: &Tree, pod_uid: &str) -> bool {
     noted.is_some_and(|(bytes, _)| bytes == pod_uid.as_bytes())
 }
 
-/// What becomes of what is stored.
+/// Claim on the stored results.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 enum Claim {
     /// There is nothing.

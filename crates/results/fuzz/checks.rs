@@ -1,4 +1,4 @@
-//! What must hold whatever the bytes are. The fuzz targets run these, and the crate's own tests replay the corpus with them.
+//! Checks that hold for any bytes. The fuzz targets run these, and the crate's own tests replay the corpus with them.
 //!
 //! A failed check panics, which is what both look for.
 
@@ -13,7 +13,7 @@ const STRICTNESSES: [Strictness; 2] = [Strictness::Offline, Strictness::Pod];
 const WORKERS: usize = 4;
 const SEPARATOR: u8 = 0;
 
-/// What became of an input, over all its readings.
+/// Outcome of an input, over all its readings.
 #[derive(Clone, Copy, Debug, Default, PartialEq, Eq)]
 pub struct Seen {
     /// It was taken at least once.

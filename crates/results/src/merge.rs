@@ -16,11 +16,11 @@ pub struct PairProgress {
     pub done: u32,
     /// Routes the pair has to drive, each repetition counted.
     pub total: u32,
-    /// Whether the evaluator came to its regular end; see [`Checkpoint::ended`].
+    /// True if the evaluator came to its regular end; see [`Checkpoint::ended`].
     pub ended: bool,
 }
 
-/// What the workers' files have together.
+/// Sum of the workers' files.
 #[derive(Clone, Debug)]
 pub struct Merged {
     /// The merged file, as the original writes it.
@@ -29,9 +29,9 @@ pub struct Merged {
     pub done: u32,
     /// Routes to drive: the plan's when it is known, else the sum of what the files have.
     pub total: u32,
-    /// Whether nothing is missing, so that there is a global record.
+    /// True if nothing is missing, so that there is a global record.
     pub is_final: bool,
-    /// Whether the results count. In V2 the merged file may deny it, as the original does where no worker's file names sensors any more.
+    /// True if the results count. In V2 the merged file may deny it, as the original does where no worker's file names sensors any more.
     pub eligible: bool,
     /// The `entry_status` of the merged file.
     pub entry_status: String,
@@ -65,13 +65,13 @@ impl Merged {
     }
 }
 
-/// What the renderers need of the merged file.
+/// Parts of the merged file that the renderers need.
 #[derive(Clone, Debug)]
 pub(crate) struct View {
     pub(crate) sensors: Vec<Text>,
     pub(crate) routes: Vec<Line>,
     pub(crate) global: Option<Global>,
-    /// The same over the routes done so far; only before the run is final. It is no part of the merged file.
+    /// Global record over the routes done so far; only before the run is final. It is no part of the merged file.
     pub(crate) so_far: Option<Global>,
 }
 

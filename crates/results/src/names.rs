@@ -230,7 +230,7 @@ const FAILURES: [&str; 8] = [
     "Failed - Simulation crashed",
 ];
 
-/// Whether an evaluator of this format writes the status. V2 judges an unfinished record itself, V1 can't, so only V2
+/// True if an evaluator of this format writes the status. V2 judges an unfinished record itself, V1 can't, so only V2
 /// knows `Started`.
 pub(crate) fn is_known_status(format: Format, status: &str) -> bool {
     match status {

@@ -1,4 +1,4 @@
-//! What a run was asked to do: format, slices, strictness. Owns the types the callers fill in and the check that they make
+//! Plan of a run: format, slices, strictness. Owns the types the callers fill in and the check that they make
 //! sense together; knows nothing of checkpoints.
 
 use serde::{Deserialize, Serialize};
@@ -6,12 +6,12 @@ use serde::{Deserialize, Serialize};
 use crate::Refusal;
 use crate::json::FileLimits;
 
-/// What the checkpoints of all pairs may hold together in a Pod. Real ones hold a few kilobytes a route run.
+/// Bounds of the checkpoints of all pairs together in a Pod. Real ones hold a few kilobytes a route run.
 const SHARED: FileLimits = FileLimits {
     bytes: 32 << 20,
     values: 500_000,
 };
-/// What each pair may have besides its share.
+/// Bounds of each pair besides its share.
 const LEAST: FileLimits = FileLimits {
     bytes: 1 << 20,
     values: 10_000,
@@ -36,7 +36,7 @@ pub enum Strictness {
     Pod,
 }
 
-/// What happens when the scores of a record do not follow from its infractions.
+/// Treatment of scores that do not follow from a record's infractions.
 #[derive(Clone, Copy, Debug, PartialEq, Eq, Hash, Serialize, Deserialize)]
 pub enum Verify {
     /// Nothing is recomputed.
@@ -69,7 +69,7 @@ impl Slice {
     }
 }
 
-/// What a run was asked to do.
+/// Plan of a run.
 #[derive(Clone, Debug, PartialEq, Eq, Serialize, Deserialize)]
 pub struct Plan {
     /// The checkpoint format of the workers.
@@ -83,7 +83,7 @@ pub struct Plan {
     pub routes: u32,
     /// How often each route is driven.
     pub repetitions: u32,
-    /// What happens when the scores of a record do not follow from its infractions.
+    /// Treatment of scores that do not follow from a record's infractions.
     pub verify: Verify,
     /// Switches the deliberate differences from the original off.
     pub as_original: bool,
@@ -103,7 +103,7 @@ impl Plan {
         }
     }
 
-    /// Whether the plan has the pairs and routes, and decides where the files differ.
+    /// True if the plan has the pairs and routes, and decides where the files differ.
     pub(crate) fn decides(&self) -> bool {
         !self.pairs.is_empty() && !self.as_original
     }

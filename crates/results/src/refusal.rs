@@ -15,13 +15,13 @@ pub enum Refusal {
     /// The plan contradicts itself or the number of workers.
     #[error("the plan of the run does not hold: {problem}")]
     Plan {
-        /// What contradicts what.
+        /// Contradiction.
         problem: String,
     },
     /// The file, or what would be written from it, is too large in some way.
     #[error("pair {}: the checkpoint {limit}", ordinal(*pair))]
     Limit {
-        /// Whose file.
+        /// Pair whose file it is.
         pair: usize,
         /// The bound.
         limit: Limit,
@@ -35,43 +35,43 @@ pub enum Refusal {
     /// The bytes are no text.
     #[error("pair {}: the checkpoint is not UTF-8 text", ordinal(*pair))]
     NotUtf8 {
-        /// Whose file.
+        /// Pair whose file it is.
         pair: usize,
     },
     /// The JSON has not the shape of a checkpoint.
     #[error("pair {}: `{place}` in the checkpoint is not {wanted}", ordinal(*pair))]
     Shape {
-        /// Whose file.
+        /// Pair whose file it is.
         pair: usize,
         /// The key, as a path from the top.
         place: &'static str,
-        /// What it should be.
+        /// Expected type.
         wanted: &'static str,
     },
     /// The file was written for other routes or repetitions.
     #[error("pair {}: the checkpoint is for {found} route runs, but this pair has {expected}", ordinal(*pair))]
     Total {
-        /// Whose file.
+        /// Pair whose file it is.
         pair: usize,
-        /// What the file has.
+        /// Number in the file.
         found: u32,
-        /// What the plan has.
+        /// Number in the plan.
         expected: u32,
     },
     /// More records than route runs.
     #[error("pair {}: the checkpoint has {found} records for {expected} route runs", ordinal(*pair))]
     TooManyRecords {
-        /// Whose file.
+        /// Pair whose file it is.
         pair: usize,
         /// Records in the file.
         found: usize,
-        /// What the plan has.
+        /// Number in the plan.
         expected: u32,
     },
     /// A sensor of no known kind.
     #[error("{}sensor {sensor} is not one of the known kinds", .pair.map_or(String::new(), |pair| format!("pair {}: ", ordinal(pair))))]
     Sensor {
-        /// Whose file, when it was found there.
+        /// Pair whose file it is, when it was found there.
         pair: Option<usize>,
         /// Which sensor of the list, from 1.
         sensor: usize,
@@ -87,11 +87,11 @@ pub enum Refusal {
     /// A record is wrong.
     #[error("pair {}, {record}: {problem}", ordinal(*pair))]
     Record {
-        /// Whose file.
+        /// Pair whose file it is.
         pair: usize,
         /// Which record.
         record: RecordName,
-        /// What is wrong with it.
+        /// Problem of the record.
         problem: RecordProblem,
     },
     /// A route was reported twice in a finished run.
@@ -161,7 +161,7 @@ impl Refusal {
         }
     }
 
-    /// What the reader can do about it, as one sentence.
+    /// Next step for the reader, as one sentence.
     pub fn next_step(&self) -> &'static str {
         match self {
             Self::Plan { .. } => "Correct pairs, routes and repetitions of the leaderboard.",
@@ -212,7 +212,7 @@ impl fmt::Display for RecordName {
     }
 }
 
-/// What is wrong with one record.
+/// Problem of one record.
 #[derive(Clone, Debug, PartialEq, thiserror::Error)]
 pub enum RecordProblem {
     /// Not a JSON object.
@@ -223,13 +223,13 @@ pub enum RecordProblem {
     Shape {
         /// The key.
         key: &'static str,
-        /// What it should be.
+        /// Expected type.
         wanted: &'static str,
     },
     /// The id is not the evaluator's.
     #[error("its route_id is not of the form RouteScenario_<number>{}", if *.repetition { "_rep<number>" } else { "" })]
     RouteId {
-        /// Whether the format has the repetition in the name.
+        /// True if the format has the repetition in the name.
         repetition: bool,
     },
     /// Another pair's route.
@@ -246,7 +246,7 @@ pub enum RecordProblem {
         /// Repetitions of the run.
         repetitions: u32,
     },
-    /// The same route run again in the same file.
+    /// This route run again in the same file.
     #[error("the route run is there more often than it is driven")]
     Repeated,
     /// A status no evaluator writes.
@@ -257,7 +257,7 @@ pub enum RecordProblem {
     NotFinite {
         /// The key.
         field: &'static str,
-        /// What it is.
+        /// Value found.
         value: f64,
     },
     /// A number no route can have.
@@ -265,7 +265,7 @@ pub enum RecordProblem {
     Range {
         /// The key.
         field: &'static str,
-        /// What it is.
+        /// Value found.
         value: f64,
         /// The lowest possible.
         low: f64,
@@ -278,15 +278,15 @@ pub enum RecordProblem {
     /// The driving score is not the product.
     #[error("score_composed is {}, but score_route x score_penalty is {}", number_text(*.found), number_text(*.expected))]
     Composed {
-        /// What the record has.
+        /// Value in the record.
         found: f64,
-        /// What follows from its scores.
+        /// Value that follows from its scores.
         expected: f64,
     },
     /// The penalty is better than the infractions allow.
     #[error("score_penalty is {}, but its infractions allow {} at most", number_text(*.found), number_text(*.allowed))]
     Penalty {
-        /// What the record has.
+        /// Value in the record.
         found: f64,
         /// The most that follows from its infractions.
         allowed: f64,

@@ -14,12 +14,12 @@ const RATIO_DIGITS: usize = 4;
 /// Simulated frames per second.
 const FRAMES: f64 = 20.0;
 
-/// What EvalAI gets.
+/// Files for EvalAI.
 #[derive(Clone, Debug, PartialEq, Eq)]
 pub struct Files {
     /// The metrics: a list with one object, to be sent as text. All zero until the run is final.
     pub results_json: String,
-    /// The same with the metrics over the routes done so far, for a leaderboard that shows partial results. `None` once the run
+    /// Results with the metrics over the routes done so far, for a leaderboard that shows partial results. `None` once the run
     /// is final, before the first route, and with [`Plan::as_original`].
     pub partial_json: Option<String>,
     /// The summary a participant reads.

@@ -28,7 +28,7 @@ impl Case {
         fs::read_to_string(self.dir.join(file)).ok()
     }
 
-    /// Whether the original failed, and in which step.
+    /// True if the original failed, and in which step.
     fn failed(&self, step: &str) -> bool {
         self.expected("expected_error.txt")
             .is_some_and(|text| text.lines().any(|line| line.starts_with(step)))
@@ -68,7 +68,7 @@ fn count(cases: &[Case], format: Format, is_normal: bool) -> usize {
         .count()
 }
 
-/// What a case comes to: merged.json (absent if the merge fails), results.json, stdout.txt.
+/// Texts of a case: merged.json (absent if the merge fails), results.json, stdout.txt.
 fn texts(case: &Case, as_original: bool) -> [Option<String>; 3] {
     match run(case, as_original) {
         Ok((merged, files)) => {
@@ -180,7 +180,7 @@ fn computed_statuses_of_v1() {
     }
 }
 
-/// What becomes of each hostile case, for people to read and for the test to hold still.
+/// Outcome of each hostile case, for people to read and for the test to hold still.
 #[test]
 fn hostile_cases_are_refused_or_have_a_known_outcome() {
     let cases = cases();

@@ -15,7 +15,7 @@ use stats_alloc::{INSTRUMENTED_SYSTEM, Region, StatsAlloc};
 #[global_allocator]
 static COUNTED: &StatsAlloc<System> = &INSTRUMENTED_SYSTEM;
 
-/// What two rounds may allocate in all, freed or not: more than the memory they ever hold at once.
+/// Bytes that two rounds may allocate in all, freed or not: more than the memory they ever hold at once.
 const MOST: usize = 512 << 20;
 const TEXT: usize = 1 << 20;
 

@@ -1,4 +1,4 @@
-//! What the plan adds to the original: completeness against the plan, and the pod's refusals.
+//! Additions of the plan to the original: completeness against the plan, and the pod's refusals.
 #![allow(clippy::unwrap_used, reason = "the helpers of a test may fail it")]
 
 mod common;

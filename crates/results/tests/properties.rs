@@ -1,4 +1,4 @@
-//! What holds for any run: how it is shared out, interrupted or extended changes nothing, and nothing makes it panic.
+//! Properties of any run: how it is shared out, interrupted or extended changes nothing, and nothing makes it panic.
 #![allow(clippy::unwrap_used, reason = "the helpers of a test may fail it")]
 
 mod common;
@@ -312,7 +312,7 @@ fn damaged(text: &str, damages: &[Damage]) -> Vec<u8> {
     bytes
 }
 
-/// Whether EvalAI's summary holds only texts of closed sets.
+/// True if EvalAI's summary holds only texts of closed sets.
 fn is_closed(stdout: &str) -> bool {
     let is_number = |text: &str| text.trim_end_matches('x').parse::<f64>().is_ok_and(f64::is_finite);
     stdout

@@ -36,7 +36,7 @@ fn times(name: &'static str, n: usize) -> (&'static str, Vec<String>) {
     (name, vec!["Agent did it at (x=1.0, y=2.0, z=3.0)".to_owned(); n])
 }
 
-/// What verify finds in one drive, if anything.
+/// Finding of verify in one drive, if it has one.
 fn said(format: Format, drive: &Drive) -> Option<String> {
     let plan = pod(format, 1, &[(0, 0)]);
     let warnings = |plan: &Plan| read(plan, 0, &finished(format, std::slice::from_ref(drive)));
@@ -58,7 +58,7 @@ fn said(format: Format, drive: &Drive) -> Option<String> {
     merged.warnings.into_iter().next()
 }
 
-/// What the evaluator of version 1 writes.
+/// Drives as the evaluator of version 1 writes them.
 fn honest_of_v1() -> Vec<(Format, Drive)> {
     vec![
         (V1, drive(100.0, 1.0, &[])),
@@ -99,7 +99,7 @@ fn honest_of_v1() -> Vec<(Format, Drive)> {
     ]
 }
 
-/// What the evaluators of 2.0 and 2.1 write.
+/// Drives as the evaluators of 2.0 and 2.1 write them.
 fn honest_of_v2() -> Vec<(Format, Drive)> {
     vec![
         (

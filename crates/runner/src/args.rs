@@ -46,7 +46,7 @@ const WORK: &str = "/tmp/agent";
 /// Where the kubelet reads a container's last message. A flag and no variable: the environment is the image's.
 const TERMINATION_LOG: &str = "/dev/termination-log";
 
-/// What one container is to do.
+/// Work of one container.
 #[derive(Debug, Clone, PartialEq)]
 pub struct Job {
     pub pair: Pair,
@@ -57,7 +57,7 @@ pub struct Job {
     /// Bytes of output that are kept in the log.
     pub log_limit: u64,
     pub termination_log: PathBuf,
-    /// Whether changed files wake it; else it looks once a second.
+    /// True if changed files wake it; else it looks once a second.
     pub inotify: bool,
     /// Where devices and drivers are looked for.
     pub root: PathBuf,
@@ -66,7 +66,7 @@ pub struct Job {
     pub command: Vec<OsString>,
 }
 
-/// What only one side has.
+/// Settings of one side.
 #[derive(Debug, Clone, PartialEq)]
 pub enum Role {
     Simulator {
@@ -75,9 +75,9 @@ pub enum Role {
         cancel: Duration,
         answer: Duration,
         log: Option<PathBuf>,
-        /// What the server draws with, if it is to have a GPU.
+        /// Driver that the server draws with, if it is to have a GPU.
         gpu: Option<Needs>,
-        /// Whether its agent is to see a GPU.
+        /// True if its agent is to see a GPU.
         agent_gpu: bool,
         /// Variables that the server does not get.
         unset: Vec<OsString>,
@@ -87,7 +87,7 @@ pub enum Role {
         checkpoint: PathBuf,
         idle: Duration,
         python_path: Option<OsString>,
-        /// Whether it reports that it sees a GPU.
+        /// True if it reports that it sees a GPU.
         report_gpu: bool,
         /// How many route runs its evaluator is to drive, if that is known.
         route_runs: Option<u32>,
@@ -115,7 +115,7 @@ pub struct Kept {
     pub command: Vec<OsString>,
 }
 
-/// What the command line asks for.
+/// Request of the command line.
 #[derive(Debug, PartialEq)]
 pub enum Request {
     Run(Box<Job>),

@@ -17,7 +17,7 @@ use thiserror::Error;
 /// No larger checkpoint is read, in bytes.
 pub(crate) const MAX_BYTES: u64 = 64 << 20;
 
-/// What a checkpoint has.
+/// Parts of a checkpoint.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 pub(crate) struct Checkpoint {
     /// `_checkpoint.global_record` is an object with something in it: the evaluator came to its end.

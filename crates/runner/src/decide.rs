@@ -1,4 +1,4 @@
-//! What a runner does next: pure functions of what it sees. Three questions in a container's life, each with its table of
+//! Decisions of a runner: pure functions of what it sees. Three questions in a container's life, each with its table of
 //! tests: what next while it lives ([`next`]), what its end means ([`conclude`]), and when it may leave ([`leave`]).
 //!
 //! Called by `run`, which does the looking and the doing. Knows no clock, no file, no process.
@@ -32,7 +32,7 @@ pub(crate) enum Child {
     Ended,
 }
 
-/// What a simulator has read of its agent's GPU.
+/// GPU of the agent, as the simulator has read it.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 pub(crate) enum AgentGpu {
     /// It does not matter, or the agent's command may have begun: from then on what lies in its folder is its own word.
@@ -105,7 +105,7 @@ pub(crate) enum Cause {
     Mute,
 }
 
-/// What to do next.
+/// Next step.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 pub(crate) enum Action {
     Wait,
@@ -117,7 +117,7 @@ pub(crate) enum Action {
     End(Cause),
 }
 
-/// What to do next while nothing has ended yet.
+/// Next step while nothing has ended yet.
 pub(crate) fn next(side: Side, phase: Phase, seen: &Seen) -> Action {
     if seen.terminated {
         return Action::End(Cause::Terminated);
@@ -214,7 +214,7 @@ pub(crate) enum EndMark {
     Crash,
 }
 
-/// What the exit waits for.
+/// Condition that the exit waits for.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 pub(crate) enum Hold {
     /// Nothing.
@@ -227,7 +227,7 @@ pub(crate) enum Hold {
     Cancel,
 }
 
-/// What an end means.
+/// Meaning of an end.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 pub(crate) struct Conclusion {
     pub(crate) mark: Option<EndMark>,
@@ -254,7 +254,7 @@ const SIMULATOR_DONE: Conclusion = Conclusion {
     code: CODE_OVER,
 };
 
-/// What the end means, once every process has ended. `complete`: the agent's checkpoint has its global record, or all its routes.
+/// Judges the end, once every process has ended. `complete`: the agent's checkpoint has its global record, or all its routes.
 pub(crate) fn conclude(side: Side, cause: Cause, complete: bool, seen: &Seen) -> Conclusion {
     let silent = |hold, code| Conclusion { mark: None, hold, code };
     let hold = |hold| if side == Side::Host { hold } else { Hold::Free };
@@ -310,7 +310,7 @@ pub(crate) fn conclude(side: Side, cause: Cause, complete: bool, seen: &Seen) ->
     }
 }
 
-/// What to do while the exit is held.
+/// Next step while the exit is held.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 pub(crate) enum Leave {
     Wait,
@@ -319,7 +319,7 @@ pub(crate) enum Leave {
     Exit(i32),
 }
 
-/// Whether the container may exit. `over`: the present hold has lasted as long as it may.
+/// True if the container may exit. `over`: the present hold has lasted as long as it may.
 pub(crate) fn leave(side: Side, conclusion: Conclusion, seen: &Seen, over: bool) -> Leave {
     let Conclusion { hold, code, .. } = conclusion;
     let exit_or_wait = |exit, code| if exit { Leave::Exit(code) } else { Leave::Wait };

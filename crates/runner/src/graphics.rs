@@ -1,4 +1,4 @@
-//! What a container sees of its node's GPUs, before a simulator's server is started: how many devices, which of them is its own, and
+//! GPUs of the node as a container sees them before a simulator's server is started: how many devices, which of them is its own, and
 //! whether the part of the driver is there that the server draws with. Knows the file system below a root, and no Unreal Engine.
 //!
 //! A server without a GPU would end with a message that names no cause, or draw in software for hours.
@@ -22,9 +22,9 @@ const PLACES_VARIABLES: [&str; 4] = ["XDG_CONFIG_HOME", "XDG_CONFIG_DIRS", "XDG_
 const DRIVER_FOLDER: &str = "vulkan/icd.d";
 /// Variables by which the Vulkan loader is given its drivers; then it looks nowhere else.
 const DRIVER_VARIABLES: [&str; 2] = ["VK_DRIVER_FILES", "VK_ICD_FILENAMES"];
-/// The same with drivers beyond those that it finds.
+/// Variable with drivers beyond those that it finds.
 const MORE_DRIVERS: &str = "VK_ADD_DRIVER_FILES";
-/// What the file of NVIDIA's Vulkan driver begins with; some distributions put the machine behind.
+/// Beginning of the file name of NVIDIA's Vulkan driver; some distributions put the machine behind.
 const DRIVER_FILE: &str = "nvidia_icd";
 /// NVIDIA's OpenGL driver.
 const LIBRARY: &str = "libGLX_nvidia.so.0";

@@ -81,7 +81,7 @@ impl Group {
         }
     }
 
-    /// Whether a process of the group is left.
+    /// True if a process of the group is left.
     pub(crate) fn lives(&self) -> bool {
         self.status.is_none() || killpg(self.leader, None) != Err(Errno::ESRCH)
     }

@@ -33,7 +33,7 @@ type Stamp = (u64, i64, i64, u64);
 pub(crate) struct Keeper {
     checkpoint: PathBuf,
     kept: PathBuf,
-    /// What was copied last.
+    /// Stamp of the last copy.
     copied: Option<Stamp>,
     /// The file was written, and was not looked at since.
     due: bool,
@@ -51,7 +51,7 @@ pub(crate) struct NotPutBack {
 }
 
 impl NotPutBack {
-    /// Whether its node is the cause, and not what lies in the folder.
+    /// True if its node is the cause, and not what lies in the folder.
     pub(crate) fn is_nodes(&self) -> bool {
         matches!(&self.why, Failure::Io(error) if kernel::is_nodes(error))
     }
@@ -254,7 +254,7 @@ mod tests {
             fs::write(&self.keeper.checkpoint, text).unwrap();
         }
 
-        /// The same container after its runner has died.
+        /// Starts this container again after its runner has died.
         fn restart(&mut self) -> String {
             self.keeper = Keeper::new(self.keeper.checkpoint.clone(), self.keeper.kept.clone());
             self.keeper.prepare().unwrap();

@@ -20,7 +20,7 @@ use leaderboard_runner::args::Kept;
 const SLOW_POLL: Duration = Duration::from_secs(1);
 /// For output whose writer outlives the command: then the rest is given up.
 const LAST_WAIT: Duration = Duration::from_secs(10);
-/// What a shell adds to the number of a signal.
+/// Number that a shell adds to that of a signal.
 const BY_SIGNAL: i32 = 128;
 
 /// Runs the command to its end; its exit code, as a shell would give it.

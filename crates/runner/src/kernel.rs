@@ -1,4 +1,4 @@
-//! Whose an error of the kernel is before the command runs: the image's, or the node's. Called by `launch` and `run`. Pure.
+//! Errors of the kernel before the command runs: the image's, or the node's. Called by `launch` and `run`. Pure.
 
 use std::io;
 
@@ -31,7 +31,7 @@ pub(crate) fn of_spawn(error: &io::Error) -> Cause {
     }
 }
 
-/// Whether the node refuses a file, in any folder: it lacks open files, memory or disk, or its disk fails.
+/// True if the node refuses a file, in any folder: it lacks open files, memory or disk, or its disk fails.
 pub(crate) fn is_nodes(error: &io::Error) -> bool {
     let number = error.raw_os_error().map(Errno::from_raw);
     matches!(

@@ -10,7 +10,7 @@ use std::path::Path;
 
 /// Such a list can name users who may not look, whatever the mode is.
 const ACCESS_LIST: &str = "system.posix_acl_access";
-/// What a reader needs to look for names and to watch, and the runner to write.
+/// Rights that let a reader look for names and watch, and the runner write.
 const OPEN: u32 = 0o755;
 
 /// Opens the folder again. A container that does not own it could not shut it either.

@@ -13,7 +13,7 @@ use crate::checkpoint::{Checkpoint, Unreadable};
 use crate::decide::Cause;
 use crate::group::Status;
 
-/// What is known about an end.
+/// An end, as far as it is known.
 #[derive(Debug)]
 pub(crate) struct End<'a> {
     pub(crate) side: Side,
@@ -24,7 +24,7 @@ pub(crate) struct End<'a> {
     pub(crate) out_of_memory: bool,
     /// The agent's checkpoint, if it was looked at.
     pub(crate) results: Option<&'a Result<Checkpoint, Unreadable>>,
-    /// What went wrong, for the causes that are errors.
+    /// Error, for the causes that are errors.
     pub(crate) detail: Option<&'a str>,
 }
 

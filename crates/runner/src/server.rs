@@ -25,7 +25,7 @@ const TIME_WAIT: &str = "06";
 /// behind these.
 const PORTS: u16 = 10;
 
-/// Who listens on a port.
+/// Listener on a port.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 pub(crate) enum Listener {
     Nobody,
@@ -40,7 +40,7 @@ pub(crate) fn ports_of(port: u16) -> RangeInclusive<u16> {
     port..=port.saturating_add(PORTS - 1)
 }
 
-/// Who listens on the port.
+/// Finds the listener on the port.
 pub(crate) fn listener(port: u16) -> Listener {
     match sockets() {
         None => Listener::Own,
@@ -155,7 +155,7 @@ fn parent_of_living(stat: &str) -> Option<u32> {
     (!matches!(state, "Z" | "X" | "x")).then_some(parent)
 }
 
-/// Whether a process has one of the sockets open. One whose files are hidden (it has changed its user) may have.
+/// True if a process has one of the sockets open. One whose files are hidden (it has changed its user) may have.
 fn holds(pid: u32, sockets: &HashSet<&str>) -> bool {
     let entries = match fs::read_dir(Path::new("/proc").join(pid.to_string()).join("fd")) {
         Ok(entries) => entries,
@@ -167,14 +167,14 @@ fn holds(pid: u32, sockets: &HashSet<&str>) -> bool {
         .any(|link| link.to_str().is_some_and(|link| sockets.contains(link)))
 }
 
-/// Whether an agent of this Pod may have begun: not before a simulator was ready. Until then a taken port is no agent's doing.
+/// True if an agent of this Pod may have begun: not before a simulator was ready. Until then a taken port is no agent's doing.
 pub(crate) fn may_agents_run(status: &Path) -> bool {
     let is_ready =
         |file: &StatusFile| matches!(file, StatusFile::Of(member, Mark::Start(_)) if member.side == Side::Host);
     protocol::present(status, Pair::MAX).iter().any(is_ready)
 }
 
-/// Whether a server answers on the port.
+/// True if a server answers on the port.
 pub(crate) fn answers(port: u16) -> bool {
     let address = address(port);
     let Ok(stream) = TcpStream::connect_timeout(&address, Duration::from_millis(100)) else {
@@ -197,7 +197,7 @@ impl Question {
         Ok(Self(stream))
     }
 
-    /// Whether the server has reacted: a server of another protocol that closes the connection is alive, too.
+    /// True if the server has reacted: a server of another protocol that closes the connection is alive, too.
     pub(crate) fn is_answered(&mut self) -> bool {
         let mut byte = [0];
         match self.0.read(&mut byte) {

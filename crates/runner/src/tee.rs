@@ -58,7 +58,7 @@ impl Tee {
         }
     }
 
-    /// Whether stdout has to take something.
+    /// True if stdout has to take something.
     pub(crate) fn wants_stdout(&self) -> bool {
         !self.pending.is_empty()
     }

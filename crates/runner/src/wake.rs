@@ -1,4 +1,4 @@
-//! What wakes the runner: signals (SIGCHLD among them), changes in the folders of its peer and of `logcopy`, and a checkpoint
+//! Events that wake the runner: signals (SIGCHLD among them), changes in the folders of its peer and of `logcopy`, and a checkpoint
 //! that was written. Called by `run` only. It reports that something may have changed, never what: the caller looks again.
 
 use std::ffi::OsString;

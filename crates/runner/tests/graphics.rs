@@ -117,7 +117,7 @@ fn a_simulator_without_a_gpu_of_the_leaderboard_checks_nothing_and_changes_no_wo
 
 const ASKS: &str = "--agent-gpu=true";
 const REPORTS: &str = "--report-gpu=true";
-/// What the command of an agent leaves that it ran.
+/// Command of an agent, which leaves a mark that it ran.
 const RUNS: &str = "touch \"$CHECKPOINT.ran\"; printf '%s' \"$RESULTS\" > \"$CHECKPOINT\"";
 
 fn server_of(pod: &Pod) -> [String; 3] {

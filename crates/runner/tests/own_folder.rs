@@ -31,7 +31,7 @@ fn pod() -> (Pod, PathBuf) {
     (pod, folder)
 }
 
-/// Whether every user can look into it.
+/// True if every user can look into it.
 fn is_open(folder: &Path) -> bool {
     let has_list = rustix::fs::getxattr(folder, ACCESS_LIST, &mut [0_u8; 256][..]).is_ok();
     let mode = fs::metadata(folder).unwrap().permissions().mode();

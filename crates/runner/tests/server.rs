@@ -1,4 +1,4 @@
-//! What a simulator's runner finds out of its server by the network: whose listener has its ports, whether it hangs, and how many
+//! Findings of a simulator's runner about its server by the network: whose listener has its ports, whether it hangs, and how many
 //! connections it had.
 
 #![allow(clippy::unwrap_used, clippy::panic, reason = "a test that cannot go on fails")]

@@ -56,12 +56,12 @@ impl Meta {
         self.namespace.as_deref().unwrap_or_default()
     }
 
-    /// Whether it belongs to the object with this UID.
+    /// True if it belongs to the object with this UID.
     pub fn is_owned_by(&self, uid: &str) -> bool {
         self.owner_references.iter().any(|owner| *owner.uid == *uid)
     }
 
-    /// Whether nothing but its version separates them.
+    /// True if nothing but its version separates them.
     pub(super) fn is_same(&self, other: &Self) -> bool {
         let Self {
             name,

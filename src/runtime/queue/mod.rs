@@ -148,7 +148,7 @@ pub struct Turn {
 }
 
 impl Turn {
-    /// Whether it may continue, once it knows whether it creates a Job. If not, it changes nothing and ends with
+    /// True if it may continue, once it knows whether it creates a Job. If not, it changes nothing and ends with
     /// `After::WithPermit`.
     pub fn may_continue(&self, creates_job: bool) -> bool {
         let may_continue = lock(&self.queue.state).may_continue(&self.key, creates_job);

@@ -32,7 +32,7 @@ use leaderboard_protocol::files::{Mark, Pair, StatusFile};
 
 /// Rounds of a container whose status files are stored: far more than retries a host forgives.
 const STATUS_ROUNDS: u32 = 64;
-/// What the last logs get at most if the node is about to be taken away: with the agents' end before it and the simulators' after it,
+/// Longest time for the last logs if the node is about to be taken away: with the agents' end before it and the simulators' after it,
 /// all is stored before the controller deletes the Pod, 90 s after it has noticed.
 const LAST_LOGS_BEFORE_NODE: Duration = Duration::from_secs(40);
 /// Bytes of the owner that are read.
@@ -47,7 +47,7 @@ pub(super) enum Why {
     Shutdown,
 }
 
-/// What is on the volume.
+/// Files on the volume.
 #[derive(Debug)]
 struct Found {
     gathered: Gathered,
@@ -59,10 +59,10 @@ struct Found {
     agents_fill_disk: bool,
 }
 
-/// What the rounds hear of other tasks.
+/// News for the rounds from other tasks.
 pub(super) struct News {
     pub(super) stop: watch::Receiver<Option<Stop>>,
-    /// What has become of the lines for CloudWatch.
+    /// State of the lines for CloudWatch.
     pub(super) logs: watch::Receiver<Option<Logs>>,
 }
 
@@ -133,7 +133,7 @@ impl Rounds {
         Duration::from_secs(self.setting.run.flush_seconds)
     }
 
-    /// What the last logs get of it: as much is left for what comes after them.
+    /// Time for the last logs: as much is left for what comes after them.
     fn time_for_last_logs(&self, why: Why) -> Duration {
         let longest = match why {
             Why::Period => self.flush(),
@@ -283,7 +283,7 @@ impl Rounds {
         }
     }
 
-    /// Whether this Pod's writes still count.
+    /// True if this Pod's writes still count.
     async fn owns_prefix(&mut self) -> Result<bool, ArchiveError> {
         let known = self.owner_etag.as_deref();
         match self.archive.get_if_none_match(OWNER_KEY, known, OWNER_BYTES).await? {
@@ -426,7 +426,7 @@ fn is_of_first_rounds(file: &StatusFile) -> bool {
     }
 }
 
-/// What can't wait for the period: a container's new status file, or its new folder. A checkpoint can wait: an agent that
+/// True for a name that can't wait for the period: a container's new status file, or its new folder. A checkpoint can wait: an agent that
 /// writes all the time must not set the pace.
 fn is_news(name: &OsStr) -> bool {
     let Some(name) = name.to_str() else { return false };

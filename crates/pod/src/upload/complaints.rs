@@ -1,4 +1,4 @@
-//! What was left out and why, written once to logcopy's log, with the limit's name and what to do.
+//! Complaints: files that were left out, each written once to logcopy's log, with the limit's name and the next step.
 
 use std::collections::BTreeSet;
 use std::fmt;
@@ -16,7 +16,7 @@ pub enum Why {
     Limit(Limit),
     /// A known log is stored up to this byte only.
     Shortened(u64),
-    /// What may be sent on a day was sent.
+    /// The allowance of the day is used up.
     Day,
     /// It took too long and was cut.
     Slow(Duration),
@@ -72,7 +72,7 @@ impl fmt::Display for Why {
 }
 
 impl Why {
-    /// What is shown once: each limit, and each file that has a reason of its own.
+    /// Topic that is shown once: each limit, and each file that has a reason of its own.
     fn topic(&self, key: &str) -> String {
         match self {
             Self::Limit(Limit::Bytes(_)) => "bytes".to_owned(),
@@ -88,7 +88,7 @@ impl Why {
     }
 }
 
-/// What was shown already.
+/// Topics that were shown already.
 #[derive(Debug, Default)]
 pub struct Complaints(BTreeSet<String>);
 

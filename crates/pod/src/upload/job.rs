@@ -14,10 +14,10 @@ use leaderboard_aws::archive::{Archive, ArchiveError, Cause, Kept, MIN_PART, PAR
 use leaderboard_evaluation::Object;
 use leaderboard_evidence::{Stamp, Tree, TreeError};
 
-/// What is left to abort an upload that was cut.
+/// Time to abort an upload that was cut.
 const ABORTING: Duration = Duration::from_secs(10);
 
-/// What became of one file.
+/// Outcome of one file.
 pub(super) enum Outcome {
     /// It is stored, and was sent if that is true.
     Stored(Box<Stored>, bool),
@@ -70,7 +70,7 @@ pub(super) struct Job {
     pub(super) tree: Arc<Tree>,
     /// With as many bytes as it may have.
     pub(super) wanted: Wanted,
-    /// Whether it has more.
+    /// True if it has more.
     pub(super) is_shortened: bool,
     pub(super) decision: Decision,
     pub(super) known: Option<Stored>,
@@ -82,7 +82,7 @@ struct Opened {
     file: Arc<File>,
     stamp: Stamp,
     fingerprint: String,
-    /// Of as many bytes as were stored before.
+    /// Fingerprint of as many bytes as were stored before.
     of_known: String,
 }
 
@@ -195,7 +195,7 @@ impl Job {
     }
 }
 
-/// What comes of it; `None` if it takes longer than until then.
+/// Output of the work; `None` if it takes longer than until then.
 async fn in_time<T>(until: Option<Instant>, work: impl Future<Output = T>) -> Option<T> {
     match until {
         Some(until) => tokio::time::timeout_at(until.into(), work).await.ok(),

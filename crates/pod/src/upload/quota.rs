@@ -21,7 +21,7 @@ pub const LEAST: u64 = 4 << 10;
 /// Bytes that the server copies with one request of an append.
 const COPIED: u64 = 1 << 30;
 
-/// What a key is for, in the order in which files are sent.
+/// Kind of a key, in the order in which files are sent.
 #[derive(Clone, Copy, Debug, PartialEq, Eq, PartialOrd, Ord)]
 pub enum Kind {
     /// Checkpoints, results and status files: stored from memory, and bounded there.
@@ -80,9 +80,9 @@ pub struct Quota {
     pub bytes: u64,
     /// Objects.
     pub objects: u64,
-    /// What may be sent of one known log on a day.
+    /// Allowance of one known log for a day.
     pub log_a_day: Spent,
-    /// What may be sent of the agents' own files together on a day, and of the simulators' other files.
+    /// Allowance of the agents' own files together for a day, and of the simulators' other files.
     pub files_a_day: Spent,
     logs: BTreeSet<String>,
 }
@@ -107,7 +107,7 @@ impl Quota {
         }
     }
 
-    /// What a key is for.
+    /// Kind of a key.
     pub fn kind(&self, key: &str) -> Kind {
         if self.logs.contains(key) {
             return Kind::Log;
@@ -125,7 +125,7 @@ impl Quota {
         }
     }
 
-    /// Who shares a day's allowance, and how much it is.
+    /// Purse of a key, and its allowance for a day.
     pub fn purse<'a>(&self, key: &'a str) -> (&'a str, Spent) {
         match self.kind(key) {
             Kind::Result | Kind::Log => (key, self.log_a_day),
@@ -134,7 +134,7 @@ impl Quota {
         }
     }
 
-    /// What counts already, by what is stored.
+    /// Ledger of what is stored already.
     pub fn ledger<'a>(&'a self, stored: impl Iterator<Item = (&'a str, u64)>) -> Ledger<'a> {
         let mut ledger = Ledger {
             quota: self,
@@ -190,12 +190,12 @@ fn is_checkpoint(key: &str) -> bool {
     })
 }
 
-/// Whether a stranger's container writes it.
+/// True if a stranger's container writes it.
 fn is_agents(kind: Kind, key: &str) -> bool {
     kind == Kind::Agent || (kind == Kind::Log && key.starts_with("agent/"))
 }
 
-/// What counts at present.
+/// Sums that count at present.
 #[derive(Clone, Debug)]
 pub struct Ledger<'a> {
     quota: &'a Quota,
@@ -261,7 +261,7 @@ impl Ledger<'_> {
     }
 }
 
-/// What sending a file of `size` bytes costs.
+/// Cost of sending a file of `size` bytes.
 pub fn cost(decision: Decision, size: u64) -> Spent {
     let parts = |bytes: u64, of: u64| bytes.div_ceil(of);
     match decision {

@@ -26,7 +26,7 @@ const AT_ONCE: usize = 4;
 /// Pause before a file that was cut is tried again; doubled each time.
 const AFTER_A_CUT: Duration = Duration::from_mins(10);
 
-/// What became of one round of files.
+/// Outcome of one round of files.
 #[derive(Clone, Copy, Debug, Default, PartialEq, Eq)]
 pub struct Sent {
     /// Objects written.
@@ -42,7 +42,7 @@ pub struct Sent {
 pub struct Window {
     /// From then on no file is begun.
     pub begin_until: Option<Instant>,
-    /// What is in the air then is cut.
+    /// Time at which requests under way are cut.
     pub cut_at: Option<Instant>,
     /// There is no later time for what would wait: neither the day's allowance nor an earlier cut holds it back.
     pub is_last: bool,
@@ -69,7 +69,7 @@ struct Slow {
     times: u32,
 }
 
-/// Who pays for a file, and how much.
+/// Purse that pays for a file, and how much.
 struct Bill {
     key: String,
     purse: String,
@@ -102,7 +102,7 @@ impl Uploader {
         }
     }
 
-    /// What is stored.
+    /// Stored objects.
     pub fn memory(&self) -> &Memory {
         &self.memory
     }
@@ -249,7 +249,7 @@ impl Uploader {
         failed
     }
 
-    /// What is stored under a key is another's, or not known. It counts all the same.
+    /// Forgets the content under a key: it is another's, or not known. It counts all the same.
     fn forget_content(&mut self, key: &str) {
         if let Some(known) = self.memory.stored.get_mut(key) {
             *known = Stored::unknown(known.stamp.size);
@@ -331,7 +331,7 @@ impl Uploader {
     }
 }
 
-/// Whether a file is due, and how much of it there is room for.
+/// Decision on a file that is due, and how much of it there is room for.
 fn due(file: &Wanted, known: Option<&Stored>, ledger: &Ledger<'_>, now: Duration) -> Result<Option<Due>, Why> {
     if decide_upload(&file.stamp, known, now, file.haste) == Decision::Keep {
         return Ok(None);

@@ -56,7 +56,7 @@ pub struct Files {
 }
 
 impl Files {
-    /// What is there now.
+    /// Finds the files that are there now.
     pub fn find(tree: &Tree, pairs: usize) -> Self {
         let mut found = Self::default();
         let each = ENTRIES.checked_div(pairs).unwrap_or(ENTRIES).min(AGENT_ENTRIES);
@@ -94,7 +94,7 @@ impl Files {
         self.left_out = self.left_out.saturating_add(walk.left_out);
     }
 
-    /// What is to be stored of it, by why each pair's checkpoint is refused. A checkpoint is stored from memory, whole. One that
+    /// Files to store, given why each pair's checkpoint is refused. A checkpoint is stored from memory, whole. One that
     /// is refused is kept as evidence under another name, so that nothing is resumed from it.
     pub fn wanted(&self, refused: &[Option<String>]) -> Vec<Wanted> {
         let of_pair: BTreeMap<String, bool> = Pair::first(refused.len())

@@ -30,7 +30,7 @@ const MAX_OBJECTS: usize = 100_000;
 /// Downloads at once.
 const AT_ONCE: usize = 4;
 
-/// What was brought back.
+/// Restored files.
 #[derive(Clone, Copy, Debug, Default, PartialEq, Eq)]
 pub struct Restored {
     /// Files.
@@ -104,13 +104,13 @@ struct Chosen {
     objects: Vec<Listed>,
     /// The checkpoints of another pipeline's workers, each for the pair of its number.
     of_workers: Vec<Listed>,
-    /// What stays in the bucket only.
+    /// Objects that stay in the bucket only.
     others: Vec<Listed>,
     /// How many of them are not left there on purpose.
     left_out: usize,
 }
 
-/// What is restored: results and known logs first, then the smallest, so that no flood and no huge file keeps a checkpoint out.
+/// Chooses objects: results and known logs first, then the smallest, so that no flood and no huge file keeps a checkpoint out.
 fn choose(objects: Vec<Listed>, quota: &Quota, pairs: usize) -> Chosen {
     let not_counted = [OWNER_KEY, REPORT_KEY, FAILURE_LOG_KEY];
     let (of_workers, objects) = checkpoints_of_workers(objects, quota, pairs);
@@ -174,7 +174,7 @@ fn log_of_worker(key: &str) -> Option<Pair> {
         .then(|| worker.parse().ok())?
 }
 
-/// Whether a key is one that the run goes on with.
+/// True if a key is one that the run goes on with.
 fn is_restored(key: &str, pairs: usize) -> bool {
     // What logcopy makes from the checkpoints it makes again, and evidence is for people.
     let unread = [&format!("{STATUS_FOLDER}/"), "logcopy/.", EVALAI, REFUSED];

@@ -17,7 +17,7 @@ const MAX_SENSORS: usize = 1_000;
 /// A file can't promise more route runs than this.
 const MAX_TOTAL: i128 = 1_000_000;
 
-/// What one worker has written so far, checked as far as one file can be.
+/// File of one worker, checked as far as one file can be.
 #[derive(Clone, Debug)]
 pub struct Checkpoint {
     pub(crate) records: Vec<Record>,
@@ -60,7 +60,7 @@ impl Checkpoint {
         self.total
     }
 
-    /// Whether the evaluator came to its regular end: the file has a global record of its own. After a crashed simulation it
+    /// True if the evaluator came to its regular end: the file has a global record of its own. After a crashed simulation it
     /// has none, even when no route is missing.
     pub fn ended(&self) -> bool {
         self.end != End::Open
@@ -100,7 +100,7 @@ impl Checkpoint {
         self.records.iter().take(count(self.done))
     }
 
-    /// Whether a record says that the simulation crashed. It is the agent's own word.
+    /// True if a record says that the simulation crashed. It is the agent's own word.
     pub fn names_crash(&self) -> bool {
         self.records.iter().any(Record::names_crash)
     }

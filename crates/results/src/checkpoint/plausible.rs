@@ -1,4 +1,4 @@
-//! What a stranger's file must satisfy before any of it is published: the pair's own routes, known statuses, numbers a
+//! Conditions on a stranger's file before any of it is published: the pair's own routes, known statuses, numbers a
 //! drive can have. Called by the reader for `Strictness::Pod` only.
 
 use std::collections::HashMap;

@@ -56,7 +56,7 @@ pub(crate) struct Record {
 type Problem = (RecordName, RecordProblem);
 
 impl Record {
-    /// Whether its status says that the simulation crashed.
+    /// True if its status says that the simulation crashed.
     pub(crate) fn names_crash(&self) -> bool {
         self.status.contains(SIMULATION_CRASHED)
     }

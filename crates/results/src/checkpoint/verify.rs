@@ -1,4 +1,4 @@
-//! Whether the scores of a record follow from its infractions. The agent runs in the process that computes its score, so
+//! Check that the scores of a record follow from its infractions. The agent runs in the process that computes its score, so
 //! this is the cheap answer to an edited file; it does not see an infraction that was removed together with its penalty.
 //! Pure; called by the checkpoint reader.
 //!
@@ -58,7 +58,7 @@ fn is_beyond(distance: f64, limit: f64) -> bool {
     distance > limit || distance.is_nan()
 }
 
-/// What each infraction multiplies the penalty by.
+/// Factors by which each infraction multiplies the penalty.
 const V1_FACTORS: [(&str, f64); 5] = [
     ("collisions_pedestrian", 0.5),
     ("collisions_vehicle", 0.6),
@@ -67,7 +67,7 @@ const V1_FACTORS: [(&str, f64); 5] = [
     ("stop_infraction", 0.8),
 ];
 
-/// The same for 2.0.
+/// Factors of 2.0.
 const V2_FACTORS: [(&str, f64); 7] = [
     ("collisions_pedestrian", 0.5),
     ("collisions_vehicle", 0.6),
@@ -80,7 +80,7 @@ const V2_FACTORS: [(&str, f64); 7] = [
 /// Driving at twice the speed of the traffic raises the penalty by so much in 2.0.
 const V2_SPEED: f64 = 0.3;
 
-/// What each infraction adds to the divisor in 2.1.
+/// Coefficients that each infraction adds to the divisor in 2.1.
 const V21_COEFFICIENTS: [(&str, f64); 7] = [
     ("collisions_pedestrian", 1.0),
     ("collisions_vehicle", 0.7),
@@ -95,7 +95,7 @@ const V21_SPEED: f64 = 0.4;
 
 /// The infraction messages of a record.
 ///
-/// Those with a percentage, driving off the road and slow driving, can only take from the penalty, and the percentage is
+/// Infractions with a percentage, driving off the road and slow driving, can only take from the penalty, and the percentage is
 /// rounded, missing in some forks and without effect in others: they are counted as taking nothing. Fast driving is the
 /// one thing that gives.
 struct Events<'a> {

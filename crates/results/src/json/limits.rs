@@ -1,4 +1,4 @@
-//! What bounds a file of a stranger, whatever its bytes are.
+//! Bounds of a file of a stranger, for any bytes.
 
 /// A bound a hostile file ran into.
 #[derive(Clone, Copy, Debug, PartialEq, Eq, thiserror::Error)]
@@ -39,7 +39,7 @@ pub struct FileLimits {
 }
 
 impl FileLimits {
-    /// Of any file, whatever it is for.
+    /// Bounds of any file.
     pub(crate) const LARGEST: Self = Self {
         bytes: 64 << 20,
         values: 500_000,

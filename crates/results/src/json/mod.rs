@@ -29,7 +29,7 @@ pub(crate) struct Text {
 }
 
 impl Text {
-    /// What stands in `shared` at `place`.
+    /// Part of `shared` at `place`.
     fn part(shared: &Arc<[u8]>, place: Range<usize>) -> Option<Self> {
         let place = u32::try_from(place.start).ok()?..u32::try_from(place.end).ok()?;
         let shared = Arc::clone(shared);
@@ -115,7 +115,7 @@ pub(crate) enum Value {
 }
 
 impl Value {
-    /// What Python's `not value` is.
+    /// Value of Python's `not value`.
     pub(crate) fn is_falsy(&self) -> bool {
         match self {
             Self::Null => true,

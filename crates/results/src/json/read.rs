@@ -55,7 +55,7 @@ struct Reader<'a> {
     /// How many more there may be.
     values: usize,
     limits: FileLimits,
-    /// What the lists and objects around this place hold so far: each is allocated once, when its length is known.
+    /// Items of the lists and objects around this place so far: each list is allocated once, when its length is known.
     items: Vec<Value>,
     entries: Vec<(Text, Value)>,
 }
@@ -203,7 +203,7 @@ impl<'a> Reader<'a> {
         }
     }
 
-    /// What stands as it is up to a quote, an escape or a control character.
+    /// Characters up to a quote, an escape or a control character.
     fn plain(&mut self) -> Read<&'a [u8]> {
         let rest = self.bytes.get(self.at..).unwrap_or_default();
         let is_end = |byte: &u8| *byte < 0x20 || *byte == b'"' || *byte == b'\\';

@@ -1,4 +1,4 @@
-//! Whether an agent that is given a GPU of its node by its number sees one, which only its own container shows. For `run`.
+//! GPU of an agent that is given one of its node by its number: only its own container shows whether it sees one. For `run`.
 //!
 //! Nothing of the agent's image runs before its simulator has announced its server for the first time, and nobody else can write
 //! into its folder. So the simulator asks for the report of the agent's runner before that, believes it, and asks no more afterwards.
@@ -25,7 +25,7 @@ impl Runner {
         self.write(&StatusFile::Gpu(self.me, is_there))
     }
 
-    /// What a simulator has read of its agent's.
+    /// GPU of the agent, as a simulator has read it.
     pub(super) fn agent_gpu(&self) -> AgentGpu {
         let is_asked = matches!(self.job.role, Role::Simulator { agent_gpu: true, .. });
         if !is_asked || self.phase != Phase::Booting || self.has_announced() {
@@ -41,7 +41,7 @@ impl Runner {
         }
     }
 
-    /// Whether the agent's command may have begun, in whatever round.
+    /// True if the agent's command may have begun, in whatever round.
     fn has_announced(&self) -> bool {
         (0..=self.round).any(|round| StatusFile::Of(self.me, Mark::Start(round)).exists(&self.job.status))
     }

@@ -1,4 +1,4 @@
-//! What only the network shows of a simulator's server, for `run`: whether it is this container's own, whether its ports are free, and
+//! Facts about a simulator's server that only the network shows, for `run`: that it is this container's own, that its ports are free, and
 //! whether it hangs.
 
 use std::time::{Duration, Instant};
@@ -11,7 +11,7 @@ use crate::server::{self, Listener, Question};
 const MANY_CONNECTIONS: usize = 256;
 
 impl Runner {
-    /// Whether it is this container's server that listens. Another container's listener is no readiness.
+    /// True if it is this container's server that listens. Another container's listener is no readiness.
     pub(super) fn is_own_server(&mut self, port: u16) -> bool {
         let listener = server::listener(port);
         if listener == Listener::Foreign {
@@ -26,7 +26,7 @@ impl Runner {
         }
     }
 
-    /// What only the network shows of the end of a simulator, while its server may live.
+    /// Cause of a simulator's end that only the network shows, while its server may live.
     pub(super) fn of_the_server(&mut self, cause: Cause) -> Cause {
         let Some((port, answer)) = self.server() else {
             return cause;
@@ -50,7 +50,7 @@ impl Runner {
         }
     }
 
-    /// Whether a server failed to start because another container has one of its ports. Asked when its processes have ended: a port that
+    /// Cause of a server's end where another container has one of its ports. Asked when its processes have ended: a port that
     /// cannot be taken then is another container's, however busy the node is.
     pub(super) fn of_its_ports(&mut self, cause: Cause) -> Cause {
         let Some((port, _)) = self.server() else { return cause };
@@ -68,7 +68,7 @@ impl Runner {
         cause
     }
 
-    /// Whether the server hangs. One that ends while it is asked does not.
+    /// True if the server hangs. One that ends while it is asked does not.
     fn is_server_silent(&mut self, port: u16, answer: Duration) -> bool {
         let begin = Instant::now();
         let mut question = Question::ask(port);

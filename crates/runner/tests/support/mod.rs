@@ -260,7 +260,7 @@ impl Container {
         status.code().unwrap_or_else(|| 128 + status.signal().unwrap())
     }
 
-    /// Whether it is still there after `time`.
+    /// True if it is still there after `time`.
     pub fn stays(&mut self, time: Duration) -> bool {
         self.ended = self.ended.or_else(|| self.end.recv_timeout(time).ok());
         self.ended.is_none()
@@ -270,7 +270,7 @@ impl Container {
         Verdict::parse(&fs::read_to_string(&self.verdict).unwrap()).unwrap()
     }
 
-    /// What its runners have printed so far, all lives of it.
+    /// Output of its runners so far, all lives of it.
     pub fn stderr(&self) -> String {
         fs::read_to_string(&self.stderr).unwrap()
     }
@@ -306,7 +306,7 @@ impl Drop for Container {
     }
 }
 
-/// Whether a process with this id lives (a zombie does not).
+/// True if a process with this id lives (a zombie does not).
 pub fn lives(pid: i32) -> bool {
     let stat = fs::read_to_string(format!("/proc/{pid}/stat")).unwrap_or_default();
     stat.rsplit_once(") ")
