@@ -27,7 +27,7 @@ pub enum CallError {
 }
 
 impl CallError {
-    /// What the API server has answered, if it has.
+    /// Answer of the API server, if it has given one.
     pub fn status(&self) -> Option<&Status> {
         match self {
             Self::Refused { source, .. } => match source.as_ref() {
@@ -38,7 +38,7 @@ impl CallError {
         }
     }
 
-    /// What the API server has answered, if that is no and stays no until somebody changes something: no right, a quota, or a webhook
+    /// Answer of the API server, if that is no and stays no until somebody changes something: no right, a quota, or a webhook
     /// or a policy of admission. Not a conflict, and not too many requests.
     pub fn refusal(&self) -> Option<&Status> {
         let is_refusal = |code: u16| (400..500).contains(&code) && ![408, 409, 429].contains(&code);

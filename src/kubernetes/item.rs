@@ -20,12 +20,12 @@ use serde_json::value::RawValue;
 use super::objects::Texts;
 use super::store;
 
-/// What `kubectl apply` leaves for itself: a second copy of the object.
+/// Annotation that `kubectl apply` leaves for itself: a second copy of the object.
 const LAST_APPLIED: &str = "kubectl.kubernetes.io/last-applied-configuration";
 
-/// What can be watched.
+/// Kinds that can be watched.
 pub trait Watchable: Lookup<DynamicType = ()> + Clone + fmt::Debug + Send + Sync + 'static {
-    /// Whether it lives in a namespace.
+    /// Scope: in a namespace or not.
     type Scope;
 
     /// Reads one object. Where people write what a kind holds, one that cannot be read is an answer too.

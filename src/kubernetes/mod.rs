@@ -1,4 +1,4 @@
-//! What controller and bridge share of the API server: watches with their caches, and the checks before the start.
+//! Parts of the API server's client that controller and bridge share: watches with their caches, and the checks before the start.
 //!
 //! Imports the API types and `observability`; knows no policy, and no module that uses it.
 

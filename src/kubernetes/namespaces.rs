@@ -15,7 +15,7 @@ pub enum Namespaces {
 }
 
 impl Namespaces {
-    /// Those of the command line; none means all.
+    /// Namespaces of the command line; none means all.
     pub fn of(names: impl IntoIterator<Item = String>) -> Self {
         let names: BTreeSet<String> = names.into_iter().filter(|name| !name.is_empty()).collect();
         if names.is_empty() { Self::All } else { Self::Only(names) }

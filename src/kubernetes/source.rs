@@ -64,13 +64,13 @@ impl<K> Source<K> {
 /// A list under way. What it brings is cached at once, so that no second cache is needed, and is an event once the list is
 /// complete.
 pub(super) struct Listing<K> {
-    /// What this list has shown.
+    /// Names that this list has shown.
     pub shown: HashSet<Box<str>>,
-    /// What it has shown and cannot be read.
+    /// Names that it has shown and that cannot be read.
     pub unreadable: BTreeSet<Box<str>>,
-    /// What has changed since the last list that was complete.
+    /// Names that have changed since the last list that was complete.
     pub changed: HashSet<Box<str>>,
-    /// What was replaced by another object of its name meanwhile.
+    /// Objects that another one of their name has replaced meanwhile.
     pub replaced: Vec<Arc<K>>,
 }
 
@@ -103,7 +103,7 @@ type Events<K> = Pin<Box<dyn Stream<Item = Result<Event<Item<K>>, Error>> + Send
 type Numbered<K> = (usize, Option<Result<Event<Item<K>>, Error>>);
 type AllEvents<K> = SelectAll<Pin<Box<dyn Stream<Item = Numbered<K>> + Send>>>;
 
-/// What comes of all APIs, each with its number.
+/// Events of all APIs, each with its number.
 pub(super) fn all<K: Watchable>(apis: Vec<Api<Item<K>>>, config: &Config) -> AllEvents<K> {
     stream::select_all(apis.into_iter().enumerate().map(|(number, api)| {
         let events = lasting(api, config.clone()).map(Some);

@@ -26,7 +26,7 @@ use leaderboard_base::shutdown::Stop;
 /// Longer than anything here may take.
 const LIMIT: Duration = Duration::from_mins(20);
 
-/// What a request is answered.
+/// Answer to a request.
 enum Answer {
     Json(u16, Value),
     /// The lines of a watch, which then ends.

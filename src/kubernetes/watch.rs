@@ -31,14 +31,14 @@ pub(super) const PAGE: u32 = 100;
 pub struct Watch<K: Watchable> {
     /// The objects as they were last observed.
     pub store: Store<K>,
-    /// Whether the store is in sync with the API server.
+    /// True while the store is in sync with the API server.
     pub synced: Synced,
-    /// What exists and is not in the store, or only as it was before.
+    /// Objects that exist and are not in the store, or only as they were before.
     pub unreadable: Unreadable,
     feed: Feed<K>,
 }
 
-/// Whether a watch has listed its kind and was not refused since: otherwise a store may show what is long gone. Clones are
+/// True once a watch has listed its kind and was not refused since: otherwise a store may show what is long gone. Clones are
 /// the same one.
 #[derive(Clone, Debug, Default)]
 pub struct Synced(Arc<AtomicBool>);
@@ -69,7 +69,7 @@ impl Unreadable {
     }
 }
 
-/// What is kept of a kind, and how it is found.
+/// Shape in which a kind is kept, and how it is found.
 pub struct Shape<K> {
     /// Drops what is never read, before an object is cached.
     pub trim: fn(&mut K),
@@ -175,7 +175,7 @@ struct Task<K: Watchable> {
     feed: Feed<K>,
     synced: Synced,
     unreadable: Unreadable,
-    /// What has come before the cache was complete, and is an event when it is.
+    /// Keys that have come before the cache was complete, and are events when it is.
     pending: HashSet<Box<str>>,
     /// Every source has listed once.
     is_complete: bool,

@@ -37,7 +37,7 @@ pub struct Writes<K> {
     kind: PhantomData<fn() -> K>,
 }
 
-/// What is read of an answer. That to a deletion may have none of it.
+/// Part of an answer that is read. That to a deletion may have none of it.
 #[derive(Deserialize, Debug, Default)]
 #[serde(default)]
 pub struct Written {

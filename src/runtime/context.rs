@@ -1,4 +1,4 @@
-//! What all reconciles share: clients, caches and memory. Each stage gets the parts that it uses, and nothing else.
+//! Clients, caches and memory that all reconciles share. Each stage gets the parts that it uses, and nothing else.
 
 use std::sync::Arc;
 
@@ -83,7 +83,7 @@ impl Context {
         }
     }
 
-    /// What keeps the policies in place.
+    /// Part that keeps the policies in place.
     pub fn policies(&self) -> Policies<'_> {
         Policies {
             client: &self.client,

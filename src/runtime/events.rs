@@ -166,7 +166,7 @@ fn of_leaderboard(
     }
 }
 
-/// What of a Leaderboard's status may hold its submissions up.
+/// Part of a Leaderboard's status that may hold its submissions up.
 fn standing(leaderboard: &Leaderboard) -> String {
     let status = leaderboard.status.as_ref();
     let condition = |type_: &str| {
@@ -206,7 +206,7 @@ fn of_pod(shared: Arc<Shared>) -> impl FnMut(WatchEvent<Pod>) -> Option<(ObjectR
     }
 }
 
-/// What of an object is news to us: neither its status nor our own finalizer, which both are our own writes.
+/// Part of an object that is news to us: neither its status nor our own finalizer, which both are our own writes.
 fn own_fields(object: &impl ResourceExt, own_finalizer: &str) -> String {
     let meta = object.meta();
     let finalizers = meta
@@ -222,7 +222,7 @@ fn own_fields(object: &impl ResourceExt, own_finalizer: &str) -> String {
     )
 }
 
-/// What was last observed of each object, as a hash: what has not changed is no news.
+/// Hash of each object as it was last observed: the same hash again is no news.
 #[derive(Default)]
 struct Marks(HashMap<String, u64>);
 
@@ -238,7 +238,7 @@ impl Marks {
         self.0.insert(uid, mark) != Some(mark)
     }
 
-    /// Of a Job only its end and its deletion are news: it was made by us, and what else happens shows in its Pod.
+    /// True for the end and the deletion of a Job: it was made by us, and all else that happens shows in its Pod.
     fn job_has_news(&mut self, job: &Job, is_gone: bool) -> bool {
         let (uid, deleted) = (&*job.metadata.uid, &job.metadata.deletion_timestamp);
         if is_gone {

@@ -80,7 +80,7 @@ pub enum RunError {
     TaskFailed(#[from] TaskFailed),
 }
 
-/// What all reconciles share.
+/// Parts that all reconciles share.
 pub(super) struct Shared {
     context: Arc<Context>,
     queues: Queues,
@@ -148,7 +148,7 @@ pub struct Clients {
     pub lease: Client,
 }
 
-/// What one process is made of.
+/// Parts of one process.
 struct Parts {
     client: Client,
     watch_client: Client,
@@ -225,7 +225,7 @@ impl Parts {
         sweep
     }
 
-    /// What messages of EvalAI's queues are taken in with. A queue that cannot be read shows in its Leaderboards' `Ready`.
+    /// Parts that take messages of EvalAI's queues in. A queue that cannot be read shows in its Leaderboards' `Ready`.
     fn inbox(&self) -> Arc<pollers::Shared> {
         Arc::new(pollers::Shared {
             client: self.client.clone(),
@@ -240,7 +240,7 @@ impl Parts {
         })
     }
 
-    /// What all reconciles share.
+    /// Parts that all reconciles share.
     fn context(
         &self,
         fence: &leader::Fence,

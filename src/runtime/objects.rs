@@ -1,4 +1,4 @@
-//! What is read off any object: its key, its owner, and what marks it as ours. Pure.
+//! Facts of any object: its key, its owner, and its mark as ours. Pure.
 
 use std::fmt;
 
@@ -24,7 +24,7 @@ pub fn uid(object: &impl Resource) -> &str {
     object.meta().uid.as_deref().unwrap_or_default()
 }
 
-/// The same, to be kept.
+/// UID, to be kept.
 pub fn uid_of(object: &impl Resource) -> String {
     uid(object).to_owned()
 }
@@ -34,7 +34,7 @@ pub fn version(object: &impl Resource) -> u64 {
     object.meta().resource_version.as_deref().map_or(0, version_number)
 }
 
-/// The same of one that a write has made.
+/// Number of a version that a write has made.
 pub fn version_number(version: &str) -> u64 {
     version.parse().unwrap_or(0)
 }
@@ -48,7 +48,7 @@ pub fn key_of(object: &impl ResourceExt) -> ObjectKey {
     }
 }
 
-/// What all log lines about a submission are written in.
+/// Span of all log lines about a submission.
 pub fn span_of(submission: &Submission) -> Span {
     let spec = &submission.spec;
     about::submission(
@@ -59,7 +59,7 @@ pub fn span_of(submission: &Submission) -> Span {
     )
 }
 
-/// The same, for a task that works for it later.
+/// Span for a task that works for a submission later.
 pub fn log_span_of(submission: &Submission) -> LogSpan {
     let spec = &submission.spec;
     LogSpan::of(

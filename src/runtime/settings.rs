@@ -1,4 +1,4 @@
-//! What the command line sets.
+//! Settings of the command line.
 
 use crate::kubernetes::Namespaces;
 use leaderboard_pod_spec::job::OwnImage;
@@ -7,7 +7,7 @@ use leaderboard_policy::allowed::Allowed;
 /// Settings that come from the command line.
 #[derive(Clone, Debug)]
 pub struct Settings {
-    /// What Pods get of the operator.
+    /// Image and environment that Pods get of the operator.
     pub own: OwnImage,
     /// Name of this installation, `<namespace>/<name>` of its Lease.
     pub operator: String,
@@ -15,7 +15,7 @@ pub struct Settings {
     pub namespaces: Namespaces,
     /// Nodes are watched, and Leases of other installations read wherever they are: rights of the whole cluster.
     pub has_cluster_rights: bool,
-    /// What Leaderboards may name.
+    /// Places that Leaderboards may name.
     pub allowed: Allowed,
     /// Reconciles at once.
     pub concurrency: u16,

@@ -21,7 +21,7 @@ pub struct Stores {
     /// By the UID of their Job too.
     pub pods: Store<Pod>,
     pub policies: Store<NetworkPolicy>,
-    /// Whether what `policies` shows can be relied on.
+    /// True once `policies` can be relied on.
     pub policies_synced: Synced,
     /// None: an operator without rights of the whole cluster has none to nodes.
     pub nodes: Option<Watch<Node>>,

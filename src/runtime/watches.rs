@@ -75,7 +75,7 @@ impl Watches {
         }
     }
 
-    /// What the page reads: of a standby it is the same.
+    /// Stores that the page reads, on a standby too.
     pub(super) fn for_page(&self, leader: &Leader) -> Reads {
         let leadership = leader.leadership();
         Reads {

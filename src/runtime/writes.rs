@@ -11,7 +11,7 @@ use super::objects::uid;
 use crate::kubernetes::{CallError, Watchable, Writer, Writes, call};
 use leaderboard_api::names;
 
-/// Of a patch that is no apply.
+/// Parameters of a patch that is no apply.
 pub fn patch_by(manager: &str) -> PatchParams {
     PatchParams {
         field_manager: Some(manager.into()),

@@ -9,7 +9,7 @@ use super::meta::Meta;
 use super::texts::{Texts, cut};
 use super::watchable;
 
-/// What is read of an event.
+/// Part of an event that is read.
 #[derive(Deserialize, Clone, Debug, Default)]
 #[serde(rename_all = "camelCase", default)]
 pub struct Event {

@@ -8,7 +8,7 @@ use super::meta::Meta;
 use super::texts::{Text, Texts, cut};
 use super::watchable;
 
-/// What is read of a Job.
+/// Part of a Job that is read.
 #[derive(Deserialize, Clone, Debug, Default, PartialEq)]
 #[serde(default)]
 pub struct Job {

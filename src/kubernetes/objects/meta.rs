@@ -5,7 +5,7 @@ use serde::Deserialize;
 
 use super::texts::{Text, Texts};
 
-/// What is read of a child's metadata.
+/// Part of a child's metadata that is read.
 #[derive(Deserialize, Clone, Debug, Default, PartialEq)]
 #[serde(rename_all = "camelCase", default)]
 pub struct Meta {
@@ -21,7 +21,7 @@ pub struct Meta {
     pub annotations: Annotations,
 }
 
-/// What an object belongs to.
+/// Owner of an object.
 #[derive(Deserialize, Clone, Debug, Default, PartialEq)]
 #[serde(default)]
 pub struct Owner {

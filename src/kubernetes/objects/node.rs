@@ -9,7 +9,7 @@ use super::pod::of_type;
 use super::texts::{Text, Texts};
 use super::watchable;
 
-/// What is read of a node.
+/// Part of a node that is read.
 #[derive(Deserialize, Clone, Debug, Default, PartialEq)]
 #[serde(default)]
 pub struct Node {

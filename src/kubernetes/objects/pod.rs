@@ -11,7 +11,7 @@ use super::meta::Meta;
 use super::texts::{Text, Texts, cut};
 use super::watchable;
 
-/// What is read of a Pod.
+/// Part of a Pod that is read.
 #[derive(Deserialize, Clone, Debug, Default, PartialEq)]
 #[serde(default)]
 pub struct Pod {
@@ -46,7 +46,7 @@ pub struct PodStatus {
     pub container_statuses: Box<[ContainerStatus]>,
 }
 
-/// What is read of a Pod's conditions.
+/// Part of a Pod's conditions that is read.
 #[derive(Clone, Debug, Default, PartialEq)]
 pub struct Conditions {
     /// `PodScheduled`.
@@ -71,7 +71,7 @@ pub struct Condition {
 #[serde(from = "Seen")]
 pub struct ContainerStatus {
     pub name: Text,
-    /// What the node calls its image; empty before it has the image.
+    /// Name of its image on the node; empty before it has the image.
     pub image_id: Text,
     pub restart_count: i32,
     /// The kubelet has made the container of the next life, and counts it, before that runs. It says that the container waits, as after an end.
@@ -94,7 +94,7 @@ struct Seen {
     last_state: States,
 }
 
-/// What a container does: one of the three that Kubernetes has.
+/// State of a container: one of the three that Kubernetes has.
 #[derive(Clone, Debug, Default, PartialEq)]
 pub enum ContainerState {
     #[default]
@@ -153,7 +153,7 @@ fn conditions<'de, D: Deserializer<'de>>(deserializer: D) -> Result<Conditions, 
     Ok(found)
 }
 
-/// Of all conditions the one that is read.
+/// Reads one of all conditions.
 pub(super) fn of_type<'de, T: Deserialize<'de>, D: Deserializer<'de>>(
     deserializer: D,
     is_it: impl FnMut(&T) -> bool,

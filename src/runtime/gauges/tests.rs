@@ -1,4 +1,4 @@
-//! What the gauges show of Submissions and Leaderboards.
+//! Gauges of Submissions and Leaderboards.
 
 use kube::runtime::reflector::ObjectRef;
 use serde_json::{Value, json};

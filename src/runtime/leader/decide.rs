@@ -1,4 +1,4 @@
-//! What a candidate does about a Lease: a pure function of what it saw, when it saw it, and who it is.
+//! Decision of a candidate about a Lease: a pure function of what it saw, when it saw it, and who it is.
 //!
 //! Called by the election before every write. Knows no client; times are those of the candidate's own boot clock, and
 //! expiry counts from when the candidate itself saw the record change, so that clocks never have to agree.
@@ -8,7 +8,7 @@ use std::time::Duration;
 use super::Timing;
 use super::record::{FIRST_TERM, Identity, Record};
 
-/// What a candidate has seen of the Lease.
+/// Lease as a candidate has seen it.
 #[derive(Clone, Debug, Default, PartialEq, Eq)]
 pub struct ObservedLease {
     /// None: there is no Lease.
@@ -52,7 +52,7 @@ pub struct Leading {
     pub renewed_at: Duration,
 }
 
-/// What is to be done.
+/// Next step of a candidate.
 #[derive(Clone, Debug, PartialEq, Eq)]
 pub enum Decision {
     /// Write the Lease as the holder, in this term.

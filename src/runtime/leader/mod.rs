@@ -3,7 +3,7 @@
 //! `main` starts it once; every writer to EvalAI, DynamoDB or Kubernetes asks `Fence::may_write` right before. `decide` is pure,
 //! `record` translates between Leases and what `decide` reads, `elector` does the calls. Knows no Submission.
 //!
-//! What is promised: at any moment at most one process may write, also when processes are paused, answers are lost and
+//! The promise: at any moment at most one process may write, also when processes are paused, answers are lost and
 //! clocks disagree. A process that has led leads no second time: `Leadership::Lost` has to end it.
 
 pub mod decide;
@@ -53,7 +53,7 @@ impl Default for Timing {
     }
 }
 
-/// What an election needs to know.
+/// Settings of an election.
 #[derive(Clone, Debug)]
 pub struct Settings {
     /// The operator's own namespace.
@@ -158,7 +158,7 @@ impl Leader {
         self.leadership.clone()
     }
 
-    /// What writers ask.
+    /// Fence that writers ask.
     pub fn fence(&self) -> Fence {
         self.fence.clone()
     }

@@ -1,4 +1,4 @@
-//! Who stands for leader, and a Lease as the election reads and writes it.
+//! Candidates, and a Lease as the election reads and writes it.
 //!
 //! Called by the election. Pure but for the random part of an identity.
 
@@ -23,7 +23,7 @@ pub struct Identity {
 }
 
 impl Identity {
-    /// Of the only process of a container that leads; the kubelet starts the next only when this one has ended.
+    /// Identity of the only process of a container that leads; the kubelet starts the next only when this one has ended.
     pub fn of_pod(name: &str, uid: &str) -> Self {
         let container = format!("{name}_{uid}_");
         Self {
@@ -32,7 +32,7 @@ impl Identity {
         }
     }
 
-    /// Of a process outside a Pod.
+    /// Identity of a process outside a Pod.
     pub fn random(host: &str) -> Self {
         Self {
             text: format!("{host}_{}", random()),
@@ -55,7 +55,7 @@ fn random() -> String {
     format!("{:016x}", fastrand::u64(..))
 }
 
-/// What a Lease shows.
+/// Content of a Lease.
 #[derive(Clone, Debug, PartialEq, Eq)]
 pub struct Record {
     pub holder: Option<String>,

@@ -1,4 +1,4 @@
-//! What is ready to be reconciled, and which of it is next. Pure.
+//! Objects that are ready to be reconciled, and which of them is next. Pure.
 //!
 //! The most urgent class is next, and in it what has waited longest. A lower class ages: once its oldest has waited for
 //! `PATIENCE`, each fourth reconcile is its own, however much comes above it.

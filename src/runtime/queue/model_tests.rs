@@ -17,7 +17,7 @@ const LIMITS: Limits = Limits {
     creates_per_namespace: 2,
 };
 
-/// What the model has of an object.
+/// An object in the model.
 #[derive(Clone, Debug, Default)]
 struct Known {
     /// An event that no reconcile has begun for.
@@ -102,7 +102,7 @@ impl Life {
         }
     }
 
-    /// Those that may begin now.
+    /// Objects that may begin now.
     fn candidates(&self) -> Vec<((String, String), Class)> {
         let running = self.model.values().filter(|known| known.runs.is_some());
         let others = running

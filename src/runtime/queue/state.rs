@@ -1,4 +1,4 @@
-//! What is reconciled when: each object by one reconcile at a time, and none of its events lost. Pure: the time is handed in.
+//! Times of reconciles: each object has one reconcile at a time, and none of its events is lost. Pure: the time is handed in.
 //!
 //! An object is ready, waits for a time, or runs. An event makes it ready at once; while it runs, any number of events makes one
 //! more reconcile after it. What a reconcile asks for counts from its end, unless something has happened meanwhile.
@@ -22,7 +22,7 @@ pub struct Limits {
     pub creates_per_namespace: usize,
 }
 
-/// What follows a reconcile.
+/// Step after a reconcile.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 pub enum After {
     /// The next one without any other cause, and how urgent it and all others are until then at the least.
@@ -51,7 +51,7 @@ pub struct State {
     timers: BTreeMap<DueKey, Key>,
     permits: Permits,
     running: usize,
-    /// Of these, those that are not urgent.
+    /// Running reconciles that are not urgent.
     running_others: usize,
     last_number: u64,
 }
@@ -264,7 +264,7 @@ impl State {
     }
 }
 
-/// Who may create a Job now: so many in all, and so many in each namespace.
+/// Permits to create a Job now: so many in all, and so many in each namespace.
 #[derive(Debug, Default)]
 struct Permits {
     taken: usize,

@@ -26,7 +26,7 @@ fn key(namespace: &str, name: impl Into<Arc<str>>) -> Key {
 
 struct Running {
     queue: Arc<Queue>,
-    /// What has begun, and when.
+    /// Reconciles that have begun, and when.
     begun: mpsc::UnboundedReceiver<(Key, Instant)>,
     stop: watch::Sender<bool>,
     task: JoinHandle<()>,

@@ -49,7 +49,7 @@ pub fn of_pod(pod: &Pod, is_gone: bool) -> Class {
     urgent_or(is_gone || is_over || all_ended || is_deleting, Class::Refresh)
 }
 
-/// What a reconcile has decided, for all that follows it.
+/// Urgency that a reconcile has decided, for all that follows it.
 pub fn after(submission: &Submission, plan: &Plan) -> Class {
     let awaits_report_of_end = plan.report.as_ref().is_some_and(|demand| demand.stage > Stage::Live);
     if awaits_report_of_end && !plan.status.has_ended() {

@@ -10,7 +10,7 @@ use kube::client::Body;
 use serde_json::{Value, json};
 use tower_test::mock::{Handle, SendResponse, pair};
 
-/// What happens to one request.
+/// Fault of one request.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 pub enum Fault {
     /// It is answered as a server would.
@@ -31,11 +31,11 @@ pub enum Fault {
 pub struct State {
     pub lease: Option<Value>,
     version: u64,
-    /// Of the next writes, in order; then none.
+    /// Faults of the next writes, in order; then none.
     pub writes: VecDeque<Fault>,
-    /// Of the next reads.
+    /// Faults of the next reads.
     pub reads: VecDeque<Fault>,
-    /// What every request meets from now on, if set.
+    /// Fault of every request from now on, if set.
     pub always: Option<Fault>,
     /// Requests that arrived, `GET`, `POST` or `PUT`.
     pub log: Vec<String>,

@@ -191,7 +191,7 @@ impl World {
         }
     }
 
-    /// Those whose fence is open.
+    /// Processes whose fence is open.
     fn writers(&self) -> Vec<(usize, i32)> {
         let open = |(who, candidate): (usize, &Candidate)| {
             let leading = candidate.leading.filter(|_| !candidate.is_lost)?;
