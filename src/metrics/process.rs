@@ -29,8 +29,6 @@ impl Collector for Process {
         let file = |name| fs::read_to_string(format!("/proc/self/{name}")).unwrap_or_default();
         // The folder that is read is open as well.
         let open = fs::read_dir("/proc/self/fd").map(|files| files.count().saturating_sub(1));
-        let runtime = Handle::try_current().map(|handle| handle.metrics()).ok();
-        let of_runtime = |read: fn(&RuntimeMetrics) -> usize| runtime.as_ref().map(read).and_then(number);
         let mut to = Scrape(encoder);
         to.counter(
             "process_cpu_seconds",
@@ -57,27 +55,33 @@ impl Collector for Process {
             "Unix time at which the process began",
             Some(self.0),
         )?;
-        to.gauge(
-            "leaderboard_runtime_workers",
-            "Threads that run tasks",
-            of_runtime(RuntimeMetrics::num_workers),
-        )?;
-        to.gauge(
-            "leaderboard_runtime_tasks",
-            "Tasks that have not ended",
-            of_runtime(RuntimeMetrics::num_alive_tasks),
-        )?;
-        to.gauge(
-            "leaderboard_runtime_queued_tasks",
-            "Tasks that are ready to go on and that no thread has taken yet",
-            of_runtime(RuntimeMetrics::global_queue_depth),
-        )?;
-        to.counter(
+        of_runtime(&mut to)
+    }
+}
+
+fn of_runtime(to: &mut Scrape<'_>) -> fmt::Result {
+    let runtime = Handle::try_current().map(|handle| handle.metrics()).ok();
+    let of_runtime = |read: fn(&RuntimeMetrics) -> usize| runtime.as_ref().map(read).and_then(number);
+    to.gauge(
+        "leaderboard_runtime_workers",
+        "Threads that run tasks",
+        of_runtime(RuntimeMetrics::num_workers),
+    )?;
+    to.gauge(
+        "leaderboard_runtime_tasks",
+        "Tasks that have not ended",
+        of_runtime(RuntimeMetrics::num_alive_tasks),
+    )?;
+    to.gauge(
+        "leaderboard_runtime_queued_tasks",
+        "Tasks that are ready to go on and that no thread has taken yet",
+        of_runtime(RuntimeMetrics::global_queue_depth),
+    )?;
+    to.counter(
             "leaderboard_runtime_busy_seconds",
             "Time for which threads ran tasks, summed over all threads; as many seconds a second as there are threads means overload",
             runtime.as_ref().map(busy_seconds),
         )
-    }
 }
 
 /// Takes samples without labels; a value that could not be read is left out.

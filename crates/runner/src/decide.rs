@@ -256,13 +256,11 @@ const SIMULATOR_DONE: Conclusion = Conclusion {
 
 /// Judges the end, once every process has ended. `complete`: the agent's checkpoint has its global record, or all its routes.
 pub(crate) fn conclude(side: Side, cause: Cause, complete: bool, seen: &Seen) -> Conclusion {
-    let silent = |hold, code| Conclusion { mark: None, hold, code };
-    let hold = |hold| if side == Side::Host { hold } else { Hold::Free };
     match cause {
         Cause::Terminated => silent(Hold::Free, CODE_TERMINATED),
         Cause::Mute => silent(Hold::Free, CODE_MUTE),
-        Cause::AlreadyDone => silent(hold(Hold::Flush), CODE_OVER),
-        Cause::Cancelled => silent(hold(Hold::Cancel), CODE_OVER),
+        Cause::AlreadyDone => silent(of_host(side, Hold::Flush), CODE_OVER),
+        Cause::Cancelled => silent(of_host(side, Hold::Cancel), CODE_OVER),
         Cause::PeerDone => SIMULATOR_DONE,
         // The agent's image may take an hour to come, and nothing that it does helps.
         Cause::NoGpu | Cause::AgentHasNoGpu | Cause::GraphicsDriverMissing => Conclusion {
@@ -278,36 +276,49 @@ pub(crate) fn conclude(side: Side, cause: Cause, complete: bool, seen: &Seen) ->
         | Cause::PortTaken
         | Cause::CannotStart(_)
         | Cause::NodeRefused
-        | Cause::NoProcess => {
-            let ran = !matches!(
-                cause,
-                Cause::NotReady | Cause::CannotStart(_) | Cause::NodeRefused | Cause::NoProcess
-            );
-            if side == Side::Host && seen.peer_done {
-                SIMULATOR_DONE
-            } else if side == Side::Agent && ran && complete {
-                Conclusion {
-                    mark: Some(EndMark::Done),
-                    hold: Hold::Peer,
-                    code: CODE_OVER,
-                }
-            } else if seen.cancel {
-                silent(hold(Hold::Cancel), CODE_OVER)
-            } else {
-                let code = match cause {
-                    Cause::CannotStart(code) => code,
-                    Cause::NodeRefused => CODE_NODE_REFUSED,
-                    Cause::NoProcess => CODE_NO_PROCESS,
-                    _ => CODE_CRASHED,
-                };
-                Conclusion {
-                    mark: Some(EndMark::Crash),
-                    hold: Hold::Peer,
-                    code,
-                }
-            }
-        }
+        | Cause::NoProcess => crashed(side, cause, complete, seen),
     }
+}
+
+/// Judges an end that is a crash, unless the run was over or asked to end by then.
+fn crashed(side: Side, cause: Cause, complete: bool, seen: &Seen) -> Conclusion {
+    let ran = !matches!(
+        cause,
+        Cause::NotReady | Cause::CannotStart(_) | Cause::NodeRefused | Cause::NoProcess
+    );
+    if side == Side::Host && seen.peer_done {
+        return SIMULATOR_DONE;
+    }
+    if side == Side::Agent && ran && complete {
+        return Conclusion {
+            mark: Some(EndMark::Done),
+            hold: Hold::Peer,
+            code: CODE_OVER,
+        };
+    }
+    if seen.cancel {
+        return silent(of_host(side, Hold::Cancel), CODE_OVER);
+    }
+    let code = match cause {
+        Cause::CannotStart(code) => code,
+        Cause::NodeRefused => CODE_NODE_REFUSED,
+        Cause::NoProcess => CODE_NO_PROCESS,
+        _ => CODE_CRASHED,
+    };
+    Conclusion {
+        mark: Some(EndMark::Crash),
+        hold: Hold::Peer,
+        code,
+    }
+}
+
+fn silent(hold: Hold, code: i32) -> Conclusion {
+    Conclusion { mark: None, hold, code }
+}
+
+/// Hold of the host's side; the agent's is free.
+fn of_host(side: Side, hold: Hold) -> Hold {
+    if side == Side::Host { hold } else { Hold::Free }
 }
 
 /// Next step while the exit is held.

@@ -57,15 +57,9 @@ pub async fn restore(
         tracing::warn!("the prefix holds more than {MAX_OBJECTS} objects; the rest is not restored");
     }
     let limit = run.plan.storage.s3.size_limit.bytes();
-    let chosen = choose(
-        listing.objects,
-        &Quota::new(limit, run.plan.workers()),
-        run.plan.workers(),
-    );
-    let others = chosen.others.iter().chain(&chosen.of_workers);
-    let others: Vec<(String, Stored)> = others
-        .map(|other| (other.key.clone(), Stored::unknown(other.size)))
-        .collect();
+    let workers = run.plan.workers();
+    let chosen = choose(listing.objects, &Quota::new(limit, workers), workers);
+    let others = chosen.unknown();
     let of_workers = chosen.of_workers.len();
     for object in chosen.of_workers {
         let path = of_worker(&object.key).map(checkpoint_path).unwrap_or_default();
@@ -108,6 +102,14 @@ struct Chosen {
     others: Vec<Listed>,
     /// How many of them are not left there on purpose.
     left_out: usize,
+}
+
+impl Chosen {
+    /// Objects that are not restored as they are: their content is not known.
+    fn unknown(&self) -> Vec<(String, Stored)> {
+        let all = self.others.iter().chain(&self.of_workers);
+        all.map(|one| (one.key.clone(), Stored::unknown(one.size))).collect()
+    }
 }
 
 /// Chooses objects: results and known logs first, then the smallest, so that no flood and no huge file keeps a checkpoint out.

@@ -98,6 +98,11 @@ pub(super) fn watch(draft: &mut PlanBuilder<'_>, job: &JobView) {
         return unschedulable(draft, job, words, pod.scale_up.as_ref());
     }
     let since = pod.scheduled.or(job.begun()).unwrap_or(draft.now());
+    on_its_node(draft, pod, since);
+}
+
+/// Judges the containers of a Pod that has its node, or waits for one in silence.
+fn on_its_node(draft: &mut PlanBuilder<'_>, pod: &PodView, since: Timestamp) {
     let found = cause::trouble_of(pod);
     let stalled = found
         .as_ref()
