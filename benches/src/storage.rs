@@ -11,7 +11,7 @@ use axum::extract::{Request, State};
 use axum::http::{Method, StatusCode, header};
 use axum::response::{IntoResponse, Response};
 use leaderboard_api::{Attempt, Metric, WorkerState};
-use leaderboard_contract::report::{Outcome, REPORT_KEY, Report, ReportWorker, SCHEMA, StoredFile};
+use leaderboard_contract::report::{Outcome as RunOutcome, REPORT_KEY, Report, ReportWorker, SCHEMA, StoredFile};
 use tokio::net::TcpListener;
 use tokio::task::JoinHandle;
 
@@ -188,7 +188,11 @@ fn report(is_final: bool) -> Report {
         ],
         is_final,
         eligible: true,
-        outcome: if is_final { Outcome::Finished } else { Outcome::Running },
+        outcome: if is_final {
+            RunOutcome::Finished
+        } else {
+            RunOutcome::Running
+        },
         stopped: None,
         refused: None,
         warnings: Vec::new(),

@@ -2,6 +2,7 @@
 #![cfg(test)]
 
 use std::collections::BTreeMap;
+use std::sync::Arc;
 
 use aws_sdk_dynamodb::types::{
     AttributeDefinition, AttributeValue, BillingMode, KeySchemaElement, KeyType, ScalarAttributeType,
@@ -12,7 +13,7 @@ use tokio::sync::{mpsc, watch};
 use super::bridge::{LIMIT, StandIn};
 use crate::support::throttle::Throttle;
 use leaderboard_api as api;
-use leaderboard_aws::table::{Row, Table, Written};
+use leaderboard_aws::table::{Row, Table, Tables, Written};
 use leaderboard_base::object_key::ObjectKey;
 use leaderboard_base::shutdown::Stop;
 use leaderboard_base::spans::LogSpan;
@@ -393,7 +394,8 @@ fn records(stand_in: &StandIn) -> (Asker<Record>, mpsc::UnboundedReceiver<String
     let (wake, woken) = mpsc::unbounded_channel();
     let (stop, stopped) = Stop::new();
     let wake = Box::new(move |key: &ObjectKey| wake.send(key.name.clone()).unwrap());
-    let records = records::start(&stand_in.aws, || true, &Tasks::new(stopped), wake);
+    let tables = Arc::new(Tables::new(stand_in.aws.clone()));
+    let records = records::start(tables, || true, &Tasks::new(stopped), wake);
     (records, woken, stop)
 }
 

@@ -105,7 +105,10 @@ async fn a_message_delivered_again_and_again_runs_once_and_only_a_resume_runs_ag
             .submission(&name, "the second attempt begins", LIMIT, resumed)
             .await;
         let running = scene.running(&name, LIMIT).await;
-        assert_eq!((state(&running), reason(&running)), (Some(State::Resumed), "Resumed"));
+        assert_eq!(
+            (state(&running), reason(&running).as_str()),
+            (Some(State::Resumed), "Resumed")
+        );
         let finished = scene.settled(&name, LIMIT).await;
         assert_eq!(
             (state(&finished), score(&finished)),

@@ -9,6 +9,7 @@ use super::super::reconciles::Queues;
 use super::*;
 use crate::fixtures::{self, Cluster, surroundings};
 use crate::metrics::Metrics;
+use leaderboard_api::Attempt;
 use leaderboard_base::shutdown::Stop;
 
 const NOW: &str = "2026-01-01T01:00:00Z";
@@ -146,6 +147,7 @@ fn in_state(state: State, reason: Option<&str>, class: Option<&str>) -> Submissi
     let status = one.status.as_mut().unwrap();
     // What is for people is read by nobody.
     status.state = Some(State::Resumed);
+    status.attempt = Some(Attempt::FIRST);
     status.reason = reason.map(Into::into);
     status.failure = serde_json::from_value(json!(failure)).unwrap();
     one

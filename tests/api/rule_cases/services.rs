@@ -2,20 +2,21 @@
 
 use serde_json::{Value, json};
 
-use super::super::objects::{Kind::Leaderboard, merge};
-use super::{Case, create, evalai, track, update};
+use super::super::objects::Kind::Leaderboard;
+use super::{Case, create, served, update};
 
 pub(super) fn all() -> Vec<Case> {
-    [server(), queue(), networks(), labels(), identities_and_tables(), endpoints()]
-        .into_iter()
-        .flatten()
-        .collect()
-}
-
-fn served(more: &Value) -> Value {
-    let mut spec = json!({"evalai": evalai(), "tracks": [track(&json!({"phase": 7}))]});
-    merge(&mut spec, more);
-    spec
+    [
+        server(),
+        queue(),
+        networks(),
+        labels(),
+        identities_and_tables(),
+        endpoints(),
+    ]
+    .into_iter()
+    .flatten()
+    .collect()
 }
 
 fn server() -> Vec<Case> {

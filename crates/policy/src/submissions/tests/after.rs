@@ -28,12 +28,7 @@ const PUBLISHED_AS: &str = "EvalAI has the result: 4 of 4 routes, Driving score 
 fn evalai_first_then_the_table_then_rest() {
     // A failure has had its event at once.
     for (mut world, state, update, told) in [
-        (
-            finished(),
-            Finished,
-            EvalaiUpdate::Finished,
-            vec![Reason::Published.into()],
-        ),
+        (finished(), Finished, EvalaiUpdate::Finished, vec![Reason::Published]),
         (failed(), Failed, EvalaiUpdate::Failed, Vec::new()),
     ] {
         let mut plan = world.pass();

@@ -148,8 +148,8 @@ fn each_end_without_that_has_its_class_and_reason() {
         ..report(3)
     };
     for (report, reason) in [
-        (ineligible("Rejected"), Reason::NotEligible),
-        (ineligible("Invalid"), Reason::NotEligible),
+        (ineligible(Outcome::Rejected), Reason::NotEligible),
+        (ineligible(Outcome::Invalid), Reason::NotEligible),
         (refused(true), Reason::InvalidResults),
     ] {
         let failure = completes_with(Some(report), reason);

@@ -5,6 +5,7 @@ use crate::submissions::failure::for_both;
 use crate::submissions::failure::{at_the_end, infrastructure, invalid_results, participant};
 use leaderboard_api::text::sentence;
 use leaderboard_api::{Failure, FailureClass, Reason};
+use leaderboard_contract::report::RefusedResults;
 
 #[test]
 fn a_next_step_is_added_at_the_end() {
@@ -31,7 +32,11 @@ fn words_become_one_sentence() {
     for (words, wanted) in [("no", "no."), (" no. ", "no."), ("cut …", "cut …"), ("", "")] {
         assert_eq!(sentence(words), wanted);
     }
-    assert!(!invalid_results("a score of NaN.").message.contains(".."));
+    assert!(
+        !invalid_results(&RefusedResults::new(None, "a score of NaN."))
+            .message
+            .contains("..")
+    );
 }
 
 /// The failure of a run whose agent 2 has ended like this as often as it may.
