@@ -9,15 +9,7 @@ use kube::config::KubeconfigError;
 use kube::runtime::watcher;
 
 use super::text::clean;
-use leaderboard_api::client_errors as text;
-
-/// Where this version's documents are.
-pub const DOCS: &str = concat!(
-    env!("CARGO_PKG_REPOSITORY"),
-    "/blob/v",
-    env!("CARGO_PKG_VERSION"),
-    "/docs/"
-);
+use leaderboard_api::{DOCUMENTS, client_errors as text};
 
 /// Why a command could not be carried out.
 #[derive(thiserror::Error, Debug)]
@@ -32,7 +24,7 @@ pub enum Error {
     Credentials(String),
     /// The person lacks a right.
     #[error(
-        "missing right: {0}. Check namespace and context, or ask for the right: {DOCS}plugin.md#rights has a Role with all that the plugin needs"
+        "missing right: {0}. Check namespace and context, or ask for the right: {DOCUMENTS}plugin.md#rights has a Role with all that the plugin needs"
     )]
     Forbidden(String),
     /// The cluster does not have the kind.

@@ -2,7 +2,7 @@
 
 use clap::Command;
 
-use crate::error::DOCS;
+use leaderboard_api::DOCUMENTS;
 
 /// Heading of the flags that every command takes.
 pub const GLOBAL: &str = "Global options";
@@ -25,7 +25,7 @@ pub fn dressed(mut command: Command) -> Command {
             return one;
         };
         let after = one.get_after_help().map(|text| format!("\n\n{text}"));
-        let after = after.unwrap_or_default().replace("docs/", DOCS);
+        let after = after.unwrap_or_default().replace("docs/", DOCUMENTS);
         let globals = "`kubectl leaderboard --help` lists the global options, such as -n NAMESPACE.";
         let one = one.mut_args(|flag| if flag.is_global_set() { flag.hide(true) } else { flag });
         one.after_help(format!("Examples:\n{examples}{after}\n\n{globals}"))
