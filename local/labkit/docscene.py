@@ -9,7 +9,7 @@ from pathlib import Path
 from typing import Any
 
 from . import docpages
-from .chartcases import RELEASE, SYSTEM
+from .chartcases import RELEASE, SET_IMAGE, SYSTEM
 from .chartrender import documents, folder
 from .docpages import Block
 from .kube import Kube, last_words
@@ -62,7 +62,7 @@ APPLY = ("apply", "--server-side", "--force-conflicts", "--dry-run=server", "--v
 
 def prepare(repository: Path, kube: Kube) -> None:
     """The operator as the chart installs it, and objects by the names that the pages use, which have ended well."""
-    argv = ["install", RELEASE, str(folder(repository)), f"--namespace={SYSTEM}", "--create-namespace"]
+    argv = ["install", RELEASE, str(folder(repository)), f"--namespace={SYSTEM}", "--create-namespace", SET_IMAGE]
     kube.run("helm", *argv)
     definitions = ("crd/leaderboards.leaderboard.carla.org", "crd/submissions.leaderboard.carla.org")
     kube.run("kubectl", "wait", "--for=condition=Established", *definitions, "--timeout=60s")
@@ -130,7 +130,7 @@ def applied(repository: Path, kube: Kube, page: str, kind: str, text: str) -> st
     if kind == "other":
         return "a manifest of nothing that is known: give it a kind, or a reason in docscene.py"
     if kind == "values":
-        done = kube.attempt("helm", "template", RELEASE, str(folder(repository)), "--values=-", given=text)
+        done = kube.attempt("helm", "template", RELEASE, str(folder(repository)), SET_IMAGE, "--values=-", given=text)
         return last_words(done.stderr) if done.returncode != 0 else ""
     if kind == "part":
         base = example(repository, kube, {"metadata": {"name": "fragment"}, "spec": INSTEAD.get(page, {})})
