@@ -12,6 +12,7 @@ use leaderboard_api::conditions::{RUNNING, STALLED};
 /// How long a run may take.
 const LIMIT: i64 = 3600;
 
+#[allow(clippy::unnecessary_wraps, reason = "the field of a Job is optional")]
 fn suspended(since: i64, queue: Option<&str>) -> Option<Box<Suspension>> {
     Some(Box::new(Suspension {
         since: Some(at(since)),
