@@ -154,6 +154,42 @@ mod tests {
     }
 
     #[test]
+    fn the_mark_of_the_results_moves_with_each_result_that_ranks_and_with_nothing_else() {
+        let one = |name: &str, score: &str, ends: &str, published: &str| {
+            let conditions = [
+                condition("Finished", "True", ends),
+                condition("Published", "False", published),
+            ];
+            let score = json!({"name": "Driving score", "value": score, "text": score, "final": true});
+            let mut one = submission(name, false, &json!({"score": score, "conditions": conditions}));
+            one.metadata.uid = Some(name.into());
+            one
+        };
+        let mark = |all: &[Submission]| Census::of(all).results;
+        let (a, b) = (
+            one("a", "1", "Finished", "Waiting"),
+            one("b", "2", "Finished", "Waiting"),
+        );
+        let both = mark(&[a.clone(), b.clone()]);
+        assert_eq!(mark(&[b.clone(), a.clone()]), both, "in any order");
+        for other in [
+            one("a", "1.5", "Finished", "Waiting"),
+            one("a", "1", "Finished", "CancelledInEvalAI"),
+            one("c", "1", "Finished", "Waiting"),
+        ] {
+            assert_ne!(mark(&[other, b.clone()]), both);
+        }
+        let running = json!({"conditions": [condition("Running", "True", "Running")]});
+        assert_eq!(mark(&[a.clone(), b.clone(), submission("r", false, &running)]), both);
+        assert_eq!(
+            mark(&[one("a", "1", "Finished", "Refused"), b]),
+            both,
+            "the result is the same"
+        );
+        assert_eq!(mark(&[one("a", "1", "Cancelled", "Waiting")]), 0);
+    }
+
+    #[test]
     fn the_teams_that_have_used_the_most_come_first_and_no_more_than_ten() {
         let used = |team: &str, gpu_seconds: i64| {
             let status = json!({"use": {"gpus": 4, "gpuSeconds": gpu_seconds}, "team": {"name": team}});
