@@ -63,7 +63,9 @@ class Shown(unittest.TestCase):
         with redirect_stdout(shown):
             demo.show(SimpleNamespace(run=lambda *_: "the table of kubectl"), good())
         headings = [line for line in shown.getvalue().splitlines() if line.startswith("--- ")]
-        self.assertEqual(headings[2:], ["--- S3: s3://leaderboard-20/1", "--- DynamoDB: table leaderboard-20", "--- EvalAI"])
+        self.assertEqual(
+            headings[2:], ["--- S3: s3://leaderboard-20/1", "--- DynamoDB: table leaderboard-20", "--- EvalAI"]
+        )
 
 
 class Comparison(unittest.TestCase):

@@ -262,7 +262,6 @@ class Engines(unittest.TestCase):
             engine.clear(own)
             self.assertFalse(own.storage.exists())
 
-
     def test_one_that_outlives_its_run_keeps_the_next_one_out(self) -> None:
         """As a run that is killed leaves it behind, at work on the caches."""
         with tempfile.TemporaryDirectory() as folder:
@@ -274,9 +273,11 @@ class Engines(unittest.TestCase):
             program.chmod(0o755)
             run = os.fork()
             if run == 0:
-                with patch.object(engine, "ensure", return_value=str(program)):
-                    with engine.opened(SimpleNamespace(cache=Path(folder))) as own:
-                        own.run("images", "--all")
+                with (
+                    patch.object(engine, "ensure", return_value=str(program)),
+                    engine.opened(SimpleNamespace(cache=Path(folder))) as own,
+                ):
+                    own.run("images", "--all")
                 os._exit(1)
             self.assertEqual(said.read_text(), "runs\n")
             os.kill(run, signal.SIGKILL)
@@ -295,7 +296,9 @@ class NotRunLayers(unittest.TestCase):
             raise NotRun("no engine")
 
         with redirect_stderr(StringIO()):
-            result = testrun.run_layer(testrun.Plan(SimpleNamespace(), ""), testrun.Layer("image", "it", work, testrun.COMPUTES), [])
+            result = testrun.run_layer(
+                testrun.Plan(SimpleNamespace(), ""), testrun.Layer("image", "it", work, testrun.COMPUTES), []
+            )
         self.assertEqual((result.failure, result.lacks), ("", "no engine"))
         lines = testrun.table([testrun.Result("lab", 1.0, ""), result], 1.0).splitlines()
         self.assertTrue(lines[2].endswith("   not run: no engine"))
