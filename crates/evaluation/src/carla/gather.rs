@@ -303,7 +303,9 @@ impl Gatherer {
                 self.unmerged = None;
             }
             Err(refusal) => {
-                let worker = refusal.pair().and_then(|pair| u32::try_from(pair + 1).ok());
+                let worker = refusal
+                    .pair()
+                    .and_then(|pair| u32::try_from(pair.saturating_add(1)).ok());
                 let refused = RefusedResults::new(worker, reason(&refusal));
                 tracing::warn!("the checkpoints are not merged: {refused}");
                 self.unmerged = Some(refused);

@@ -52,7 +52,7 @@ pub(super) fn at_the_end(found: Failure) -> Failure {
             let step = of_infrastructure(&found.reason);
             Failure {
                 message: format!("{} {step}", found.message).trim_end().to_owned(),
-                next_step: Some(step.to_owned()).filter(|step| !step.is_empty()),
+                next_step: Some(step.clone()).filter(|step| !step.is_empty()),
                 ..found
             }
         }

@@ -77,7 +77,7 @@ fn a_track_ranks_as_evalai_does_then_as_before_then_as_its_evaluation() {
     let comfort = || ranking("Comfort", Order::Descending);
     let named = |ranking: Option<Ranking>| Some(ranking.map(|ranking| (7, ranking)).into_iter().collect());
     let known = |stored: Option<Ranking>| leaderboard(true, &track(stored.as_ref(), &[]));
-    for (name, board, named, expected, lacking) in [
+    for (name, board, named, expected, lacking) in vec![
         ("EvalAI's", known(None), named(Some(completion())), completion(), None),
         (
             "EvalAI's new one",
@@ -185,7 +185,7 @@ fn an_object_is_deleted_only_when_the_standings_are_right_without_it() {
     let driving = || ranking("Driving score", Order::Descending);
     let with = |stored: &[Submission]| leaderboard(true, &track(Some(&driving()), &rows(stored)));
     let full = with(&best);
-    for (name, board, submission, expected) in [
+    for (name, board, submission, expected) in vec![
         ("not stored yet", with(&[]), finished("a", 40), false),
         ("stored", with(&[finished("a", 40)]), finished("a", 40), true),
         ("none of the best", full.clone(), finished("a", 40), true),

@@ -122,7 +122,7 @@ type Keeps = (&'static str, fn(&mut World));
 fn nothing_else_is_ever_deleted() {
     let cases: [Keeps; 7] = [
         ("retention is off", |w| {
-            w.leaderboard().retention.finished_seconds = None
+            w.leaderboard().retention.finished_seconds = None;
         }),
         ("its Leaderboard is gone", |w| w.view.leaderboard = None),
         ("a person deletes it", World::delete),
