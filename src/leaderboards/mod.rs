@@ -117,12 +117,11 @@ async fn drive(leaderboard: Arc<Leaderboard>, uses: Uses<'_>) -> Result<Duration
         return Ok(RESYNC);
     }
     let left = looked.waits().map(|waited| FIRST_LOOK.saturating_sub(waited));
-    let again = match left.filter(|left| !left.is_zero()) {
-        Some(left) => left,
-        None => {
-            let shown = (&plan, &made);
-            write_status(writer, state, &leaderboard, version.as_deref(), shown, now).await?
-        }
+    let again = if let Some(left) = left.filter(|left| !left.is_zero()) {
+        left
+    } else {
+        let shown = (&plan, &made);
+        write_status(writer, state, &leaderboard, version.as_deref(), shown, now).await?
     };
     let patience = looked.reach.patience().unwrap_or(RESYNC);
     let policy = isolation::again(&view.policy, stores.shows_policy(&view.leaderboard));

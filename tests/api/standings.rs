@@ -129,7 +129,7 @@ async fn each_track_ranks_by_the_schema_of_its_phase_and_a_metric_that_is_not_sh
         split.schema.metadata = json!({"Route completion": {"sort_ascending": true}});
     });
     change_board(&world, 2, |split| {
-        split.schema.default_order_by = "Agent blocked".into()
+        split.schema.default_order_by = "Agent blocked".into();
     });
     let tracks_of = json!({"tracks": [{"name": "sensors", "phase": 1}, {"name": "map", "phase": 2}]});
     world.leaderboard_with("lb", 1, "Hosts", &tracks_of).await;

@@ -76,8 +76,8 @@ fn a_track_ranks_as_evalai_does_then_as_before_then_as_its_evaluation() {
     let completion = || ranking("Route completion", Order::Ascending);
     let comfort = || ranking("Comfort", Order::Descending);
     let named = |ranking: Option<Ranking>| Some(ranking.map(|ranking| (7, ranking)).into_iter().collect());
-    let known = |stored: Option<Ranking>| leaderboard(true, &track(stored.as_ref(), &[]));
-    for (name, board, named, expected, lacking) in vec![
+    let known = |stored: Option<Ranking>| Box::new(leaderboard(true, &track(stored.as_ref(), &[])));
+    for (name, board, named, expected, lacking) in [
         ("EvalAI's", known(None), named(Some(completion())), completion(), None),
         (
             "EvalAI's new one",
@@ -110,7 +110,7 @@ fn a_track_ranks_as_evalai_does_then_as_before_then_as_its_evaluation() {
         ),
         (
             "local",
-            leaderboard(false, &track(Some(&completion()), &[])),
+            Box::new(leaderboard(false, &track(Some(&completion()), &[]))),
             None,
             driving(),
             None,
