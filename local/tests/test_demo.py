@@ -135,7 +135,7 @@ class Following(unittest.TestCase):
 
     def test_a_line_of_kubectl_is_read(self) -> None:
         seen = follow.parse(
-            self.line("Running", "3/20", "~61.00", "Running", "node", "", "", "3 of 20 routes are done")
+            self.line("Running", "3/20", "~61.00", "", "node", "", "", "3 of 20 routes are done")
         )
         assert seen is not None
         self.assertEqual(seen.line(), "Running   3/20   ~61.00")
@@ -145,7 +145,7 @@ class Following(unittest.TestCase):
         self.assertTrue(stopping.line().endswith("it was cancelled"))
 
     def test_it_is_stored_when_both_services_have_it(self) -> None:
-        finished = ("Finished", "20/20", "69.41", "Finished", "node")
+        finished = ("Finished", "20/20", "69.41", "", "node")
         for published, recorded, stored in (("", "", False), ("True", "False", False), ("True", "True", True)):
             seen = follow.parse(self.line(*finished, published, recorded, ""))
             assert seen is not None
