@@ -88,7 +88,7 @@ pub(super) struct Ended {
     #[serde(flatten)]
     pub who: Who,
     pub state: &'static str,
-    /// Whose failure it is.
+    /// Side that caused the failure.
     pub class: Option<&'static str>,
     pub reason: Option<String>,
     pub score: Option<String>,
@@ -164,7 +164,7 @@ impl Waits {
             let began = status.condition(conditions::FINISHED);
             let since = began.map(|c| c.last_transition_time.0).or(created);
             let waiting = status.waiting.as_deref();
-            let meaning = status.reason.as_ref().and_then(ReasonName::known);
+            let meaning = status.present_reason().as_ref().and_then(ReasonName::known);
             let meaning = meaning.map(|reason| reasons::plain(reason.meaning()));
             let own = status.message.as_deref().unwrap_or_default();
             Self {

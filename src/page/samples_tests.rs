@@ -227,7 +227,7 @@ pub(super) fn leaderboards() -> Vec<Arc<Leaderboard>> {
     });
     let mut denied = condition("Ready", "False", "AwsDenied", HOUR);
     denied["message"] =
-        "s3:PutObject is denied for the bucket results-10; give the role the policy of docs/aws.md".into();
+        "s3:PutObject is denied for the bucket results-10; give the role the policy of the bucket".into();
     let broken = json!({"evalai": {"requestsLastMinute": 4, "requestsPerMinute": 30}, "conditions": [denied]});
     vec![
         leaderboard(

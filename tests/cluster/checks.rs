@@ -76,7 +76,7 @@ async fn a_good_leaderboard_passes_while_it_is_paused() {
             &[
                 "is Finished since",
                 "1/1 routes done",
-                "S3:          Stored",
+                "Delivered:   S3.",
                 "Ready:       True, Ready",
                 "The check passed.",
             ],

@@ -120,11 +120,11 @@ pub struct ContentsContainer {
     /// Arguments of the command.
     #[serde(default, skip_serializing_if = "Option::is_none")]
     pub args: Option<Vec<String>>,
-    /// Further environment.
+    /// Environment variables beside those that the operator sets.
     #[serde(default, skip_serializing_if = "Vec::is_empty")]
     #[x_kube(merge_strategy = ListMerge::Map(vec!["name".into()]))]
     pub env: Vec<EnvVar>,
-    /// Requests and limits.
+    /// Requests and limits of the container.
     #[serde(default, skip_serializing_if = "Option::is_none")]
     pub resources: Option<ResourceRequirements>,
     /// Laid over the safe default field by field. To remove one of its fields, set it to null in podOverrides.
@@ -150,7 +150,7 @@ pub struct SimulatorContainer {
     /// Arguments of the command.
     #[serde(default, skip_serializing_if = "Option::is_none")]
     pub args: Option<Vec<String>>,
-    /// Further environment.
+    /// Environment variables beside those that the operator sets.
     #[serde(default, skip_serializing_if = "Vec::is_empty")]
     #[x_kube(merge_strategy = ListMerge::Map(vec!["name".into()]))]
     pub env: Vec<EnvVar>,

@@ -74,7 +74,7 @@ pub struct Network {
     pub dns_servers: Vec<String>,
 }
 
-/// One range of addresses.
+/// One range of addresses that Pods may reach.
 #[derive(Serialize, Deserialize, KubeSchema, Clone, Debug, PartialEq, Eq)]
 #[x_kube(validation = Rule::new("isCIDR(self.cidr)").message("network.egress[].cidr is not a range of addresses such as 10.0.0.0/16"))]
 pub struct Egress {

@@ -45,7 +45,7 @@ pub struct Evalai {
     #[serde(default = "defaults::split")]
     #[schemars(length(min = 1, max = 128))]
     pub split: String,
-    /// A host's token.
+    /// Token of a member of the host team, for EvalAI's API.
     pub token: Token,
     /// Requests per minute of this token; the server's own limit is 60, shared with the host's browser.
     #[serde(default = "defaults::requests_per_minute")]

@@ -117,7 +117,7 @@ pub struct Standing {
     /// Attempt that had this result.
     #[serde(default, skip_serializing_if = "Option::is_none")]
     pub attempt: Option<Attempt>,
-    /// When it was submitted.
+    /// Time at which the team submitted it.
     #[serde(default, skip_serializing_if = "Option::is_none")]
     pub submitted_at: Option<Time>,
     /// When its run had ended.

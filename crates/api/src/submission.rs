@@ -69,7 +69,7 @@ pub struct SubmissionSpec {
     #[serde(default, skip_serializing_if = "Option::is_none")]
     #[schemars(length(min = 1, max = 512), regex(pattern = r"^[a-z0-9][!-~]*$"))]
     pub image: Option<String>,
-    /// Its identity in EvalAI.
+    /// Identity of the submission in EvalAI.
     #[serde(default, skip_serializing_if = "Option::is_none")]
     pub evalai: Option<EvalaiRef>,
     /// Name of the track, for a submission that is not EvalAI's.

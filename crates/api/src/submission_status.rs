@@ -88,7 +88,7 @@ pub struct SubmissionStatus {
     /// conditions have it then, too.
     #[serde(default, skip_serializing_if = "Option::is_none")]
     pub reason: Option<ReasonName>,
-    /// Reason as a sentence.
+    /// Sentence for people that explains the reason.
     #[serde(default, skip_serializing_if = "Option::is_none")]
     #[schemars(length(max = MAX_MESSAGE))]
     pub message: Option<SharedText>,
@@ -124,10 +124,10 @@ pub struct SubmissionStatus {
     #[x_kube(merge_strategy = ListMerge::Map(vec!["name".into()]))]
     #[schemars(length(max = MAX_METRICS))]
     pub metrics: Vec<Metric>,
-    /// Place in line.
+    /// Place of the submission in the line for a slot.
     #[serde(default, skip_serializing_if = "Option::is_none")]
     pub waiting: Option<Box<Waiting>>,
-    /// When what happened.
+    /// Times at which the submission reached each stage.
     #[serde(default, skip_serializing_if = "Times::is_empty")]
     pub times: Times,
     /// Duration of the run for people, such as `1h25m`; only once it has ended. `times` has it exactly.
@@ -224,7 +224,7 @@ pub struct RunPlan {
     /// Number of the EvalAI phase.
     #[serde(default, skip_serializing_if = "Option::is_none")]
     pub phase: Option<i64>,
-    /// Where the results go.
+    /// Bucket and prefix that receive the results.
     pub storage: Storage,
     /// The participant's image.
     #[schemars(length(max = 1024))]
@@ -297,7 +297,7 @@ impl Times {
     }
 }
 
-/// Whose failure it is.
+/// Side that caused the failure.
 #[derive(Serialize, Deserialize, JsonSchema, Clone, Copy, Debug, PartialEq, Eq, Hash)]
 pub enum FailureClass {
     Participant,
@@ -324,7 +324,7 @@ pub struct Failure {
     /// A sentence with the next step, for the challenge's hosts.
     #[schemars(length(max = MAX_MESSAGE))]
     pub message: String,
-    /// The next step alone.
+    /// Next step for the host, without the cause.
     #[serde(default, skip_serializing_if = "Option::is_none")]
     #[schemars(length(max = MAX_MESSAGE))]
     pub next_step: Option<String>,

@@ -343,7 +343,7 @@ reasons! {
         NotAllowed,
             "The Leaderboard names a Secret's entry, a queue, a bucket, a table or a log group that its namespace may not use. The \
              operator reads neither token nor queue, and starts and records nothing.",
-            "Name another one, or let the operator's administrator allow it under `leaderboards` of the chart's values.";
+            "Name another one, or let the operator's administrator allow it under `allow`, or in the entry of its namespace under `namespaces`, of the chart's values.";
         InsecureServer,
             "`evalai.apiServer` begins with http and is on the internet: everyone on the way could read the host's token.",
             "Use https.";
