@@ -218,7 +218,8 @@ fn text(file: &str) -> String {
 /// The metrics that docs/metrics.md lists.
 fn documented() -> BTreeSet<String> {
     let page = text(PAGE);
-    let table = page.split("## All metrics").nth(1).unwrap();
+    let table = page.split("\n## All metrics\n").nth(1).unwrap();
+    let table = table.split("\n## ").next().unwrap();
     let rows = table
         .lines()
         .filter_map(|line| line.strip_prefix("| `")?.split('`').next().map(str::to_owned));
