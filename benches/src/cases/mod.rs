@@ -38,7 +38,7 @@ pub enum Case {
     BurstRestart,
     /// 1,000 and 5,000 live ones: memory, rest, restart.
     Live,
-    /// 10,000 live ones, which the chart's limit of memory is to hold. Only where it is named, since it takes long.
+    /// 10,000 live ones, which half of the chart's limit of memory is to hold. Only where it is named, since it takes long.
     #[value(name = "live-10000")]
     Live10000,
     /// Whole lives next to many that have ended.

@@ -126,7 +126,7 @@ const AIMS: &[Aim] = &[
         AtMost(80.0),
     ),
     Aim(
-        "RSS, 10,000 live: the chart's limit",
+        "RSS, 10,000 live: half of the chart's limit",
         "live-10000",
         "RSS, MB, 10000 live",
         "MB",
