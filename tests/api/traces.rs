@@ -150,17 +150,16 @@ fn check_lines(lines: &[Value], uid: &str, namespace: &str) {
         let text = |field: &str| line[field].as_str().unwrap_or_default().to_owned();
         match text("to") {
             to if to.is_empty() => text("message"),
-            to => [format!("{} -> {to}", text("from")), text("reason")].join(" ").trim_end().to_owned(),
+            to => [format!("{} -> {to}", text("from")), text("reason")]
+                .join(" ")
+                .trim_end()
+                .to_owned(),
         }
     };
     let found: Vec<String> = lines.iter().map(said).collect();
     let mut last = found.clone();
     let deliveries: BTreeSet<String> = last.split_off(found.len().saturating_sub(2)).into_iter().collect();
-    let expected = [
-        "none -> Pending Preparing",
-        "Pending -> Running",
-        "Running -> Finished",
-    ];
+    let expected = ["none -> Pending Preparing", "Pending -> Running", "Running -> Finished"];
     assert_eq!(last, expected, "{found:?}");
     assert_eq!(
         deliveries,
