@@ -21,7 +21,8 @@ AGENT = "leaderboard-operator-"
 LEASE = "operator"
 VALUES: Mapping[str, Any] = {
     "fullnameOverride": LEASE,
-    "leaderboards": [{"namespace": "tests", "secrets": ["evalai"]}],
+    "namespaces": ["tests"],
+    "allow": {"secrets": ["evalai"]},
 }
 GROUP = "leaderboard.carla.org"
 DECISION = "authorization.k8s.io/decision"
