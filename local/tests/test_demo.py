@@ -134,9 +134,7 @@ class Following(unittest.TestCase):
         return follow.SEPARATOR.join(parts)
 
     def test_a_line_of_kubectl_is_read(self) -> None:
-        seen = follow.parse(
-            self.line("Running", "3/20", "~61.00", "", "node", "", "", "3 of 20 routes are done")
-        )
+        seen = follow.parse(self.line("Running", "3/20", "~61.00", "", "node", "", "", "3 of 20 routes are done"))
         assert seen is not None
         self.assertEqual(seen.line(), "Running   3/20   ~61.00")
         self.assertFalse(seen.is_stored or seen.is_lost)
