@@ -55,6 +55,14 @@ impl ByteQuantity {
         self.bytes
     }
 
+    /// So many MiB.
+    pub fn mebibytes(number: u8) -> Self {
+        Self {
+            text: format!("{number}Mi"),
+            bytes: u64::from(number) << 20,
+        }
+    }
+
     /// So many GiB.
     pub fn gibibytes(number: u8) -> Self {
         Self {

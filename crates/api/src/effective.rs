@@ -4,10 +4,13 @@
 
 use k8s_openapi::api::core::v1::ResourceRequirements;
 
-use super::leaderboard_parts::{Deadlines, S3Bucket, Track, TrackContainer};
-use super::{CarlaPlan, LeaderboardSpec, LeaderboardVersion, RouteSlice, RunId, RunPlan};
+use super::leaderboard_parts::{Deadlines, Evaluation, S3Bucket, Track, TrackContainer};
+use super::{
+    Carla, CarlaPlan, ContainerEvaluation, ContainerPlan, LeaderboardSpec, LeaderboardVersion, PlannedEvaluation, RouteSlice, RunId, RunPlan,
+    TrackEvaluator,
+};
 
-/// How many of what one track runs.
+/// How many routes one track of the CARLA Leaderboard runs, and in how many pairs.
 #[derive(Clone, Debug, PartialEq, Eq)]
 pub struct Shape {
     /// Number of simulator-agent pairs.
@@ -20,9 +23,9 @@ pub struct Shape {
     pub slices: Vec<RouteSlice>,
 }
 
-/// What a track of this Leaderboard runs.
-pub fn shape(spec: &LeaderboardSpec, track: &Track) -> Shape {
-    let (own, carla) = (&track.carla, &spec.evaluation.carla);
+/// Routes and pairs of a track of the CARLA Leaderboard.
+pub fn shape(carla: &Carla, track: &Track) -> Shape {
+    let own = &track.carla;
     let pairs = positive(own.pairs.unwrap_or(carla.pairs));
     let routes = positive(own.routes.unwrap_or(carla.routes));
     let usual = match carla.version {
@@ -54,6 +57,12 @@ pub fn slices(routes: usize, pairs: usize) -> Vec<RouteSlice> {
             Some(RouteSlice { first, last })
         })
         .collect()
+}
+
+/// Number of workers of a track that a container of the host's evaluates.
+pub fn workers(container: &ContainerEvaluation, track: &Track) -> i32 {
+    let own = track.container.as_ref().and_then(|own| own.workers);
+    own.unwrap_or(container.workers).max(1)
 }
 
 /// The deadlines of a track's runs.
@@ -89,27 +98,48 @@ pub fn results_url(bucket: &S3Bucket, run_id: &RunId) -> String {
     )
 }
 
-/// The plan of a submission's first attempt. `image` is the participant's, `resume` means that stored results are taken up.
-pub fn plan(spec: &LeaderboardSpec, track: &Track, run_id: RunId, image: String, resume: bool) -> RunPlan {
-    let (shape, carla) = (shape(spec, track), &spec.evaluation.carla);
-    RunPlan {
+/// The plan of a submission's first attempt. `image` is the participant's, `resume` means that stored results are taken up. `None` for a
+/// track without the score that its kind of evaluation needs, which the API server refuses.
+pub fn plan(spec: &LeaderboardSpec, track: &Track, run_id: RunId, image: String, resume: bool) -> Option<RunPlan> {
+    let evaluation = match &spec.evaluation {
+        Evaluation::Carla(carla) => PlannedEvaluation::Carla(carla_plan(carla, track)),
+        Evaluation::Container(container) => {
+            PlannedEvaluation::Container(container_plan(container, track, track.container.as_ref()?))
+        }
+    };
+    Some(RunPlan {
         run_id,
         track: track.name.as_str().into(),
         phase: track.phase,
         storage: spec.storage.clone(),
         image,
-        carla: CarlaPlan {
-            version: carla.version,
-            codename: track.carla.codename.as_ref().unwrap_or(&track.name).into(),
-            slices: shape.slices,
-            routes: i32::try_from(shape.routes).unwrap_or(i32::MAX),
-            repetitions: i32::try_from(shape.repetitions).unwrap_or(i32::MAX),
-            contents_image: carla.contents.image.as_str().into(),
-            simulator_image: carla.simulator.image.as_str().into(),
-        },
+        evaluation,
         resume,
         earlier_attempts: 0,
         submission_uid: None,
+    })
+}
+
+fn carla_plan(carla: &Carla, track: &Track) -> CarlaPlan {
+    let shape = shape(carla, track);
+    CarlaPlan {
+        version: carla.version,
+        codename: track.carla.codename.as_ref().unwrap_or(&track.name).into(),
+        slices: shape.slices,
+        routes: i32::try_from(shape.routes).unwrap_or(i32::MAX),
+        repetitions: i32::try_from(shape.repetitions).unwrap_or(i32::MAX),
+        contents_image: carla.contents.image.as_str().into(),
+        simulator_image: carla.simulator.image.as_str().into(),
+    }
+}
+
+fn container_plan(container: &ContainerEvaluation, track: &Track, own: &TrackEvaluator) -> ContainerPlan {
+    ContainerPlan {
+        mode: container.mode,
+        workers: workers(container, track),
+        merge: container.merge,
+        score: own.score.clone(),
+        image: container.image.as_str().into(),
     }
 }
 

@@ -17,16 +17,46 @@ use serde::{Deserialize, Serialize};
 
 pub use super::byte_quantity::ByteQuantity;
 use super::carla::{Carla, TrackCarla};
+use super::container::{ContainerEvaluation, TrackEvaluator};
 pub use super::gpu::*;
 use super::image_pattern::ImagePattern;
 pub use super::leaderboard_network::*;
 pub use super::leaderboard_services::*;
 
-/// A kind of evaluation, and what it runs.
+/// A kind of evaluation: exactly one of its members.
 #[derive(Serialize, Deserialize, JsonSchema, Clone, Debug, PartialEq)]
-pub struct Evaluation {
+#[serde(rename_all = "camelCase")]
+pub enum Evaluation {
     /// The CARLA Leaderboard: pairs of a simulator and an agent drive routes.
-    pub carla: Carla,
+    Carla(Box<Carla>),
+    /// A container of the host's evaluates the participant's agent, and writes the result.
+    Container(Box<ContainerEvaluation>),
+}
+
+impl Evaluation {
+    /// That of the CARLA Leaderboard, if it is one.
+    pub fn carla(&self) -> Option<&Carla> {
+        match self {
+            Self::Carla(carla) => Some(carla),
+            Self::Container(_) => None,
+        }
+    }
+
+    /// That of the CARLA Leaderboard, to change it.
+    pub fn carla_mut(&mut self) -> Option<&mut Carla> {
+        match self {
+            Self::Carla(carla) => Some(carla),
+            Self::Container(_) => None,
+        }
+    }
+
+    /// That by a container of the host's, if it is one.
+    pub fn container(&self) -> Option<&ContainerEvaluation> {
+        match self {
+            Self::Carla(_) => None,
+            Self::Container(container) => Some(container),
+        }
+    }
 }
 
 /// A track: what one phase of the challenge asks for.
@@ -43,6 +73,9 @@ pub struct Track {
     /// Overrides fields of `evaluation.carla`.
     #[serde(default, skip_serializing_if = "TrackCarla::is_empty")]
     pub carla: TrackCarla,
+    /// Overrides fields of `evaluation.container`, and names the score.
+    #[serde(default, skip_serializing_if = "Option::is_none")]
+    pub container: Option<TrackEvaluator>,
     /// Overrides deadlines of the Leaderboard.
     #[serde(default, skip_serializing_if = "Option::is_none")]
     pub deadlines: Option<TrackDeadlines>,

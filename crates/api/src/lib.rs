@@ -8,6 +8,7 @@ mod carla;
 #[cfg(feature = "client-errors")]
 pub mod client_errors;
 pub mod conditions;
+mod container;
 pub mod definitions;
 pub mod effective;
 mod evalai_mode;
@@ -50,6 +51,7 @@ pub use kube::ResourceExt;
 pub use attempt::Attempt;
 pub use carla::*;
 pub use conditions::Condition;
+pub use container::*;
 pub use evalai_mode::EvalaiMode;
 pub use evalai_queue::EvalaiQueue;
 pub use failed_node::{FailedNode, MAX_FAILED_NODES};

@@ -4,50 +4,81 @@
 
 use k8s_openapi::api::core::v1::{EnvVar, ResourceRequirements, SecurityContext};
 
-use super::{CarlaPlan, LeaderboardSpec, RouteSlice, RunPlan, Track, effective};
+use super::leaderboard_parts::Evaluation;
+use super::{CarlaPlan, ContainerPlan, LeaderboardSpec, PlannedEvaluation, RouteSlice, RunPlan, Track, effective};
 
 impl RunPlan {
     /// How many workers share the work.
     pub fn workers(&self) -> usize {
-        self.carla.slices.len()
+        match &self.evaluation {
+            PlannedEvaluation::Carla(carla) => carla.slices.len(),
+            PlannedEvaluation::Container(container) => usize::try_from(container.workers).unwrap_or(1),
+        }
     }
 
-    /// Units of work of one worker, which counts from 1; 0 if the plan has no such worker.
+    /// The plan of CARLA's evaluation, if it is one.
+    pub fn carla(&self) -> Option<&CarlaPlan> {
+        match &self.evaluation {
+            PlannedEvaluation::Carla(carla) => Some(carla),
+            PlannedEvaluation::Container(_) => None,
+        }
+    }
+
+    /// The plan of an evaluation by a container of the host's, if it is one.
+    pub fn container(&self) -> Option<&ContainerPlan> {
+        match &self.evaluation {
+            PlannedEvaluation::Carla(_) => None,
+            PlannedEvaluation::Container(container) => Some(container),
+        }
+    }
+
+    /// Units of work of one worker, which counts from 1; 0 if the plan has no such worker, and where the host's evaluator alone knows it.
     pub fn total_of(&self, worker: i32) -> i32 {
+        let Some(carla) = self.carla() else {
+            return 0;
+        };
         let index = usize::try_from(worker).ok().and_then(|worker| worker.checked_sub(1));
-        let slice = index.and_then(|index| self.carla.slices.get(index));
-        let units = slice.and_then(|slice| i32::try_from(slice.routes()).ok()?.checked_mul(self.carla.repetitions));
+        let slice = index.and_then(|index| carla.slices.get(index));
+        let units = slice.and_then(|slice| i32::try_from(slice.routes()).ok()?.checked_mul(carla.repetitions));
         units.unwrap_or(0)
     }
 
-    /// The plan of a check: the first unit of work, once, with one worker.
+    /// The plan of a check: one worker, and with CARLA the first route once.
     #[must_use]
-    pub fn of_check(self) -> Self {
-        let first = self.carla.slices.first().map_or(0, |slice| slice.first);
-        let carla = CarlaPlan {
-            slices: vec![RouteSlice { first, last: first }],
-            routes: 1,
-            repetitions: 1,
-            ..self.carla
-        };
-        Self { carla, ..self }
+    pub fn of_check(mut self) -> Self {
+        match &mut self.evaluation {
+            PlannedEvaluation::Carla(carla) => {
+                let first = carla.slices.first().map_or(0, |slice| slice.first);
+                carla.slices = vec![RouteSlice { first, last: first }];
+                (carla.routes, carla.repetitions) = (1, 1);
+            }
+            PlannedEvaluation::Container(container) => container.workers = 1,
+        }
+        self
     }
 
     /// The plan with the images that the Leaderboard names now, but for the participant's.
     #[must_use]
-    pub fn renewed(self, spec: &LeaderboardSpec) -> Self {
-        let now = &spec.evaluation.carla;
-        let carla = CarlaPlan {
-            contents_image: now.contents.image.as_str().into(),
-            simulator_image: now.simulator.image.as_str().into(),
-            ..self.carla
-        };
-        Self { carla, ..self }
+    pub fn renewed(mut self, spec: &LeaderboardSpec) -> Self {
+        match (&mut self.evaluation, &spec.evaluation) {
+            (PlannedEvaluation::Carla(carla), Evaluation::Carla(now)) => {
+                carla.contents_image = now.contents.image.as_str().into();
+                carla.simulator_image = now.simulator.image.as_str().into();
+            }
+            (PlannedEvaluation::Container(container), Evaluation::Container(now)) => {
+                container.image = now.image.as_str().into();
+            }
+            // The kind of a Leaderboard is immutable.
+            (PlannedEvaluation::Carla(_), Evaluation::Container(_)) | (PlannedEvaluation::Container(_), Evaluation::Carla(_)) => {}
+        }
+        self
     }
 
     /// Gives back memory that its lists do not need.
     pub fn shrink_to_fit(&mut self) {
-        self.carla.slices.shrink_to_fit();
+        if let PlannedEvaluation::Carla(carla) = &mut self.evaluation {
+            carla.slices.shrink_to_fit();
+        }
     }
 }
 
@@ -73,17 +104,17 @@ pub struct Given<'a> {
 }
 
 impl LeaderboardSpec {
-    /// What the host writes of a container, with the overrides of a track.
-    pub fn given<'a>(&'a self, track: Option<&Track>, part: Part) -> Given<'a> {
-        let carla = &self.evaluation.carla;
-        match part {
-            Part::Contents => Given {
+    /// Fields that the host writes of a container, with the overrides of a track. `None` for a part that its kind of evaluation has not.
+    pub fn given<'a>(&'a self, track: Option<&Track>, part: Part) -> Option<Given<'a>> {
+        let given = match (part, &self.evaluation) {
+            (Part::Contents, Evaluation::Container(_)) => return None,
+            (Part::Contents, Evaluation::Carla(carla)) => Given {
                 path: "evaluation.carla.contents",
                 env: &carla.contents.env,
                 resources: carla.contents.resources.clone(),
                 security: carla.contents.security_context.as_ref(),
             },
-            Part::Host => Given {
+            (Part::Host, Evaluation::Carla(carla)) => Given {
                 path: "evaluation.carla.simulator",
                 env: &carla.simulator.env,
                 resources: effective::resources(
@@ -92,7 +123,16 @@ impl LeaderboardSpec {
                 ),
                 security: carla.simulator.security_context.as_ref(),
             },
-            Part::Agent => Given {
+            (Part::Host, Evaluation::Container(container)) => Given {
+                path: "evaluation.container",
+                env: &container.env,
+                resources: effective::resources(
+                    track.and_then(|track| track.container.as_ref()?.evaluator.as_ref()),
+                    container.resources.as_ref(),
+                ),
+                security: container.security_context.as_ref(),
+            },
+            (Part::Agent, _) => Given {
                 path: "agent",
                 env: &self.agent.env,
                 resources: effective::resources(
@@ -101,13 +141,16 @@ impl LeaderboardSpec {
                 ),
                 security: self.agent.security_context.as_ref(),
             },
-        }
+        };
+        Some(given)
     }
 
-    /// Images of the host, which are nobody's submission.
-    pub fn host_images(&self) -> [&str; 2] {
-        let carla = &self.evaluation.carla;
-        [&carla.contents.image, &carla.simulator.image]
+    /// Images of the host, which no submission may name.
+    pub fn host_images(&self) -> Vec<&str> {
+        match &self.evaluation {
+            Evaluation::Carla(carla) => vec![&carla.contents.image, &carla.simulator.image],
+            Evaluation::Container(container) => vec![&container.image],
+        }
     }
 }
 
@@ -128,7 +171,8 @@ mod tests {
         let plan: RunPlan = serde_json::from_value(plan).unwrap();
         assert_eq!([plan.total_of(0), plan.total_of(1), plan.total_of(3)], [0, 30, 0]);
         let plan = plan.of_check();
-        assert_eq!(plan.carla.slices, [RouteSlice { first: 4, last: 4 }]);
-        assert_eq!((plan.carla.routes, plan.carla.repetitions, plan.total_of(1)), (1, 1, 1));
+        let carla = plan.carla().unwrap();
+        assert_eq!(carla.slices, [RouteSlice { first: 4, last: 4 }]);
+        assert_eq!((carla.routes, carla.repetitions, plan.total_of(1)), (1, 1, 1));
     }
 }

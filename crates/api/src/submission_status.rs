@@ -9,6 +9,7 @@ use serde::{Deserialize, Serialize};
 
 use super::attempt::Attempt;
 use super::carla::CarlaPlan;
+use super::container::ContainerPlan;
 use super::conditions::Condition;
 use super::failed_node::{FailedNode, MAX_FAILED_NODES};
 use super::leaderboard_parts::Storage;
@@ -194,12 +195,15 @@ impl SubmissionStatus {
     /// All texts that other submissions are likely to have as well.
     pub fn shared_texts(&mut self) -> impl Iterator<Item = &mut SharedText> {
         let of_plan = self.plan.iter_mut().flat_map(|plan| {
-            [
-                &mut plan.track,
-                &mut plan.carla.codename,
-                &mut plan.carla.contents_image,
-                &mut plan.carla.simulator_image,
-            ]
+            let of_kind: Vec<_> = match &mut plan.evaluation {
+                PlannedEvaluation::Carla(carla) => vec![
+                    &mut carla.codename,
+                    &mut carla.contents_image,
+                    &mut carla.simulator_image,
+                ],
+                PlannedEvaluation::Container(container) => vec![&mut container.image],
+            };
+            of_kind.into_iter().chain([&mut plan.track])
         });
         let of_conditions = self.conditions.iter_mut().flat_map(Condition::shared_texts);
         self.message.iter_mut().chain(of_plan).chain(of_conditions)
@@ -229,8 +233,9 @@ pub struct RunPlan {
     /// The participant's image.
     #[schemars(length(max = 1024))]
     pub image: String,
-    /// The plan of CARLA's evaluation.
-    pub carla: CarlaPlan,
+    /// The plan of the kind of evaluation.
+    #[serde(flatten)]
+    pub evaluation: PlannedEvaluation,
     /// True if the stored results of an earlier run are taken up.
     #[serde(default)]
     pub resume: bool,
@@ -241,6 +246,16 @@ pub struct RunPlan {
     #[schemars(length(max = 128))]
     #[serde(default, rename = "submissionUID", skip_serializing_if = "Option::is_none")]
     pub submission_uid: Option<String>,
+}
+
+/// The plan of a kind of evaluation: exactly one of its members.
+#[derive(Serialize, Deserialize, JsonSchema, Clone, Debug, PartialEq)]
+#[serde(rename_all = "camelCase")]
+pub enum PlannedEvaluation {
+    /// The plan of CARLA's evaluation.
+    Carla(CarlaPlan),
+    /// The plan of an evaluation by a container of the host's.
+    Container(ContainerPlan),
 }
 
 /// The participant's image as the first agent ran it.

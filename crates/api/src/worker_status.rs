@@ -76,8 +76,8 @@ pub enum EndReason {
     NoProcess,
     /// Agent and simulator were ended from outside: their sandbox was made anew, or their node started again. It is no crash.
     EndedFromOutside,
-    /// The agent's verdict blames a simulator that has not failed.
-    BlamesSimulator,
+    /// The agent's verdict blames a simulator or an evaluator that has not failed.
+    BlamesHost,
     /// The simulator followed its agent, whose own end is not known.
     Unseen,
     /// Another container of the Pod listened on the simulator's port.
@@ -87,6 +87,12 @@ pub enum EndReason {
     SimulatorSilent,
     /// The kubelet could not start the simulator's container.
     SimulatorNotStarted,
+    /// The evaluator ended without a final result.
+    EvaluatorCrashed,
+    /// The evaluator did not listen on its port in time, or had no final result in time.
+    EvaluatorNotReady,
+    /// The kubelet could not start the evaluator's container.
+    EvaluatorNotStarted,
     /// The simulator was to have a GPU and saw none.
     NoGPU,
     /// The simulator's node has no driver for what it draws with.

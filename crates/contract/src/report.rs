@@ -98,6 +98,9 @@ pub struct Report {
     /// Results that are refused, for the participant.
     #[serde(default, skip_serializing_if = "Option::is_none")]
     pub refused: Option<RefusedResults>,
+    /// Results that the host's own evaluator wrote and that cannot be used, for hosts.
+    #[serde(default, skip_serializing_if = "Option::is_none")]
+    pub unusable: Option<RefusedResults>,
     /// What `verify` noticed.
     #[serde(default, skip_serializing_if = "Vec::is_empty")]
     pub warnings: Vec<String>,

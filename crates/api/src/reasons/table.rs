@@ -142,9 +142,9 @@ reasons! {
             log: "the log of the agent of the first pair that was not done, else of the first pair";
         InvalidResults,
             "A checkpoint was refused: malformed, implausible, or incomplete at the end. Or it names a crash of the simulation that \
-             its simulator did not have.",
-            "Check what the agent writes into its checkpoint, and submit again.",
-            log: "the log of the agent whose checkpoint was refused";
+             its simulator did not have. Or the host's evaluator refused the submission.",
+            "Check what the agent writes into its checkpoint or sends to the evaluator, and submit again.",
+            log: "the log of the agent whose results were refused";
         NotEligible,
             "The run is complete, but its results do not count (`Rejected`, `Invalid`).",
             "Compare the agent's sensors with those the track allows, and submit again.",
@@ -181,6 +181,12 @@ reasons! {
              that simulator has failed in this attempt.",
             "Look at the simulator's log, then resume the submission; it repeats the route it was at.",
             log: "the log of simulator `<n>`, read from its node before the Pod ends; else `simulator/console-<n>.log`";
+        EvaluatorFailed,
+            "An evaluator crashed, was not ready, or had no final result more often than `retries.perWorker` allows. Or it wrote a \
+             `result.json` that cannot be used.",
+            "Look at the evaluator's log and at `evaluators/<n>/result.json`; `kubectl leaderboard lint FILE` says what is wrong with \
+             it. Correct the evaluator's image, then resume the submission.",
+            log: "the log of evaluator `<n>`, `evaluators/<n>/console.log`";
         NoGPU,
             "A simulator, or in `NodeIndex` an agent that had not begun, saw no GPU although `gpu` gives it one. Another Job follows; \
              after two such ends on one node the Jobs of the attempt avoid it.",

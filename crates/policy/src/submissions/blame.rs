@@ -268,7 +268,7 @@ fn of_agent(container: &ContainerView, end: &EndView) -> EndReason {
             | What::PortTaken
             | What::NoGpu
             | What::GraphicsDriverMissing,
-        ) => EndReason::BlamesSimulator,
+        ) => EndReason::BlamesHost,
         Some(What::Idle) => EndReason::Idle,
         Some(What::CannotStart) => EndReason::CannotStart,
         _ if end.reason == "OOMKilled" => EndReason::OutOfMemory,

@@ -277,7 +277,7 @@ fn of_agent(id: i32, times: &str, cause: EndReason, words: &Words) -> (Reason, S
             format!("Pair {id} failed {times}: the agents left the Pod no process to start it again."),
             for_both("Let the agents start fewer processes and threads, and submit again."),
         ),
-        EndReason::BlamesSimulator => (
+        EndReason::BlamesHost => (
             Reason::AgentCrashed,
             format!("Agent {id} ended {times} and blamed its {host}, which had not failed."),
             for_both("Leave the files of the evaluator's runner alone, and submit again."),

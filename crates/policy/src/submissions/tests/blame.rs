@@ -120,7 +120,7 @@ fn a_simulator_that_failed_in_the_round_is_the_cause_whatever_the_agent_reports(
 #[test]
 fn an_agent_whose_simulator_followed_it_is_the_cause_by_its_own_report() {
     use EndReason::{
-        BlamesSimulator, CannotStart, Exited, Idle, Incomplete, OutOfMemory, PortTaken, SilentDeath, Unseen,
+        BlamesHost, CannotStart, Exited, Idle, Incomplete, OutOfMemory, PortTaken, SilentDeath, Unseen,
     };
     let killed = without_verdict(ended("agent-1", 2, "exited", 1, 100), "OOMKilled", 137);
     check(vec![
@@ -130,9 +130,9 @@ fn an_agent_whose_simulator_followed_it_is_the_cause_by_its_own_report() {
         both("could not start", "peerCrashed", "cannotStart", CannotStart),
         both("killed with its runner", "peerCrashed", "silentDeath", SilentDeath),
         both("says done and crashes", "finished", "exited", Exited),
-        both("blames its simulator", "peerCrashed", "notReady", BlamesSimulator),
-        both("blames its node", "peerCrashed", "noGpu", BlamesSimulator),
-        both("each blames the other", "peerCrashed", "peerCrashed", BlamesSimulator),
+        both("blames its simulator", "peerCrashed", "notReady", BlamesHost),
+        both("blames its node", "peerCrashed", "noGpu", BlamesHost),
+        both("each blames the other", "peerCrashed", "peerCrashed", BlamesHost),
         both("took a port", "portTaken", "peerCrashed", PortTaken),
         row(
             "was killed for lack of memory",
@@ -144,7 +144,7 @@ fn an_agent_whose_simulator_followed_it_is_the_cause_by_its_own_report() {
             "forges a verdict without a round",
             ended("simulator-1", 2, "peerCrashed", 1, 100),
             claims(None, ended("agent-1", 2, "notReady", 1, 100)),
-            Settled(BlamesSimulator),
+            Settled(BlamesHost),
         ),
         row(
             "its own end is not seen yet",
@@ -282,7 +282,7 @@ fn an_agent_that_the_kubelet_cannot_start_is_its_images_only_by_the_kubelets_wor
 
 #[test]
 fn an_agent_that_ends_alone_is_the_cause_after_a_while() {
-    use EndReason::{BlamesSimulator, CannotStart, Exited, SilentDeath};
+    use EndReason::{BlamesHost, CannotStart, Exited, SilentDeath};
     let round_2 = || restarted("simulator-1", 2, "peerCrashed", 1, 40);
     let later = |what| since(50, ended("agent-1", 2, what, 1, 100));
     let mut paused = ended("simulator-1", 2, "peerCrashed", 1, 40);
@@ -306,20 +306,20 @@ fn an_agent_that_ends_alone_is_the_cause_after_a_while() {
             "blames its simulator",
             round_2(),
             later("notReady"),
-            Awaited(BlamesSimulator),
+            Awaited(BlamesHost),
         ),
         row(
             "claims a later round",
             paused,
             claims(Some(9), later("notReady")),
-            Awaited(BlamesSimulator),
+            Awaited(BlamesHost),
         ),
         // The kubelet knows better: its simulator failed before this life of the agent began.
         row(
             "claims the round in which its simulator failed",
             restarted("simulator-1", 2, "exited", 1, 40),
             claims(Some(1), later("peerCrashed")),
-            Awaited(BlamesSimulator),
+            Awaited(BlamesHost),
         ),
         row(
             "its simulator was started at the second try, long before",

@@ -117,7 +117,7 @@ fn without_process(container: ContainerView) -> ContainerView {
 
 #[test]
 fn a_simulator_that_has_run_and_lacks_processes_is_waited_for() {
-    use EndReason::{BlamesSimulator, NoProcess, SimulatorNotStarted};
+    use EndReason::{BlamesHost, NoProcess, SimulatorNotStarted};
     let kept_away = || {
         let mut simulator = without_process(ended("simulator-1", 2, "", 128, 60));
         simulator.waiting = Some(("CrashLoopBackOff".into(), "back-off 10s".into()));
@@ -130,8 +130,8 @@ fn a_simulator_that_has_run_and_lacks_processes_is_waited_for() {
     let late = || since(50, ended("agent-1", 1, "notReady", 1, 100));
     check(vec![
         row("its agent waits", kept_away(), running("agent-1"), NoCrash),
-        row("its agent gives up", kept_away(), late(), Awaited(BlamesSimulator)),
-        row("the kubelet tries again", refused, late(), Awaited(BlamesSimulator)),
+        row("its agent gives up", kept_away(), late(), Awaited(BlamesHost)),
+        row("the kubelet tries again", refused, late(), Awaited(BlamesHost)),
         row(
             "its runner starts no server",
             no_server(),

@@ -1,0 +1,176 @@
+//! The evaluation of a host's own evaluator in the spec and the status of a Leaderboard: a container beside the participant's agent, which
+//! writes the result.
+//!
+//! Owned by `api`. A track lays its own fields over those of the Leaderboard; `api::effective` computes the result.
+
+use k8s_openapi::api::core::v1::{EnvVar, ResourceRequirements, SecurityContext};
+use kube::KubeSchema;
+use schemars::JsonSchema;
+use serde::{Deserialize, Serialize};
+
+use super::byte_quantity::ByteQuantity;
+use super::leaderboard_parts::TrackContainer;
+use super::progress::MAX_NAME;
+use super::shared_text::SharedText;
+use super::standings::Order;
+
+/// Ports of two evaluators of one Pod are so far apart.
+pub const PORT_STEP: i32 = 100;
+
+/// A way in which an evaluator and the participant's image meet.
+#[derive(Serialize, Deserialize, JsonSchema, Clone, Copy, Debug, PartialEq, Eq)]
+pub enum EvaluationMode {
+    /// The evaluator and the agent run side by side in one Pod and talk over a port.
+    Interactive,
+}
+
+/// Treatment of the results of several workers.
+#[derive(Serialize, Deserialize, JsonSchema, Clone, Copy, Debug, Default, PartialEq, Eq)]
+pub enum MergeMethod {
+    /// Each metric is the mean of all workers, weighted by the units that each has done.
+    #[default]
+    Mean,
+    /// Each metric is the sum of all workers.
+    Sum,
+}
+
+/// The evaluation by a container of the host's.
+#[derive(Serialize, Deserialize, KubeSchema, Clone, Debug, PartialEq)]
+#[serde(rename_all = "camelCase")]
+#[x_kube(
+    validation = Rule::new("quantity(string(self.shmSize)).compareTo(quantity('1Mi')) >= 0").message("evaluation.container.shmSize must be 1Mi or more"),
+    validation = Rule::new("quantity(string(self.shmSize)).compareTo(quantity('1Ti')) <= 0").message("evaluation.container.shmSize must be 1Ti or less")
+)]
+pub struct ContainerEvaluation {
+    /// Mode in which the evaluator and the participant's image meet.
+    pub mode: EvaluationMode,
+    /// Image of the evaluator.
+    #[schemars(length(min = 1, max = 512), regex(pattern = r"^[^\s]+$"))]
+    pub image: String,
+    /// Command of the evaluator. It has no default, since the image's own entrypoint is not known.
+    #[schemars(length(min = 1, max = 64))]
+    pub command: Vec<String>,
+    /// Arguments of the command.
+    #[serde(default, skip_serializing_if = "Option::is_none")]
+    pub args: Option<Vec<String>>,
+    /// Environment variables beside those that the operator sets.
+    #[serde(default, skip_serializing_if = "Vec::is_empty")]
+    #[x_kube(merge_strategy = ListMerge::Map(vec!["name".into()]))]
+    pub env: Vec<EnvVar>,
+    /// Requests and limits; GPUs are requested by the field `gpu` of the Leaderboard.
+    #[serde(default, skip_serializing_if = "Option::is_none")]
+    pub resources: Option<ResourceRequirements>,
+    /// Laid over the safe default field by field. To remove one of its fields, set it to null in podOverrides.
+    #[serde(default, skip_serializing_if = "Option::is_none")]
+    pub security_context: Option<SecurityContext>,
+    /// Number of workers, each with an evaluator and an agent of its own.
+    #[serde(default = "defaults::workers")]
+    #[schemars(range(min = 1, max = 16))]
+    pub workers: i32,
+    /// Port on which the first worker's evaluator listens; each further worker's is 100 higher. The agent starts once the evaluator listens
+    /// there. Absent: the agent starts at once.
+    #[serde(default, skip_serializing_if = "Option::is_none")]
+    #[schemars(range(min = 1024, max = 64000))]
+    pub port: Option<i32>,
+    /// Size of each evaluator's and each agent's `/dev/shm`, in memory: `1Mi` to `1Ti`. `agent.shmSize` takes its place for agents.
+    #[serde(default = "defaults::shm_size")]
+    pub shm_size: ByteQuantity,
+    /// Seconds from the regular end of an agent to the final result of its evaluator.
+    #[serde(default = "defaults::answer_seconds")]
+    #[schemars(range(min = 1, max = 31_536_000))]
+    pub answer_seconds: i64,
+    /// Treatment of the results of several workers.
+    #[serde(default)]
+    pub merge: MergeMethod,
+}
+
+impl ContainerEvaluation {
+    /// The whole command of the evaluator.
+    pub fn words(&self) -> Vec<String> {
+        let arguments = self.args.iter().flatten();
+        self.command.iter().chain(arguments).cloned().collect()
+    }
+}
+
+/// The overlay of one track over `evaluation.container`.
+#[derive(Serialize, Deserialize, JsonSchema, Clone, Debug, PartialEq)]
+#[serde(rename_all = "camelCase")]
+pub struct TrackEvaluator {
+    /// Number of workers, in place of the Leaderboard's.
+    #[serde(default, skip_serializing_if = "Option::is_none")]
+    #[schemars(range(min = 1, max = 16))]
+    pub workers: Option<i32>,
+    /// Metric of the result that is the score of a submission.
+    pub score: ScoreMetric,
+    /// Overrides of the Leaderboard's evaluator.
+    #[serde(default, skip_serializing_if = "Option::is_none")]
+    pub evaluator: Option<TrackContainer>,
+}
+
+/// The metric of a result that is its score.
+#[derive(Serialize, Deserialize, JsonSchema, Clone, Debug, PartialEq, Eq)]
+pub struct ScoreMetric {
+    /// Codename of the split that has the metric. Absent: the result has one split. Present: each metric's name is `<split>_<metric>`.
+    #[serde(default, skip_serializing_if = "Option::is_none")]
+    #[schemars(length(min = 1, max = MAX_NAME))]
+    pub split: Option<String>,
+    /// Name of the metric.
+    #[schemars(length(min = 1, max = MAX_NAME))]
+    pub metric: String,
+    /// `Descending` if the highest value leads. The order that EvalAI has for the phase takes its place.
+    #[serde(default)]
+    pub order: Order,
+}
+
+impl ScoreMetric {
+    /// Its name in a status, a row and the standings.
+    pub fn name(&self) -> String {
+        self.name_of(self.split.as_deref().unwrap_or_default(), &self.metric)
+    }
+
+    /// Name of any metric of the result: that of the metric, and where the score names a split, behind the metric's own split.
+    pub fn name_of(&self, split: &str, metric: &str) -> String {
+        match self.split {
+            Some(_) => format!("{split}_{metric}"),
+            None => metric.to_owned(),
+        }
+    }
+}
+
+/// What a run by a host's evaluator consists of.
+#[derive(Serialize, Deserialize, JsonSchema, Clone, Debug, PartialEq)]
+#[serde(rename_all = "camelCase")]
+pub struct ContainerPlan {
+    /// Mode in which the evaluator and the participant's image meet.
+    pub mode: EvaluationMode,
+    /// Number of workers, each with an evaluator and an agent of its own.
+    pub workers: i32,
+    /// Treatment of the results of several workers.
+    pub merge: MergeMethod,
+    /// Metric of the result that is the score of the submission.
+    pub score: ScoreMetric,
+    /// Image of the evaluator, renewed by each attempt.
+    #[schemars(length(max = 512))]
+    pub image: SharedText,
+}
+
+/// The numbers of what a track effectively runs.
+#[derive(Serialize, Deserialize, JsonSchema, Clone, Debug, Default, PartialEq, Eq)]
+pub struct ContainerShape {
+    /// Number of workers, each with an evaluator and an agent of its own.
+    pub workers: i32,
+}
+
+mod defaults {
+    use super::ByteQuantity;
+
+    pub(super) fn workers() -> i32 {
+        1
+    }
+    pub(super) fn shm_size() -> ByteQuantity {
+        ByteQuantity::mebibytes(64)
+    }
+    pub(super) fn answer_seconds() -> i64 {
+        600
+    }
+}
