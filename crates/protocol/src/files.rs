@@ -23,7 +23,7 @@ pub const KEPT_CHECKPOINT: &str = "checkpoint.json";
 /// Rounds a pair may count. Far above any `retries.perWorker`; it bounds what a reader looks up for a folder full of forgeries.
 pub const MAX_ROUNDS: u32 = 1000;
 
-/// The number of a simulator–agent pair: 1 to 999.
+/// The number of a worker, which is a pair of the host's container and the agent's: 1 to 999.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, PartialOrd, Ord, Hash)]
 pub struct Pair(u16);
 
@@ -61,8 +61,8 @@ impl Pair {
     }
 
     /// The container with the host's image.
-    pub const fn host(self) -> Member {
-        let side = Side::Host;
+    pub const fn host(self, host: Host) -> Member {
+        let side = Side::Host(host);
         Member { side, pair: self }
     }
 
@@ -90,29 +90,39 @@ impl FromStr for Pair {
     }
 }
 
+/// What the host's container of a pair runs. All pairs of a run have the same.
+#[derive(Debug, Clone, Copy, PartialEq, Eq, PartialOrd, Ord, Hash)]
+pub enum Host {
+    /// A simulator's server, for an agent that evaluates itself against it. The agent has the last word.
+    Simulator,
+    /// A program that evaluates the agent and writes the result. It has the last word.
+    Evaluator,
+}
+
+impl Host {
+    /// `simulator` or `evaluator`, as in container and file names.
+    pub const fn name(self) -> &'static str {
+        match self {
+            Self::Simulator => "simulator",
+            Self::Evaluator => "evaluator",
+        }
+    }
+}
+
 /// The two containers of a pair.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, PartialOrd, Ord, Hash)]
 pub enum Side {
-    /// Runs the host's image, such as a simulator's server.
-    Host,
+    /// Runs the host's image.
+    Host(Host),
     /// Runs the participant's image.
     Agent,
 }
 
 impl Side {
-    /// The other one of the pair.
-    #[must_use]
-    pub const fn peer(self) -> Self {
-        match self {
-            Self::Host => Self::Agent,
-            Self::Agent => Self::Host,
-        }
-    }
-
-    /// `simulator` or `agent`, as in container and file names.
+    /// `simulator`, `evaluator` or `agent`, as in container and file names.
     pub const fn name(self) -> &'static str {
         match self {
-            Self::Host => "simulator",
+            Self::Host(host) => host.name(),
             Self::Agent => "agent",
         }
     }
@@ -134,19 +144,10 @@ pub struct Member {
 }
 
 impl Member {
-    /// The other container of the same pair.
-    #[must_use]
-    pub const fn peer(self) -> Self {
-        Self {
-            side: self.side.peer(),
-            pair: self.pair,
-        }
-    }
-
-    /// Parses `simulator-<n>` or `agent-<n>`.
+    /// Parses `simulator-<n>`, `evaluator-<n>` or `agent-<n>`.
     pub fn parse(text: &str) -> Option<Self> {
         let (side, pair) = text.split_once('-')?;
-        let side = [Side::Host, Side::Agent]
+        let side = [Side::Host(Host::Simulator), Side::Host(Host::Evaluator), Side::Agent]
             .into_iter()
             .find(|known| known.name() == side)?;
         Some(Self {
@@ -165,11 +166,12 @@ impl fmt::Display for Member {
 /// What a member's file means. The number is the round: the crashes of that side before it.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, PartialOrd, Ord, Hash)]
 pub enum Mark {
-    /// Simulator: the server answers. Agent: the command is about to start.
+    /// Simulator: the server answers. Evaluator: it can be reached. Agent: the command is about to start.
     Start(u32),
     /// This round ended without complete results.
     Crash(u32),
-    /// The pair's results are complete.
+    /// Simulator, evaluator, and an agent that evaluates itself: the pair's results are complete. An evaluator's agent: its program
+    /// has ended with exit code 0, which says nothing of the results.
     Done,
 }
 
@@ -178,8 +180,8 @@ pub enum Mark {
 pub enum StatusFile {
     /// `<member>/<member>.start<c>`, `.crash<c>` or `.done`, written by that member.
     Of(Member, Mark),
-    /// `<agent>/<agent>.gpu` or `.nogpu`, written by an agent's runner before it begins anything, and read by its simulator alone:
-    /// whether the agent's container sees a GPU.
+    /// `<agent>/<agent>.gpu` or `.nogpu`, written by an agent's runner before it begins anything, and read by its host's runner
+    /// alone: whether the agent's container sees a GPU.
     Gpu(Member, bool),
     /// `logcopy/simulation.cancel`, written by `logcopy`: everybody stops.
     Cancel,
@@ -283,10 +285,10 @@ impl Progress {
     }
 }
 
-/// All status files that are there for the pairs 1 to `pairs`, for a reader that reports or stores them. A member's files
-/// beyond the first round it has not crashed in are left out.
-pub fn present(root: &Path, pairs: u16) -> Vec<StatusFile> {
-    let members = Pair::first(pairs.into()).flat_map(|pair| [pair.host(), pair.agent()]);
+/// All status files that are there for the pairs 1 to `pairs` of this host, for a reader that reports or stores them. A member's
+/// files beyond the first round it has not crashed in are left out.
+pub fn present(root: &Path, pairs: u16, host: Host) -> Vec<StatusFile> {
+    let members = Pair::first(pairs.into()).flat_map(|pair| [pair.host(host), pair.agent()]);
     let mut files = Vec::new();
     for member in members {
         let crashes = Progress::read(root, member).crashes;
@@ -327,7 +329,8 @@ mod tests {
     #[test]
     fn every_file_is_read_back_from_its_folder_and_name() {
         let agent = member(Side::Agent, 12);
-        let simulator = member(Side::Host, 1);
+        let simulator = member(Side::Host(Host::Simulator), 1);
+        let evaluator = member(Side::Host(Host::Evaluator), 999);
         let cases = [
             (
                 StatusFile::Of(simulator, Mark::Start(0)),
@@ -338,6 +341,11 @@ mod tests {
                 StatusFile::Of(simulator, Mark::Crash(10)),
                 "simulator-1",
                 "simulator-1.crash10",
+            ),
+            (
+                StatusFile::Of(evaluator, Mark::Done),
+                "evaluator-999",
+                "evaluator-999.done",
             ),
             (StatusFile::Of(agent, Mark::Done), "agent-12", "agent-12.done"),
             (StatusFile::Cancel, "logcopy", "simulation.cancel"),
@@ -353,6 +361,9 @@ mod tests {
     fn other_names_and_foreign_folders_mean_nothing() {
         let cases = [
             ("agent-1", "simulator-1.done"),
+            ("agent-1", "evaluator-1.done"),
+            ("simulator-1", "evaluator-1.done"),
+            ("evaluators-1", "evaluators-1.done"),
             ("agent-1", "agent-2.done"),
             ("agent-1", "simulation.cancel"),
             ("agent-1", "logcopy.done"),
@@ -407,7 +418,7 @@ mod tests {
     fn creating_twice_is_fine_and_present_lists_what_is_valid() {
         let root = tempfile::tempdir().unwrap();
         let files = [
-            StatusFile::Of(member(Side::Host, 1), Mark::Start(0)),
+            StatusFile::Of(member(Side::Host(Host::Simulator), 1), Mark::Start(0)),
             StatusFile::Of(member(Side::Agent, 1), Mark::Crash(0)),
             StatusFile::Of(member(Side::Agent, 1), Mark::Start(1)),
             StatusFile::Of(member(Side::Agent, 2), Mark::Done),
@@ -418,8 +429,21 @@ mod tests {
         }
         fs::write(root.path().join("agent-1/simulator-1.done"), "").unwrap();
         fs::write(root.path().join("agent-1/agent-1.crash7"), "").unwrap();
-        assert_eq!(present(root.path(), 2), files);
-        assert_eq!(present(root.path(), 1).len(), 4);
+        assert_eq!(present(root.path(), 2, Host::Simulator), files);
+        assert_eq!(present(root.path(), 1, Host::Simulator).len(), 4);
+    }
+
+    #[test]
+    fn the_files_of_the_other_kind_of_host_are_not_present() {
+        let root = tempfile::tempdir().unwrap();
+        let evaluator = StatusFile::Of(member(Side::Host(Host::Evaluator), 1), Mark::Start(0));
+        let simulator = StatusFile::Of(member(Side::Host(Host::Simulator), 1), Mark::Done);
+        let agent = StatusFile::Of(member(Side::Agent, 1), Mark::Start(0));
+        for file in [evaluator, simulator, agent] {
+            file.create(root.path()).unwrap();
+        }
+        assert_eq!(present(root.path(), 1, Host::Evaluator), [evaluator, agent]);
+        assert_eq!(present(root.path(), 1, Host::Simulator), [simulator, agent]);
     }
 
     /// A pipe that was opened would wait for its other end, and the test with it.
@@ -442,7 +466,7 @@ mod tests {
             file.create(root.path()).unwrap();
         }
         assert!(!outside.exists(), "no link is followed");
-        assert_eq!(present(root.path(), 1), files);
+        assert_eq!(present(root.path(), 1, Host::Simulator), files);
         assert_eq!(
             Progress::read(root.path(), agent),
             Progress {

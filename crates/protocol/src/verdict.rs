@@ -36,13 +36,14 @@ pub enum What {
     Cancelled,
     /// The container was ended from outside (SIGTERM).
     Stopped,
-    /// The simulator's server did not answer in time, or the agent's simulator did not come.
+    /// The simulator's server did not answer in time, the evaluator could not be reached or had no complete result in time, or the
+    /// agent's host did not come.
     NotReady,
     /// The agent crashed, and at that moment the simulator's server did not answer any more.
     ServerSilent,
-    /// Another process of the Pod has taken a port of the simulator's server.
+    /// Another process of the Pod has taken a port of the simulator's server or of the evaluator.
     PortTaken,
-    /// The simulator, or its agent, was to have a GPU and sees none. A simulator's word for both; of an agent it counts for nothing.
+    /// The host's container, or its agent, was to have a GPU and sees none. A host's word for both; of an agent it counts for nothing.
     NoGpu,
     /// The simulator sees a GPU, and no driver for what its server draws with.
     GraphicsDriverMissing,
@@ -54,7 +55,7 @@ pub enum What {
     NoProcess,
     /// Written first and replaced at the end: it stays when the runner is killed.
     SilentDeath,
-    /// The simulator's agent is done: the orderly end of a simulator.
+    /// The results are complete: the orderly end of a simulator, of an evaluator, and of an agent that its evaluator has ended.
     Finished,
 }
 
