@@ -2,8 +2,7 @@
 //!
 //! Used by all programs of the Pod that read, store or count files.
 
-use super::run::console;
-use leaderboard_protocol::files::Pair;
+use leaderboard_protocol::files::{Host, Pair};
 
 /// Key of the merged file.
 pub const MERGED: &str = "agent/agent_results.json";
@@ -23,6 +22,13 @@ pub const WORKSPACE_LOG: &str = "logcopy/workspace.log";
 /// What the host's contents print; the runner writes it.
 pub const CONTENTS_LOG: &str = "contents/contents.log";
 
+/// Before the keys of the simulators' files.
+pub const SIMULATORS: &str = "simulator/";
+/// Before the keys of the evaluators' files; the number of the worker follows.
+pub const EVALUATORS: &str = "evaluators/";
+/// Name of the file in an evaluator's folder with its result.
+pub const RESULT: &str = "result.json";
+
 /// The folder of an agent, without a slash at its end.
 pub fn agent_folder(pair: Pair) -> String {
     format!("agent/agent{pair}")
@@ -33,13 +39,39 @@ pub fn checkpoint_path(pair: Pair) -> String {
     format!("{}/agent_results.json", agent_folder(pair))
 }
 
+/// The folder of the host's container of a pair, without a slash at its end. The simulators share one.
+pub fn host_folder(host: Host, pair: Pair) -> String {
+    match host {
+        Host::Simulator => SIMULATORS.trim_end_matches('/').to_owned(),
+        Host::Evaluator => format!("{EVALUATORS}{pair}"),
+    }
+}
+
+/// Name of the file in that folder with what the container has printed.
+pub fn host_log_name(host: Host, pair: Pair) -> String {
+    match host {
+        Host::Simulator => format!("console-{pair}.log"),
+        Host::Evaluator => "console.log".to_owned(),
+    }
+}
+
+/// What the host's container of a pair has printed.
+pub fn host_log(host: Host, pair: Pair) -> String {
+    format!("{}/{}", host_folder(host, pair), host_log_name(host, pair))
+}
+
+/// The result that the evaluator of a pair writes.
+pub fn result_path(pair: Pair) -> String {
+    format!("{}/{RESULT}", host_folder(Host::Evaluator, pair))
+}
+
 /// What the agent of a pair has printed.
 pub fn agent_log(pair: Pair) -> String {
     format!("{}/leaderboard.log", agent_folder(pair))
 }
 
-/// The logs by which a run is judged: what each agent and each server has printed, and logcopy's own.
-pub fn known_logs(pairs: usize) -> impl Iterator<Item = String> {
-    let of_pairs = Pair::first(pairs).flat_map(|pair| [agent_log(pair), console(pair)]);
+/// The logs by which a run is judged: what each agent and each container of the host has printed, and logcopy's own.
+pub fn known_logs(pairs: usize, host: Host) -> impl Iterator<Item = String> {
+    let of_pairs = Pair::first(pairs).flat_map(move |pair| [agent_log(pair), host_log(host, pair)]);
     of_pairs.chain([OWN_LOG.to_owned()])
 }

@@ -237,15 +237,17 @@ impl Report {
         Ok(report.shown())
     }
 
-    /// A checkpoint is the agent's own, and its reasons and warnings repeat parts of it.
+    /// Results are a stranger's or the host's own, and reasons and warnings repeat parts of them.
     fn shown(self) -> Self {
         let line = |text: &String| one_line(text, LONGEST_TEXT);
+        let fault = |fault: &RefusedResults| RefusedResults {
+            why: line(&fault.why),
+            ..*fault
+        };
         Self {
             unit: one_line(&self.unit, MAX_NAME),
-            refused: self.refused.as_ref().map(|refused| RefusedResults {
-                why: line(&refused.why),
-                ..*refused
-            }),
+            refused: self.refused.as_ref().map(fault),
+            unusable: self.unusable.as_ref().map(fault),
             logs: self.logs.as_ref().map(|logs| match logs {
                 Logs::Sent => Logs::Sent,
                 Logs::Refused(why) => Logs::Refused(line(why)),
@@ -263,7 +265,8 @@ impl Report {
         if self.done > self.total {
             return implausible("more units done than there are");
         }
-        if self.is_final && self.stopped.is_none() && self.refused.is_none() && self.done != self.total {
+        let is_cut = self.stopped.is_some() || self.refused.is_some() || self.unusable.is_some();
+        if self.is_final && !is_cut && self.done != self.total {
             return implausible("final, but units are missing");
         }
         if !self.score.iter().chain(&self.metrics).all(Metric::is_plausible) {

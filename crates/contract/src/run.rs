@@ -5,7 +5,6 @@
 use serde::{Deserialize, Serialize};
 
 use leaderboard_api::{Attempt, Enforcement, LogGroup, Logs, RunPlan, Verify};
-use leaderboard_protocol::files::Pair;
 
 /// Environment variable with the JSON of [`Run`].
 pub const ENV_RUN: &str = "LEADERBOARD_RUN";
@@ -15,7 +14,7 @@ pub const SCHEMA: u32 = 1;
 pub const ENV_POD_UID: &str = "POD_UID";
 /// The whole `logs` volume, in `workspace` and `logcopy`.
 pub const LOGS: &str = "/logs";
-/// Where `workspace` puts `leaderboard-runner`; mounted read-only in simulators and agents.
+/// Where `workspace` puts `leaderboard-runner`; mounted read-only in the workers' containers.
 pub const TOOLS: &str = "/leaderboard-tools";
 /// The runner's name in [`TOOLS`].
 pub const RUNNER: &str = "leaderboard-runner";
@@ -37,16 +36,6 @@ pub const IDENTITY_TOKEN_FILE: &str = "token";
 /// Environment variable with the role of `podIdentity.roleARN`, in `workspace` and `logcopy`.
 pub const ENV_ROLE_ARN: &str = "LEADERBOARD_ROLE_ARN";
 
-/// Name of the file in the simulators' folder with what a pair's server has printed.
-pub fn console_name(pair: Pair) -> String {
-    format!("console-{pair}.log")
-}
-
-/// The same below the `logs` volume, and below the run's prefix.
-pub fn console(pair: Pair) -> String {
-    format!("simulator/{}", console_name(pair))
-}
-
 /// One attempt of one submission, as its Pod needs to know it.
 #[derive(Serialize, Deserialize, Clone, Debug, PartialEq)]
 #[serde(rename_all = "camelCase")]
@@ -60,7 +49,7 @@ pub struct Run {
     /// UID of the Submission: a report of another one does not count.
     pub uid: String,
     pub attempt: Attempt,
-    /// Routes, slices, format and storage.
+    /// Share of each worker, images and storage.
     pub plan: RunPlan,
     /// What is done with scores that do not follow from their infractions.
     pub verify: Verify,
@@ -107,7 +96,7 @@ pub struct Isolation {
 pub enum Stop {
     /// The participant, a host or a deletion ends it.
     Cancel,
-    /// A pair has used up its crashes.
+    /// A worker has used up its crashes.
     Retries,
     /// `deadlines.runSeconds` is over.
     RunDeadline,

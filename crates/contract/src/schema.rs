@@ -13,7 +13,9 @@ use crate::verdict::{NotAVerdict, VERDICT_SCHEMA, WorkspaceReason, WorkspaceVerd
 use leaderboard_api::Attempt;
 
 const REPORT_1: &str = include_str!("golden/report-1.json");
+const REPORT_1_CONTAINER: &str = include_str!("golden/report-1-container.json");
 const RUN_1: &str = include_str!("golden/run-1.json");
+const RUN_1_CONTAINER: &str = include_str!("golden/run-1-container.json");
 const WORKSPACE_1: &str = include_str!("golden/workspace-1.json");
 const OWNER_1: &str = include_str!("golden/owner-1.json");
 
@@ -31,14 +33,20 @@ fn each_version_of_the_report_is_read() {
     assert_round_trip(REPORT_1, &report);
     let newer = REPORT_1.replacen("\"schema\": 1", "\"schema\": 2", 1);
     assert_eq!(Report::parse(newer.as_bytes()), Err(ReportError::Schema(2)));
+    let report = Report::parse(REPORT_1_CONTAINER.as_bytes()).unwrap();
+    assert_eq!(report.unusable.as_ref().and_then(|unusable| unusable.worker), Some(2));
+    assert_round_trip(REPORT_1_CONTAINER, &report);
 }
 
 #[test]
 fn each_version_of_the_run_is_read() {
     assert_eq!(RUN_SCHEMA, 1, "a new version needs a golden file of its own");
     let run: Run = serde_json::from_str(RUN_1).unwrap();
-    assert!(run.schema == RUN_SCHEMA && run.uid == "uid-1");
+    assert!(run.schema == RUN_SCHEMA && run.uid == "uid-1" && run.plan.carla().is_some());
     assert_round_trip(RUN_1, &run);
+    let run: Run = serde_json::from_str(RUN_1_CONTAINER).unwrap();
+    assert!(run.plan.container().is_some() && run.plan.workers() == 2);
+    assert_round_trip(RUN_1_CONTAINER, &run);
 }
 
 #[test]

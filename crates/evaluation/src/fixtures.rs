@@ -6,7 +6,8 @@ use std::path::Path;
 use leaderboard_protocol::files::{Mark, Member, Pair, Side, StatusFile};
 
 use leaderboard_api::{
-    Attempt, ByteQuantity, CarlaPlan, LeaderboardVersion, RouteSlice, RunPlan, S3Bucket, Storage, Verify,
+    Attempt, ByteQuantity, CarlaPlan, LeaderboardVersion, PlannedEvaluation, RouteSlice, RunPlan, S3Bucket, Storage,
+    Verify,
 };
 use leaderboard_contract::run::{Run, SCHEMA, STATUS_FOLDER};
 
@@ -34,7 +35,7 @@ pub fn run() -> Run {
                 },
             },
             image: "image".to_owned(),
-            carla: CarlaPlan {
+            evaluation: PlannedEvaluation::Carla(CarlaPlan {
                 version: LeaderboardVersion::V2,
                 codename: "SENSORS".into(),
                 slices: vec![RouteSlice { first: 0, last: 1 }, RouteSlice { first: 2, last: 3 }],
@@ -42,7 +43,7 @@ pub fn run() -> Run {
                 repetitions: 1,
                 contents_image: "contents".into(),
                 simulator_image: "simulator".into(),
-            },
+            }),
             resume: false,
             earlier_attempts: 0,
             submission_uid: None,

@@ -8,8 +8,10 @@ use bytes::Bytes;
 use leaderboard_api::{Metric, WorkerState};
 use leaderboard_contract::keys::EVALAI;
 use leaderboard_contract::report::{Outcome, RefusedResults, ReportWorker, StoredFile};
-use leaderboard_protocol::files::{Pair, Progress};
+use leaderboard_protocol::files::{Host, Pair, Progress};
 use sha2::{Digest, Sha256};
+
+use crate::judge::Ending;
 
 /// Why a plan cannot be evaluated, and what to do.
 #[derive(thiserror::Error, Clone, Debug, PartialEq, Eq)]
@@ -26,21 +28,26 @@ pub struct WorkerSeen {
     pub agent: Progress,
     /// From its host's folder.
     pub host: Progress,
+    /// The side with the last word on the results is done.
+    pub done: bool,
 }
 
 impl WorkerSeen {
-    pub(crate) fn read(status: &Path, pair: Pair) -> Self {
-        Self {
-            agent: Progress::read(status, pair.agent()),
-            host: Progress::read(status, pair.host()),
-        }
+    pub(crate) fn read(status: &Path, pair: Pair, kind: Host) -> Self {
+        let agent = Progress::read(status, pair.agent());
+        let host = Progress::read(status, pair.host(kind));
+        let done = match kind {
+            Host::Simulator => agent.done,
+            Host::Evaluator => host.done,
+        };
+        Self { agent, host, done }
     }
 
     /// `Waiting`, `Running`, `Done` or `Crashed`; the last means between a crash and the next start.
     pub fn state(&self) -> WorkerState {
         match self {
-            Self { agent, .. } if agent.done => WorkerState::Done,
-            Self { agent, host } if agent.started || host.started => WorkerState::Running,
+            Self { done: true, .. } => WorkerState::Done,
+            Self { agent, host, .. } if agent.started || host.started => WorkerState::Running,
             _ if self.crashes() > 0 => WorkerState::Crashed,
             _ => WorkerState::Waiting,
         }
@@ -119,23 +126,36 @@ pub struct Gathered {
     pub seen: Vec<WorkerSeen>,
     /// Each worker for the report.
     pub workers: Vec<ReportWorker>,
-    /// Why each worker's results are refused, if they are.
-    pub refused: Vec<Option<String>>,
+    /// Why each worker's results are refused, if they are, as the end that follows from it.
+    pub refused: Vec<Option<Ending>>,
+    /// How the run ends if a worker has come to its end as it is now; `None` for one whose results are complete.
+    pub if_ended: Vec<Option<Ending>>,
     /// True for a worker whose results this node can't read at present.
     pub unreadable: Vec<bool>,
-    /// The workers' results together, if they can't be merged.
-    pub unmerged: Option<RefusedResults>,
+    /// The end that follows if the workers' results together can't be merged.
+    pub unmerged: Option<Ending>,
 }
 
 impl Gathered {
-    /// The first results that are refused; none once nothing is missing, since what came later changes nothing.
+    /// The participant's first results that are refused; none once nothing is missing, since what came later changes nothing.
     pub fn first_refused(&self) -> Option<RefusedResults> {
-        if self.is_complete() {
-            return None;
-        }
-        let workers = (1..).zip(&self.refused);
-        let mut refused = workers.filter_map(|(id, why)| Some(RefusedResults::new(Some(id), why.as_ref()?)));
-        refused.next().or_else(|| self.unmerged.clone())
+        self.faults().find_map(|ending| match ending {
+            Ending::Invalid(refused) => Some(refused.clone()),
+            Ending::Unusable(_) | Ending::Complete | Ending::Stopped(_) => None,
+        })
+    }
+
+    /// Results of the host's evaluators that can't be used.
+    pub fn unusable(&self) -> impl Iterator<Item = &RefusedResults> {
+        self.faults().filter_map(|ending| match ending {
+            Ending::Unusable(refused) => Some(refused),
+            Ending::Invalid(_) | Ending::Complete | Ending::Stopped(_) => None,
+        })
+    }
+
+    fn faults(&self) -> impl Iterator<Item = &Ending> {
+        let all = self.refused.iter().flatten().chain(&self.unmerged);
+        all.filter(|_| !self.is_complete())
     }
 
     /// Whether nothing is missing: judged by the plan and the last good files, whatever the agents report.

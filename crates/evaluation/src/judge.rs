@@ -16,8 +16,10 @@ pub enum Ending {
     Complete,
     /// It was stopped from outside; the results are what there is.
     Stopped(Stop),
-    /// A worker has come to its end with results that can't be used.
+    /// A worker has come to its end with results that are refused, which is the participant's fault.
     Invalid(RefusedResults),
+    /// A worker has come to its end with results that the host's own evaluator has spoiled.
+    Unusable(RefusedResults),
 }
 
 impl std::fmt::Display for Ending {
@@ -25,7 +27,7 @@ impl std::fmt::Display for Ending {
         match self {
             Self::Complete => f.write_str("the results are complete"),
             Self::Stopped(stop) => write!(f, "the run was stopped ({})", stop.as_str()),
-            Self::Invalid(refused) => write!(f, "the results can't be used: {refused}"),
+            Self::Invalid(refused) | Self::Unusable(refused) => write!(f, "the results can't be used: {refused}"),
         }
     }
 }
@@ -44,27 +46,27 @@ pub enum Step {
 /// What one round found, with the times since when.
 #[derive(Clone, Debug, PartialEq, Eq, Default)]
 pub struct Situation {
-    /// No route is missing.
+    /// No unit of work is missing.
     pub whole: bool,
-    /// No route is missing and every evaluator has come to its regular end, for this long.
+    /// No unit of work is missing and every evaluator has come to its regular end, for this long.
     pub complete: Option<Duration>,
-    /// All agents report that they are done.
+    /// All workers report that they are done.
     pub all_done: bool,
     /// Some container has begun.
     pub any_started: bool,
     /// A stop is requested.
     pub stop: Option<Stop>,
-    /// Results of a worker that has ended badly, and for how long.
-    pub spoiled: Option<(RefusedResults, Duration)>,
+    /// The end that a worker has brought about, and for how long.
+    pub spoiled: Option<(Ending, Duration)>,
     /// `simulation.cancel` is there for this long.
     pub cancelled: Option<Duration>,
-    /// The agents' folders have not changed for this long.
+    /// The workers' folders have not changed for this long.
     pub quiet: Duration,
 }
 
 /// What to do next.
 pub fn decide(seen: &Situation, pace: &Pace, cancel: Duration) -> Step {
-    // Who has a record of each route without a regular end will repeat the last one, if only its container comes back.
+    // Who has a record of each unit without a regular end will repeat the last one, if only its container comes back.
     let settled = (seen.whole && seen.all_done) || seen.complete.is_some_and(|since| since >= pace.settle);
     if let (true, None) = (settled, seen.stop) {
         return Step::Finish(Ending::Complete);
@@ -72,7 +74,7 @@ pub fn decide(seen: &Situation, pace: &Pace, cancel: Duration) -> Step {
     let spoiled = seen.spoiled.as_ref().filter(|(_, since)| *since >= pace.quiet);
     let ending = match (seen.stop, spoiled) {
         (Some(stop), _) => Ending::Stopped(stop),
-        (None, Some((refused, _))) => Ending::Invalid(refused.clone()),
+        (None, Some((spoiled, _))) => spoiled.clone(),
         (None, None) => return Step::GoOn,
     };
     if settled || seen.all_done {
@@ -95,7 +97,7 @@ pub fn decide(seen: &Situation, pace: &Pace, cancel: Duration) -> Step {
 #[derive(Debug, Default)]
 pub struct Judge {
     complete: Option<Duration>,
-    spoiled: Option<(RefusedResults, Duration)>,
+    spoiled: Option<(Ending, Duration)>,
     cancelled: Option<Duration>,
     quiet: Duration,
     activity: Option<u64>,
@@ -108,7 +110,7 @@ pub struct Outside {
     pub stop: Option<Stop>,
     /// `simulation.cancel` is there.
     pub cancelled: bool,
-    /// A digest of the agents' folders: another one means that something was written.
+    /// A digest of the workers' folders: another one means that something was written.
     pub activity: u64,
     /// Clock of this process.
     pub now: Duration,
@@ -120,9 +122,9 @@ impl Judge {
         let now = outside.now;
         let whole = gathered.is_complete();
         self.complete = (whole && gathered.has_ended()).then(|| self.complete.unwrap_or(now));
-        self.spoiled = spoiled(gathered).map(|refused| {
+        self.spoiled = spoiled(gathered).map(|ending| {
             let since = self.spoiled.as_ref().map_or(now, |(_, since)| *since);
-            (refused, since)
+            (ending, since)
         });
         self.cancelled = outside.cancelled.then(|| self.cancelled.unwrap_or(now));
         if self.activity != Some(outside.activity) {
@@ -133,49 +135,44 @@ impl Judge {
         Situation {
             whole,
             complete: self.complete.map(since),
-            all_done: gathered.seen.iter().all(|worker| worker.agent.done),
+            all_done: gathered.seen.iter().all(|worker| worker.done),
             any_started: gathered
                 .seen
                 .iter()
                 .any(|worker| worker.agent.started || worker.host.started),
             stop: outside.stop,
-            spoiled: self.spoiled.clone().map(|(refused, then)| (refused, since(then))),
+            spoiled: self.spoiled.clone().map(|(ending, then)| (ending, since(then))),
             cancelled: self.cancelled.map(since),
             quiet: since(self.quiet),
         }
     }
 }
 
-/// A pair that reports it is done without complete results will not get them any more. An agent's report alone ends
-/// nothing well: it can only end its own run badly. Nothing is known of a checkpoint that this node can't read: if that lasts, the run
-/// ends without final results, which is the infrastructure's failure.
-fn spoiled(gathered: &Gathered) -> Option<RefusedResults> {
+/// A worker that reports it is done without complete results will not get them any more. Its report alone ends nothing well: it can only
+/// end its own run badly. Nothing is known of results that this node can't read: if that lasts, the run ends without final results, which
+/// is the infrastructure's failure.
+fn spoiled(gathered: &Gathered) -> Option<Ending> {
     if gathered.is_complete() {
         return None;
     }
-    let ended = gathered.seen.iter().zip(&gathered.workers).zip(&gathered.refused);
-    let readable = ended.zip(&gathered.unreadable).filter(|(_, unreadable)| !**unreadable);
-    let mut short = readable.filter(|(((seen, pair), _), _)| seen.agent.done && pair.done < pair.total);
-    if let Some((((_, pair), refused), _)) = short.next() {
-        let incomplete = || {
-            format!(
-                "pair {} ended with {} of its {} route runs. Leave the checkpoint to the evaluator.",
-                pair.id, pair.done, pair.total
-            )
-        };
-        let why = refused.clone().unwrap_or_else(incomplete);
-        return Some(RefusedResults::new(Some(pair.id), why));
+    let workers = gathered.seen.iter().zip(&gathered.unreadable).zip(&gathered.if_ended);
+    let mut short = workers.filter_map(|((seen, unreadable), ending)| {
+        let is_known = seen.done && !unreadable;
+        ending.as_ref().filter(|_| is_known)
+    });
+    if let Some(ending) = short.next() {
+        return Some(ending.clone());
     }
-    let all_done = gathered.seen.iter().all(|pair| pair.agent.done);
+    let all_done = gathered.seen.iter().all(|worker| worker.done);
     gathered.unmerged.clone().filter(|_| all_done)
 }
 
 /// How long the programs wait for what they cannot observe.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 pub struct Pace {
-    /// From complete results to the end, when an agent does not report that it is done.
+    /// From complete results to the end, when a worker does not report that it is done.
     pub settle: Duration,
-    /// Without a change in the agents' folders, they count as stopped.
+    /// Without a change in the workers' folders, they count as stopped.
     pub quiet: Duration,
     /// From a cancel to the last round, when they are never quiet: the runner's grace and a margin.
     pub grace: Duration,

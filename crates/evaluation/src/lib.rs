@@ -1,7 +1,7 @@
 //! Kinds of evaluation: what a Pod runs, how its results are read, and in which words people read of it.
 //!
 //! ```text
-//!   api: spec, plan ──► of(), of_plan() ──► a member, such as carla
+//!   api: spec, plan ──► of(), of_plan() ──► a member: carla, container
 //!                                             │  plain data
 //!        pod-spec ◄── Workload, Contents ─────┤
 //!        pod      ◄── Gathered, each round ───┤──► judge, one for all kinds
@@ -12,6 +12,7 @@
 #![cfg_attr(not(test), deny(clippy::indexing_slicing, clippy::arithmetic_side_effects))]
 
 pub mod carla;
+pub mod container;
 #[cfg(any(test, feature = "fixtures"))]
 #[allow(clippy::unwrap_used, clippy::arithmetic_side_effects)]
 pub mod fixtures;
@@ -21,10 +22,10 @@ pub mod workload;
 
 use std::sync::Arc;
 
-use leaderboard_api::{LeaderboardSpec, Ranking, RunPlan};
+use leaderboard_api::{LeaderboardSpec, PlannedEvaluation, Ranking, RunPlan, Track};
 use leaderboard_contract::run::Run;
 use leaderboard_evidence::{Tree, TreeError};
-use leaderboard_protocol::files::Pair;
+use leaderboard_protocol::files::{Host, Pair};
 
 pub use gathered::{Gathered, Object, Objects, Refused, Summary, Texts, WorkerSeen};
 pub use leaderboard_results::number_text;
@@ -34,23 +35,26 @@ use workload::{Asked, Contents, Reserved, Workload};
 pub trait Evaluation {
     fn words(&self) -> &'static Words;
 
-    /// The numbers of a result, in EvalAI's order.
+    /// Program in the containers with the host's image.
+    fn host(&self) -> Host;
+
+    /// The numbers of a result, in EvalAI's order; empty where EvalAI's own labels are taken.
     fn columns(&self) -> Vec<Column>;
 
-    /// Names of the numbers that a result's status shows, the one that ranks where EvalAI names none first.
-    fn measures(&self) -> &'static [&'static str];
+    /// Whether a result's status shows the number of this name.
+    fn shows(&self, metric: &str) -> bool;
 
-    /// The number that ranks, and its order, where EvalAI names none.
-    fn ranking(&self) -> Ranking;
+    /// The number that ranks a track, and its order, where EvalAI names none.
+    fn ranking(&self, track: &Track) -> Ranking;
 
     /// Names that no host may use.
     fn reserved(&self) -> Reserved;
 
-    /// The container that fills the volumes with what the host keeps private, before the workers start.
-    fn contents(&self, asked: &Asked<'_>) -> Contents;
+    /// The container that fills the volumes with what the host keeps private, before the workers start; `None` if there is none.
+    fn contents(&self, asked: &Asked<'_>) -> Option<Contents>;
 
-    /// The containers of one worker.
-    fn workload(&self, asked: &Asked<'_>, worker: Pair) -> Workload;
+    /// The containers of one worker; `None` if plan and Leaderboard are of two kinds.
+    fn workload(&self, asked: &Asked<'_>, worker: Pair) -> Option<Workload>;
 
     /// An error if the plan of a run contradicts itself.
     fn check(&self, run: &Run) -> Result<(), Refused>;
@@ -97,12 +101,18 @@ pub struct Column {
 
 /// The kind of evaluation of a Leaderboard.
 pub fn of(spec: &LeaderboardSpec) -> &'static dyn Evaluation {
-    carla::of(spec.evaluation.carla.version)
+    match &spec.evaluation {
+        leaderboard_api::Evaluation::Carla(carla) => carla::of(carla.version),
+        leaderboard_api::Evaluation::Container(_) => &container::Container,
+    }
 }
 
 /// The kind of evaluation of a plan.
 pub fn of_plan(plan: &RunPlan) -> &'static dyn Evaluation {
-    carla::of(plan.carla.version)
+    match &plan.evaluation {
+        PlannedEvaluation::Carla(carla) => carla::of(carla.version),
+        PlannedEvaluation::Container(_) => &container::Container,
+    }
 }
 
 /// The words of a plan's kind.
@@ -110,7 +120,7 @@ pub fn words(plan: Option<&RunPlan>) -> &'static Words {
     plan.map_or(&PLAIN, |plan| of_plan(plan).words())
 }
 
-/// Labels of all kinds, for a reader that does not know the kind.
+/// Labels of all kinds that have their own, for a reader that does not know the kind.
 pub fn labels() -> impl Iterator<Item = &'static str> {
     carla::labels()
 }

@@ -1,7 +1,12 @@
 //! What a Pod runs, as plain data: a kind of evaluation says it, and `pod-spec` makes Kubernetes' objects of it.
 
-use leaderboard_api::{Deadlines, LeaderboardSpec, RunPlan, Track};
+use leaderboard_api::{Attempt, Deadlines, LeaderboardSpec, RunPlan, Track};
 use leaderboard_protocol::graphics::Needs;
+
+/// An agent's own folder, in its container.
+pub(crate) const AGENT: &str = "/tmp/agent";
+/// A host's program prints little; one that floods must not fill the disk. In bytes.
+pub(crate) const HOST_LOG_LIMIT: u64 = 64 << 20;
 
 /// Names that a kind of evaluation uses itself, so that no host gives them another meaning.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
@@ -21,6 +26,7 @@ pub struct Asked<'a> {
     /// `None` if an edit of the Leaderboard has taken it away since.
     pub track: Option<&'a Track>,
     pub plan: &'a RunPlan,
+    pub attempt: Attempt,
     pub deadlines: Deadlines,
     /// The run goes on with what is stored.
     pub resume: bool,
@@ -56,6 +62,8 @@ pub struct Role {
     /// Variables with their values, which nothing expands.
     pub env: Vec<(&'static str, String)>,
     pub mounts: Vec<Mount>,
+    /// Bytes of its own `/dev/shm`, in memory; `None`: it has that of the Pod.
+    pub shm: Option<u64>,
     /// Variables of the image that the container does not get.
     pub removes: &'static [&'static str],
     /// The runner checks for a driver of this kind where the container has a GPU.
@@ -81,6 +89,12 @@ pub struct ContentsVolume {
     pub written: &'static str,
     /// Where the agents read it.
     pub read: &'static str,
+}
+
+/// A flag of the runner, which counts seconds in 32 bits.
+pub(crate) fn seconds(what: &str, value: i64) -> String {
+    let value = value.clamp(0, u32::MAX.into());
+    format!("--{what}-seconds={value}")
 }
 
 /// Writes a word so that Kubernetes hands it on unchanged.

@@ -7,8 +7,9 @@
 use std::path::PathBuf;
 use std::sync::Arc;
 
-use super::measures;
+use super::{HOST, measures};
 use crate::carla::results_format;
+use crate::judge::Ending;
 use crate::{Gathered, Object, Objects, Refused, Results, Summary, Texts, WorkerSeen};
 use leaderboard_api::Verify;
 use leaderboard_contract::keys::{MERGED, METADATA, STDOUT, checkpoint_path};
@@ -29,7 +30,11 @@ impl From<Refusal> for Refused {
 
 /// The plan of the results, from the plan of the run.
 pub fn results_plan(run: &Run) -> Result<Plan, Refusal> {
-    let slices = run.plan.carla.slices.iter();
+    let Some(planned) = run.plan.carla() else {
+        let problem = "it is of another kind of evaluation".to_owned();
+        return Err(Refusal::Plan { problem });
+    };
+    let slices = planned.slices.iter();
     let pairs: Vec<Slice> = slices
         .map(|slice| Slice {
             first: slice.first,
@@ -37,11 +42,11 @@ pub fn results_plan(run: &Run) -> Result<Plan, Refusal> {
         })
         .collect();
     let plan = Plan {
-        format: results_format(run.plan.carla.version),
+        format: results_format(planned.version),
         strictness: Strictness::Pod,
         routes: pairs.iter().map(|slice| slice.routes()).fold(0, u32::saturating_add),
         pairs,
-        repetitions: u32::try_from(run.plan.carla.repetitions).unwrap_or(0),
+        repetitions: u32::try_from(planned.repetitions).unwrap_or(0),
         verify: match run.verify {
             Verify::Disabled => leaderboard_results::Verify::Disabled,
             Verify::Warn => leaderboard_results::Verify::Warn,
@@ -69,7 +74,7 @@ struct Worker {
     seen: Option<Stamp>,
     /// The runner's copy as it was read last.
     kept: Option<Stamp>,
-    refused: Option<String>,
+    refused: Option<RefusedResults>,
     /// Why this node can't read it at present, which says nothing about its content.
     unreadable: Option<String>,
 }
@@ -139,14 +144,17 @@ pub struct Gatherer {
     merged: Option<Arc<Summary>>,
     texts: Arc<Texts>,
     objects: Objects,
-    unmerged: Option<RefusedResults>,
+    unmerged: Option<Ending>,
 }
 
 impl Results for Gatherer {
     fn round(&mut self) -> Gathered {
         // The status files are read before the results: an agent that is done has written everything.
         let pairs = Pair::first(self.workers.len());
-        let seen: Vec<WorkerSeen> = pairs.clone().map(|pair| WorkerSeen::read(&self.status, pair)).collect();
+        let seen: Vec<WorkerSeen> = pairs
+            .clone()
+            .map(|pair| WorkerSeen::read(&self.status, pair, HOST))
+            .collect();
         let mut changed = false;
         for pair in pairs {
             changed |= match self.read(pair) {
@@ -163,9 +171,10 @@ impl Results for Gatherer {
             merged: self.merged.clone(),
             texts: Arc::clone(&self.texts),
             objects: self.objects.clone(),
+            if_ended: self.workers.iter().zip(&workers).map(if_ended).collect(),
             workers,
             seen,
-            refused: self.workers.iter().map(|worker| worker.refused.clone()).collect(),
+            refused: self.workers.iter().map(Worker::refused).collect(),
             unreadable: self.workers.iter().map(|worker| worker.unreadable.is_some()).collect(),
             unmerged: self.unmerged.clone(),
         }
@@ -256,7 +265,7 @@ impl Gatherer {
             }
             Err(refusal) => {
                 worker.seen = Some(stamp);
-                worker.refuse_with(reason(&refusal))
+                worker.refuse_with(pair, reason(&refusal))
             }
         }
     }
@@ -308,7 +317,7 @@ impl Gatherer {
                     .and_then(|pair| u32::try_from(pair.saturating_add(1)).ok());
                 let refused = RefusedResults::new(worker, reason(&refusal));
                 tracing::warn!("the checkpoints are not merged: {refused}");
-                self.unmerged = Some(refused);
+                self.unmerged = Some(Ending::Invalid(refused));
             }
         }
     }
@@ -333,7 +342,23 @@ impl Gatherer {
     }
 }
 
+/// A worker that is done has all its route runs, or ends the run.
+fn if_ended((worker, reported): (&Worker, &ReportWorker)) -> Option<Ending> {
+    if reported.done >= reported.total {
+        return None;
+    }
+    let ReportWorker { id, done, total, .. } = reported;
+    let why =
+        || format!("pair {id} ended with {done} of its {total} route runs. Leave the checkpoint to the evaluator.");
+    let incomplete = || Ending::Invalid(RefusedResults::new(Some(*id), why()));
+    Some(worker.refused().unwrap_or_else(incomplete))
+}
+
 impl Worker {
+    fn refused(&self) -> Option<Ending> {
+        self.refused.clone().map(Ending::Invalid)
+    }
+
     /// Takes a checkpoint, unless it has less than the last good one. Returns whether it did.
     fn take(&mut self, found: Checkpoint) -> bool {
         let next = match &self.good {
@@ -348,9 +373,8 @@ impl Worker {
     fn cannot_read(&mut self, pair: Pair, error: &TreeError) -> ReadOutcome {
         if error.is_the_writers() {
             self.unreadable = None;
-            return self.refuse_with(format!(
-                "pair {pair}: the checkpoint can't be read: {error}. Leave it to the evaluator."
-            ));
+            let why = format!("pair {pair}: the checkpoint can't be read: {error}. Leave it to the evaluator.");
+            return self.refuse_with(pair, why);
         }
         let reason = format!("pair {pair}: the checkpoint can't be read on this node: {error}");
         if self.unreadable.as_ref() != Some(&reason) {
@@ -360,11 +384,12 @@ impl Worker {
         ReadOutcome::Unusable
     }
 
-    fn refuse_with(&mut self, reason: String) -> ReadOutcome {
-        if self.refused.as_ref() != Some(&reason) {
-            tracing::warn!("a checkpoint is refused, the last good one stays: {reason}");
+    fn refuse_with(&mut self, pair: Pair, reason: String) -> ReadOutcome {
+        let refused = RefusedResults::new(Some(pair.get().into()), reason);
+        if self.refused.as_ref() != Some(&refused) {
+            tracing::warn!("a checkpoint is refused, the last good one stays: {refused}");
         }
-        self.refused = Some(reason);
+        self.refused = Some(refused);
         ReadOutcome::Same
     }
 }

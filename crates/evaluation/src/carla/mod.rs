@@ -9,10 +9,10 @@ mod workload;
 
 use std::sync::Arc;
 
-use leaderboard_api::{LeaderboardVersion, Order, Ranking};
+use leaderboard_api::{LeaderboardVersion, Order, Ranking, Track};
 use leaderboard_contract::run::Run;
 use leaderboard_evidence::Tree;
-use leaderboard_protocol::files::Pair;
+use leaderboard_protocol::files::{Host, Pair};
 use leaderboard_results::{Format, metrics};
 
 use crate::workload::{Asked, Contents, Reserved, Workload};
@@ -22,8 +22,9 @@ use gather::Gatherer;
 const WORDS: Words = Words {
     units: measures::UNIT,
     unit: "route",
-    host: "simulator",
+    host: HOST.name(),
 };
+const HOST: Host = Host::Simulator;
 
 /// The CARLA Leaderboard, by its version.
 #[derive(Clone, Copy, Debug)]
@@ -42,6 +43,10 @@ impl Evaluation for Carla {
         &WORDS
     }
 
+    fn host(&self) -> Host {
+        HOST
+    }
+
     fn columns(&self) -> Vec<Column> {
         let of_format = metrics(results_format(self.0)).iter();
         of_format
@@ -52,11 +57,11 @@ impl Evaluation for Carla {
             .collect()
     }
 
-    fn measures(&self) -> &'static [&'static str] {
-        &measures::NAMES
+    fn shows(&self, metric: &str) -> bool {
+        measures::NAMES.contains(&metric)
     }
 
-    fn ranking(&self) -> Ranking {
+    fn ranking(&self, _track: &Track) -> Ranking {
         Ranking {
             metric: measures::DRIVING_SCORE.to_owned(),
             order: Order::Descending,
@@ -67,11 +72,11 @@ impl Evaluation for Carla {
         workload::RESERVED
     }
 
-    fn contents(&self, asked: &Asked<'_>) -> Contents {
+    fn contents(&self, asked: &Asked<'_>) -> Option<Contents> {
         workload::contents(asked)
     }
 
-    fn workload(&self, asked: &Asked<'_>, worker: Pair) -> Workload {
+    fn workload(&self, asked: &Asked<'_>, worker: Pair) -> Option<Workload> {
         workload::workload(asked, worker)
     }
 

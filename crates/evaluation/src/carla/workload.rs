@@ -5,10 +5,11 @@
 use super::commands::{self, Adapter};
 use super::display;
 use super::layout::{CARLA_ROOT, LEADERBOARD_ROOT, SCENARIO_RUNNER_ROOT, python_path};
-use crate::workload::{Asked, Contents, ContentsVolume, Mount, Reserved, Role, Workload, literal};
-use leaderboard_api::{LeaderboardVersion, SimulatorContainer};
-use leaderboard_contract::keys::agent_folder;
-use leaderboard_contract::run::console_name;
+use crate::workload::{
+    AGENT, Asked, Contents, ContentsVolume, HOST_LOG_LIMIT, Mount, Reserved, Role, Workload, literal, seconds,
+};
+use leaderboard_api::{ByteQuantity, Carla, CarlaPlan, LeaderboardVersion, SimulatorContainer};
+use leaderboard_contract::keys::{agent_folder, host_folder, host_log_name};
 use leaderboard_protocol::files::Pair;
 use leaderboard_protocol::graphics::Needs;
 
@@ -16,10 +17,6 @@ const ROUTES_FILE: &str = "/workspace/leaderboard/data/routes_testing.xml";
 const SCENARIOS_FILE: &str = "/workspace/leaderboard/data/all_towns_traffic_scenarios_private.json";
 const CHECKPOINT: &str = "/tmp/agent/agent_results.json";
 const LIVE_RESULTS: &str = "/tmp/agent/live_results.txt";
-/// A server prints little; one that floods must not fill the disk. In bytes.
-const SIMULATOR_LOG_LIMIT: u64 = 64 << 20;
-/// An agent's own folder of results and log.
-const AGENT: &str = "/tmp/agent";
 /// What a simulator keeps.
 const SAVED: &str = "/home/carla/CarlaUE4/Saved";
 const CONTENTS_VOLUMES: [ContentsVolume; 3] = [
@@ -61,52 +58,70 @@ pub(super) const RESERVED: Reserved = Reserved {
     folders: &[AGENT, SAVED],
 };
 
+/// What a workload depends on, of this kind.
+struct Known<'a> {
+    asked: &'a Asked<'a>,
+    spec: &'a Carla,
+    plan: &'a CarlaPlan,
+}
+
+impl<'a> Known<'a> {
+    /// `None` if plan or Leaderboard are of another kind.
+    fn of(asked: &'a Asked<'a>) -> Option<Self> {
+        let (spec, plan) = (asked.spec.evaluation.carla()?, asked.plan.carla()?);
+        Some(Self { asked, spec, plan })
+    }
+}
+
 /// Port of a pair's simulator.
 fn port(pair: Pair) -> usize {
     pair.index().saturating_mul(100).saturating_add(2000)
 }
 
 /// The container with the private contents.
-pub(super) fn contents(asked: &Asked<'_>) -> Contents {
-    let spec = &asked.spec.evaluation.carla.contents;
+pub(super) fn contents(asked: &Asked<'_>) -> Option<Contents> {
+    let known = Known::of(asked)?;
+    let spec = &known.spec.contents;
     let host = commands::of_host(spec.command.as_deref(), spec.args.as_deref());
-    Contents {
-        image: asked.plan.carla.contents_image.to_string(),
+    Some(Contents {
+        image: known.plan.contents_image.to_string(),
         command: host.unwrap_or_else(commands::contents),
-    }
+    })
 }
 
 /// The simulator and the agent of a pair.
-pub(super) fn workload(asked: &Asked<'_>, pair: Pair) -> Workload {
-    Workload {
-        host: simulator(asked, pair),
-        agent: Some(agent(asked, pair)),
-    }
+pub(super) fn workload(asked: &Asked<'_>, pair: Pair) -> Option<Workload> {
+    let known = Known::of(asked)?;
+    Some(Workload {
+        host: simulator(&known, pair),
+        agent: Some(agent(&known, pair)),
+    })
 }
 
-fn simulator(asked: &Asked<'_>, pair: Pair) -> Role {
-    let (spec, deadlines) = (&asked.spec.evaluation.carla.simulator, &asked.deadlines);
-    let version = asked.plan.carla.version;
+fn simulator(known: &Known<'_>, pair: Pair) -> Role {
+    let (spec, deadlines) = (&known.spec.simulator, &known.asked.deadlines);
+    let version = known.plan.version;
     let flags = vec![
         format!("--port={}", port(pair)),
         seconds("ready", deadlines.ready_seconds),
         seconds("flush", deadlines.flush_seconds),
         seconds("cancel", deadlines.cancel_seconds),
-        format!("--log={}/{}", SAVED, console_name(pair)),
-        format!("--log-limit={SIMULATOR_LOG_LIMIT}"),
+        format!("--log={}/{}", SAVED, host_log_name(super::HOST, pair)),
+        format!("--log-limit={HOST_LOG_LIMIT}"),
     ];
     let own = Mount::Own {
-        folder: "simulator".into(),
+        folder: host_folder(super::HOST, pair),
         path: SAVED,
     };
     let port = ("CARLA_PORT", port(pair).to_string());
     Role {
-        image: asked.plan.carla.simulator_image.to_string(),
+        image: known.plan.simulator_image.to_string(),
         flags,
         command: commands::of_host(spec.command.as_deref(), spec.args.as_deref())
-            .unwrap_or_else(|| commands::simulator(version, adapter(spec, asked.has_gpus))),
+            .unwrap_or_else(|| commands::simulator(version, adapter(spec, known.asked.has_gpus))),
         env: [port].into_iter().chain(display::variables(spec, version)).collect(),
         mounts: [own].into_iter().chain(display::sockets(spec)).collect(),
+        shm: None,
         removes: display::removed(spec),
         draws: Some(needs(spec, version)),
     }
@@ -129,8 +144,8 @@ fn adapter(spec: &SimulatorContainer, has_gpus: bool) -> Adapter {
     }
 }
 
-fn agent(asked: &Asked<'_>, pair: Pair) -> Role {
-    let (spec, deadlines) = (&asked.spec.agent, &asked.deadlines);
+fn agent(known: &Known<'_>, pair: Pair) -> Role {
+    let (spec, deadlines) = (&known.asked.spec.agent, &known.asked.deadlines);
     let flags = vec![
         format!("--work={AGENT}"),
         format!("--checkpoint={CHECKPOINT}"),
@@ -138,56 +153,51 @@ fn agent(asked: &Asked<'_>, pair: Pair) -> Role {
         seconds("idle", deadlines.idle_seconds),
         format!("--log-limit={}", spec.log_size_limit.bytes()),
         format!("--python-path={}", python_path()),
-        format!("--route-runs={}", route_runs(asked, pair)),
+        format!("--route-runs={}", route_runs(known.plan, pair)),
     ];
     let host = commands::of_host(spec.command.as_deref(), spec.args.as_deref());
-    let words = host.unwrap_or_else(|| commands::agent(asked.plan.carla.version));
+    let words = host.unwrap_or_else(|| commands::agent(known.plan.version));
     let own = Mount::Own {
         folder: agent_folder(pair),
         path: AGENT,
     };
     Role {
-        image: asked.plan.image.clone(),
+        image: known.asked.plan.image.clone(),
         flags,
         // The runner expands these words, so that RESUME is what it is in this round.
         command: words.iter().map(|word| literal(word)).collect(),
-        env: agent_env(asked, pair),
+        env: agent_env(known, pair),
         mounts: CONTENTS_VOLUMES.map(Mount::Contents).into_iter().chain([own]).collect(),
+        shm: spec.shm_size.as_ref().map(ByteQuantity::bytes),
         removes: &[],
         draws: None,
     }
 }
 
 /// How many route runs the pair's evaluator is to drive; 0 if there were no slice for it.
-fn route_runs(asked: &Asked<'_>, pair: Pair) -> u32 {
-    let slice = asked.plan.carla.slices.get(pair.index());
-    let repetitions = u32::try_from(asked.plan.carla.repetitions).unwrap_or(0);
+fn route_runs(plan: &CarlaPlan, pair: Pair) -> u32 {
+    let slice = plan.slices.get(pair.index());
+    let repetitions = u32::try_from(plan.repetitions).unwrap_or(0);
     slice.map_or(0, |slice| slice.routes().saturating_mul(repetitions))
 }
 
-/// A flag of the runner, which counts seconds in 32 bits.
-fn seconds(what: &str, value: i64) -> String {
-    let value = value.clamp(0, u32::MAX.into());
-    format!("--{what}-seconds={value}")
-}
-
-fn agent_env(asked: &Asked<'_>, pair: Pair) -> Vec<(&'static str, String)> {
-    let (plan, track) = (asked.plan, asked.track);
+fn agent_env(known: &Known<'_>, pair: Pair) -> Vec<(&'static str, String)> {
+    let (plan, track) = (known.plan, known.asked.track);
     let routes = track
         .and_then(|track| track.carla.routes_file.as_deref())
         .unwrap_or(ROUTES_FILE);
     let scenarios = track
         .and_then(|track| track.carla.scenarios_file.as_deref())
         .unwrap_or(SCENARIOS_FILE);
-    let slice = plan.carla.slices.get(pair.index());
-    let resume = if asked.resume { "1" } else { "" };
+    let slice = plan.slices.get(pair.index());
+    let resume = if known.asked.resume { "1" } else { "" };
     vec![
         ("CARLA_PORT", port(pair).to_string()),
         ("CARLA_TM_PORT", port(pair).saturating_add(10).to_string()),
-        ("CHALLENGE_TRACK_CODENAME", plan.carla.codename.to_string()),
+        ("CHALLENGE_TRACK_CODENAME", plan.codename.to_string()),
         ("ROUTES", routes.to_owned()),
         ("ROUTES_SUBSET", slice.map(ToString::to_string).unwrap_or_default()),
-        ("REPETITIONS", plan.carla.repetitions.to_string()),
+        ("REPETITIONS", plan.repetitions.to_string()),
         ("RESUME", resume.to_owned()),
         ("CHECKPOINT_ENDPOINT", CHECKPOINT.to_owned()),
         ("RECORD_PATH", SAVED.to_owned()),
@@ -195,7 +205,7 @@ fn agent_env(asked: &Asked<'_>, pair: Pair) -> Vec<(&'static str, String)> {
         ("CARLA_ROOT", CARLA_ROOT.to_owned()),
         ("SCENARIO_RUNNER_ROOT", SCENARIO_RUNNER_ROOT.to_owned()),
         ("LEADERBOARD_ROOT", LEADERBOARD_ROOT.to_owned()),
-        match plan.carla.version {
+        match plan.version {
             LeaderboardVersion::V1 => ("SCENARIOS", scenarios.to_owned()),
             // The original's file lies in the contents, which are read-only here.
             LeaderboardVersion::V2 => ("DEBUG_CHECKPOINT_ENDPOINT", LIVE_RESULTS.to_owned()),
