@@ -81,6 +81,10 @@ pub struct Words {
     pub unit: &'static str,
     /// The container with the host's image.
     pub host: &'static str,
+    /// One worker: a container with the host's image and its agent.
+    pub worker: &'static str,
+    /// What a participant can try an agent on, in the plural.
+    pub practice: &'static str,
 }
 
 /// The words where no kind is known yet.
@@ -88,6 +92,8 @@ const PLAIN: Words = Words {
     units: "units",
     unit: "unit",
     host: "host's container",
+    worker: "worker",
+    practice: "data",
 };
 
 /// One number of a result, under both of its names.

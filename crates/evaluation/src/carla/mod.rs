@@ -23,6 +23,8 @@ const WORDS: Words = Words {
     units: measures::UNIT,
     unit: "route",
     host: HOST.name(),
+    worker: "pair",
+    practice: measures::UNIT,
 };
 const HOST: Host = Host::Simulator;
 
