@@ -7,8 +7,8 @@ use std::collections::BTreeMap;
 use jiff::Timestamp;
 
 use super::row::{Phase, Split};
-use super::types::Target;
-use leaderboard_api::{Order, Ranking};
+use super::types::{Metrics, Target};
+use leaderboard_api::{Order, Ranking, ScoreMetric};
 
 /// A challenge as EvalAI shows it.
 #[derive(Clone, Debug, PartialEq)]
@@ -52,6 +52,11 @@ pub enum Misfit {
     /// A phase has no leaderboard of that split.
     #[error("phase {phase} has no leaderboard for the split {split}; check evalai.split")]
     Split { phase: i64, split: String },
+    /// A phase has no leaderboard, or one of a split without a name: what is to be sent for it is not known.
+    #[error(
+        "EvalAI shows no leaderboard of phase {phase}, or not the codename of each; add one there, or let the token's user read them"
+    )]
+    Unnamed { phase: i64 },
     /// The leaderboard lacks metrics: EvalAI would refuse every result.
     #[error("the leaderboard of phase {phase} has no {}; add these labels to its schema", .labels.join(", "))]
     Unknown { phase: i64, labels: Vec<String> },
@@ -79,9 +84,31 @@ pub fn compare(target: &Target, catalog: &Catalog) -> Labels {
         rankings: target
             .phases
             .iter()
-            .filter_map(|phase| Some((*phase, ranking(catalog, split_of(catalog, *phase, &target.split)?)?)))
+            .filter_map(|phase| Some((*phase, phase_ranking(target, catalog, *phase)?)))
             .collect(),
     }
+}
+
+/// How a phase ranks, under the names that its results have here.
+fn phase_ranking(target: &Target, catalog: &Catalog, phase: i64) -> Option<Ranking> {
+    let scores = match &target.metrics {
+        Metrics::Fixed(_) => return ranking(catalog, split_of(target, catalog, phase)?),
+        Metrics::Listed(scores) => scores,
+    };
+    let score = scores.get(&phase)?;
+    let (name, split) = scored(score, listed(target, catalog, phase)?)?;
+    let ranking = ranking(catalog, split)?;
+    Some(Ranking {
+        metric: score.name_of(name, &ranking.metric),
+        ..ranking
+    })
+}
+
+/// The split that has the score: the one that it names, else the only one.
+fn scored<'a>(score: &ScoreMetric, listed: Vec<(&'a str, &'a Split)>) -> Option<(&'a str, &'a Split)> {
+    let is_only = listed.len() == 1;
+    let is_its = |name: &str| score.split.as_deref().map_or(is_only, |split| split == name);
+    listed.into_iter().find(|one| is_its(one.0))
 }
 
 /// How a leaderboard ranks. EvalAI's own default is that the highest value leads.
@@ -106,37 +133,43 @@ fn compare_phase(target: &Target, catalog: &Catalog, phase: i64) -> Vec<Misfit> 
         let challenge = target.challenge;
         return vec![Misfit::Phase { challenge, phase }];
     }
-    let Some(split) = split_of(catalog, phase, &target.split) else {
+    let labels = match &target.metrics {
+        Metrics::Listed(_) if listed(target, catalog, phase).is_none() => return vec![Misfit::Unnamed { phase }],
+        // What a result lacks is known once it is there.
+        Metrics::Listed(_) => return Vec::new(),
+        Metrics::Fixed(labels) => labels,
+    };
+    let Some(split) = split_of(target, catalog, phase) else {
         let split = target.split.clone();
         return vec![Misfit::Split { phase, split }];
     };
     let known = &split.schema.labels;
-    let unknown: Vec<_> = target
-        .labels
-        .iter()
-        .filter(|label| !known.contains(label))
-        .cloned()
-        .collect();
-    let unsent: Vec<_> = known
-        .iter()
-        .filter(|label| !target.labels.contains(label))
-        .cloned()
-        .collect();
+    let unknown: Vec<_> = labels.iter().filter(|label| !known.contains(label)).cloned().collect();
+    let unsent: Vec<_> = known.iter().filter(|label| !labels.contains(label)).cloned().collect();
     let unknown = (!unknown.is_empty()).then_some(Misfit::Unknown { phase, labels: unknown });
     let unsent = (!unsent.is_empty()).then_some(Misfit::Unsent { phase, labels: unsent });
     unknown.into_iter().chain(unsent).collect()
 }
 
-/// The phase's leaderboard of a split. Where EvalAI does not show a codename, a phase's only leaderboard is taken.
-fn split_of<'a>(catalog: &'a Catalog, phase: i64, codename: &str) -> Option<&'a Split> {
+/// The phase's leaderboard of the target's split.
+fn split_of<'a>(target: &'a Target, catalog: &'a Catalog, phase: i64) -> Option<&'a Split> {
+    let mut all = named(target, catalog, phase).into_iter();
+    all.find_map(|(name, split)| (name == Some(target.split.as_str())).then_some(split))
+}
+
+/// Each split of a phase with its codename. None where the phase has none, or a split has no codename.
+pub(super) fn listed<'a>(target: &'a Target, catalog: &'a Catalog, phase: i64) -> Option<Vec<(&'a str, &'a Split)>> {
+    let all = named(target, catalog, phase).into_iter();
+    let all: Option<Vec<_>> = all.map(|(name, split)| Some((name?, split))).collect();
+    all.filter(|all| !all.is_empty())
+}
+
+/// The leaderboards of a phase with the codenames of their splits. Where EvalAI does not show that of a phase's only one, it is the target's.
+fn named<'a>(target: &'a Target, catalog: &'a Catalog, phase: i64) -> Vec<(Option<&'a str>, &'a Split)> {
     let of_phase = || catalog.splits.iter().filter(|split| split.phase == phase);
-    let name = |split: &Split| catalog.codenames.get(&split.dataset_split).cloned().flatten();
-    let named = of_phase().find(|split| name(split).as_deref() == Some(codename));
-    named.or_else(|| {
-        of_phase()
-            .next()
-            .filter(|only| of_phase().count() == 1 && name(only).is_none())
-    })
+    let own = Some(target.split.as_str()).filter(|_| of_phase().count() == 1);
+    let shown = |split: &Split| catalog.codenames.get(&split.dataset_split).and_then(Option::as_deref);
+    of_phase().map(|split| (shown(split).or(own), split)).collect()
 }
 
 #[cfg(test)]
@@ -163,7 +196,7 @@ mod tests {
             sweep: Duration::from_mins(1),
             period: Duration::from_secs(10),
             phases: phases.into(),
-            labels: labels.iter().map(|label| (*label).to_owned()).collect(),
+            metrics: Metrics::Fixed(labels.iter().map(|label| (*label).to_owned()).collect()),
             inbox: None,
             is_observed: false,
             since: Timestamp::UNIX_EPOCH,
@@ -230,6 +263,76 @@ mod tests {
         }
         let other = compare(&target(&[2, 3], &["A"]), &catalog(Some("leaderboard")));
         assert_eq!(other.rankings.keys().collect::<Vec<_>>(), [&2]);
+    }
+
+    /// One whose phase has the splits `dev` and `test`, and whose leaderboards rank by `A`.
+    fn of_two_splits(codenames: [Option<&str>; 2]) -> Catalog {
+        let mut catalog = catalog(None);
+        catalog.splits[1].phase = 1;
+        let names = [10, 11].into_iter().zip(codenames);
+        catalog.codenames = names.map(|(id, name)| (id, name.map(str::to_owned))).collect();
+        catalog.descending = [(2, Some(false))].into();
+        catalog
+    }
+
+    fn takes_what_is_listed(split: Option<&str>) -> Target {
+        let score = json!({"split": split, "metric": "B", "order": "Descending"});
+        let score: ScoreMetric = serde_json::from_value(score).unwrap();
+        Target {
+            metrics: Metrics::Listed(Arc::new([(1, score.clone()), (2, score)].into())),
+            ..target(&[1], &[])
+        }
+    }
+
+    #[test]
+    fn where_the_labels_are_evalais_each_split_of_a_phase_needs_its_codename() {
+        let (dev, test) = (Some("dev"), Some("test"));
+        let unnamed = || vec![Misfit::Unnamed { phase: 1 }];
+        let missing = vec![Misfit::Phase { challenge: 1, phase: 3 }];
+        let bare = Catalog {
+            splits: vec![],
+            ..of_two_splits([dev, test])
+        };
+        for (catalog, phase, expected) in [
+            (of_two_splits([dev, test]), 1, vec![]),
+            (of_two_splits([dev, None]), 1, unnamed()),
+            (of_two_splits([None, None]), 1, unnamed()),
+            (bare, 1, unnamed()),
+            (of_two_splits([dev, test]), 3, missing),
+            (catalog(None), 1, vec![]),
+        ] {
+            let target = Target {
+                phases: [phase].into(),
+                ..takes_what_is_listed(None)
+            };
+            let found = compare(&target, &catalog);
+            assert_eq!((found.ok(), found.problems), (expected.is_empty(), expected));
+        }
+    }
+
+    #[test]
+    fn where_the_labels_are_evalais_the_split_with_the_score_ranks_under_its_name_here() {
+        let both = || of_two_splits([Some("dev"), Some("test")]);
+        let ranking = |metric: &str, order| {
+            let metric = metric.to_owned();
+            Some(Ranking { metric, order })
+        };
+        for (split, catalog, expected) in [
+            (Some("dev"), both(), ranking("dev_A", Order::Descending)),
+            (Some("test"), both(), ranking("test_A", Order::Ascending)),
+            (Some("val"), both(), None),
+            // Which of them has the score is not known.
+            (None, both(), None),
+            (None, catalog(Some("test")), ranking("A", Order::Descending)),
+            (
+                Some("test"),
+                catalog(Some("test")),
+                ranking("test_A", Order::Descending),
+            ),
+        ] {
+            let found = compare(&takes_what_is_listed(split), &catalog).rankings.remove(&1);
+            assert_eq!(found, expected, "{split:?}");
+        }
     }
 
     #[test]

@@ -32,6 +32,6 @@ pub use leaderboard_contract::report::Patience;
 pub use queue::Timing;
 pub use row::Row;
 pub use types::{
-    Changed, DesiredUpdate, Ended, ImageAnswer, InboxTrouble, Key, Outline, Payload, PayloadProblem, PayloadReader,
+    Changed, DesiredUpdate, Ended, ImageAnswer, InboxTrouble, Key, Metrics, Outline, Payload, PayloadProblem, PayloadReader,
     Publisher, Run, StoredResult, Subject, SubmissionState, SweepRow, Swept, Target, Usage, WriteGuard,
 };

@@ -1,11 +1,15 @@
-//! Results before they are sent: they name the split of their Leaderboard, and are checked, because the server's own checks are
-//! incomplete: it takes results without metrics, and results for the leaderboard of a foreign phase.
+//! Results before they are sent: they name the split of their Leaderboard, or are those that EvalAI lists, and are checked, because the
+//! server's own checks are incomplete: it takes results without metrics, and results for the leaderboard of a foreign phase.
 //!
 //! Called by `queue`. Pure.
 
-use serde::Deserialize;
+use std::collections::BTreeMap;
+
+use serde::{Deserialize, Serialize};
+use serde_json::value::RawValue;
 use serde_json::{Map, Value};
 
+use super::row::Split;
 use super::types::Payload;
 
 /// One entry of the list in `result`.
@@ -13,6 +17,15 @@ use super::types::Payload;
 struct Entry {
     split: String,
     accuracies: Map<String, Value>,
+}
+
+/// The same with its numbers as they are written: one that is read and written again may have other digits.
+#[derive(Deserialize, Serialize)]
+struct Raw<'a> {
+    split: String,
+    show_to_participant: bool,
+    #[serde(borrow)]
+    accuracies: BTreeMap<String, &'a RawValue>,
 }
 
 /// Results for this split. A Pod does not know it: what it stores names the original's, in S3 for good.
@@ -33,10 +46,49 @@ fn named(result: &str, split: &str) -> Option<String> {
     Some(format!("{before}{}{rest}", Value::from(split)))
 }
 
+/// Results for the splits that EvalAI lists for a phase, each with exactly its labels: what else there is stays in the bucket. Else why
+/// they are not sent.
+pub fn for_listed(result: &str, listed: &[(&str, &Split)]) -> Result<String, String> {
+    let mut entries: Vec<Raw<'_>> = parsed(result)?;
+    let mut sent = Vec::new();
+    for (name, split) in listed {
+        let found = entries.iter().position(|entry| entry.split == *name);
+        let found =
+            found.ok_or_else(|| format!("the results lack the split {name}, which EvalAI lists for the phase"))?;
+        let mut entry = entries.swap_remove(found);
+        let labels = &split.schema.labels;
+        entry.accuracies.retain(|name, _| labels.contains(name));
+        let number = |value: &RawValue| value.get().parse().ok().filter(|number: &f64| number.is_finite());
+        let wrong = entry.accuracies.iter().find(|(_, value)| number(value).is_none());
+        if let Some((metric, _)) = wrong {
+            return Err(format!("the metric {metric} of the split {name} is no finite number"));
+        }
+        let missing = missing(labels, |label| entry.accuracies.contains_key(label));
+        if let Some(missing) = missing {
+            return Err(format!("the split {name} of the results lacks the metrics {missing}"));
+        }
+        sent.push(entry);
+    }
+    serde_json::to_string(&sent).map_err(|error| error.to_string())
+}
+
+fn parsed<'a, T: Deserialize<'a>>(result: &'a str) -> Result<Vec<T>, String> {
+    serde_json::from_str(result).map_err(|error| format!("the results are not EvalAI's list of splits ({error})"))
+}
+
+/// The labels that are not there, in a list.
+fn missing(labels: &[String], is_there: impl Fn(&str) -> bool) -> Option<String> {
+    let missing: Vec<&str> = labels
+        .iter()
+        .map(String::as_str)
+        .filter(|label| !is_there(label))
+        .collect();
+    (!missing.is_empty()).then(|| missing.join(", "))
+}
+
 /// Why results are not sent: they lack or misname what the leaderboard wants.
 pub fn check(payload: &Payload, split: &str, labels: &[String]) -> Result<(), String> {
-    let entries: Vec<Entry> = serde_json::from_str(&payload.result)
-        .map_err(|error| format!("the results are not EvalAI's list of splits ({error})"))?;
+    let entries: Vec<Entry> = parsed(&payload.result)?;
     let [entry] = entries.as_slice() else {
         return Err(format!("the results are for {} splits, not for one", entries.len()));
     };
@@ -50,20 +102,16 @@ pub fn check(payload: &Payload, split: &str, labels: &[String]) -> Result<(), St
     if let Some((name, _)) = wrong {
         return Err(format!("the metric {name} is no finite number"));
     }
-    let missing: Vec<_> = labels
-        .iter()
-        .filter(|label| !entry.accuracies.contains_key(*label))
-        .cloned()
-        .collect();
-    if !missing.is_empty() {
-        return Err(format!("the results lack the metrics {}", missing.join(", ")));
+    match missing(labels, |label| entry.accuracies.contains_key(label)) {
+        Some(missing) => Err(format!("the results lack the metrics {missing}")),
+        None => Ok(()),
     }
-    Ok(())
 }
 
 #[cfg(test)]
 mod tests {
     use super::*;
+    use crate::row::Schema;
 
     fn checked(result: &str) -> Result<(), String> {
         let payload = Payload {
@@ -107,6 +155,60 @@ mod tests {
             let error = checked(result).unwrap_err();
             assert!(error.contains(part), "{result}: {error}");
         }
+    }
+
+    #[test]
+    fn of_results_what_evalai_lists_is_sent_and_else_nothing() {
+        let split = |labels: &[&str]| Split {
+            id: 1,
+            phase: 1,
+            dataset_split: 1,
+            schema: Schema {
+                labels: labels.iter().map(|label| (*label).to_owned()).collect(),
+                default_order_by: None,
+                metadata: Value::Null,
+            },
+        };
+        let (accuracy, both) = (split(&["accuracy"]), split(&["loss", "accuracy"]));
+        let dev = r#"{"split":"dev","show_to_participant":true,"accuracies":{"accuracy":0.50,"loss":1e2}}"#;
+        let test = r#"{"split":"test","show_to_participant":false,"accuracies":{"accuracy":0.1}}"#;
+        let results = format!("[{dev}, {test}]");
+        let whole = format!("[{test},{dev}]");
+        let part = r#"[{"split":"dev","show_to_participant":true,"accuracies":{"accuracy":0.50}}]"#;
+        assert_eq!(for_listed(&results, &[("test", &accuracy), ("dev", &both)]), Ok(whole));
+        assert_eq!(for_listed(&results, &[("dev", &accuracy)]), Ok(part.to_owned()));
+        let number = |number: &str| results.replace("1e2", number);
+        for (results, listed, why) in [
+            (results.clone(), ("val", &accuracy), "lack the split val"),
+            (
+                results.clone(),
+                ("test", &both),
+                "the split test of the results lacks the metrics loss",
+            ),
+            ("[]".to_owned(), ("dev", &both), "lack the split dev"),
+            (
+                number("1e999"),
+                ("dev", &both),
+                "loss of the split dev is no finite number",
+            ),
+            (
+                number(r#""1""#),
+                ("dev", &both),
+                "loss of the split dev is no finite number",
+            ),
+            (
+                number("null"),
+                ("dev", &both),
+                "loss of the split dev is no finite number",
+            ),
+            (number("NaN"), ("dev", &both), "list of splits"),
+            (String::new(), ("dev", &both), "list of splits"),
+        ] {
+            let refused = for_listed(&results, &[listed]).unwrap_err();
+            assert!(refused.contains(why), "{results}: {refused}");
+        }
+        // A number that nobody sends may be anything.
+        assert_eq!(for_listed(&number("1e999"), &[("dev", &accuracy)]), Ok(part.to_owned()));
     }
 
     #[test]

@@ -2,6 +2,7 @@
 //!
 //! Pure. A [`Key`] names the object that is woken, a [`Run`] the attempt that an update is about.
 
+use std::collections::BTreeMap;
 use std::sync::Arc;
 use std::time::Duration;
 
@@ -11,7 +12,7 @@ use jiff::Timestamp;
 use super::row::Row;
 use crate::token::Token;
 use leaderboard_api::evalai_status::{Outcome, Progress, Status};
-use leaderboard_api::{Attempt, S3Bucket};
+use leaderboard_api::{Attempt, S3Bucket, ScoreMetric};
 pub use leaderboard_base::object_key::ObjectKey as Key;
 use leaderboard_base::spans::LogSpan;
 use leaderboard_contract::report::ContentId;
@@ -38,14 +39,24 @@ pub struct Target {
     pub period: Duration,
     /// Phases of the Leaderboard's tracks.
     pub phases: Arc<[i64]>,
-    /// The metrics that its results hold.
-    pub labels: Arc<[String]>,
+    /// What of its results is published.
+    pub metrics: Metrics,
     /// Name of the challenge's queue, if it is to be read here.
     pub inbox: Option<String>,
     /// Nothing is written there.
     pub is_observed: bool,
     /// When the Leaderboard was created: the sweep leaves alone what asked to be run before.
     pub since: Timestamp,
+}
+
+/// The metrics that a Leaderboard publishes.
+#[derive(Clone, Debug, PartialEq)]
+pub enum Metrics {
+    /// These, for the split of the target.
+    Fixed(Arc<[String]>),
+    /// Of each split that EvalAI lists for a phase, those that it lists there. With the score of each phase, which names the split that
+    /// ranks it.
+    Listed(Arc<BTreeMap<i64, ScoreMetric>>),
 }
 
 /// Answers, right before each write, whether this process still leads.

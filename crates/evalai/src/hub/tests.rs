@@ -2,7 +2,7 @@ mod tokens;
 
 use super::*;
 use crate::token::Token;
-use crate::types::Run;
+use crate::types::{Metrics, Run};
 use futures::FutureExt;
 use leaderboard_api::Attempt;
 use leaderboard_base::shutdown::Stop;
@@ -25,7 +25,7 @@ fn target(token: &str) -> Target {
         sweep: Duration::from_mins(1),
         period: Duration::from_secs(10),
         phases: [1].into(),
-        labels: [].into(),
+        metrics: Metrics::Fixed([].into()),
         inbox: None,
         is_observed: false,
         since: Timestamp::UNIX_EPOCH,

@@ -10,8 +10,9 @@ use tokio::sync::OwnedSemaphorePermit;
 
 use super::sub::{Sub, Write};
 use super::{Busy, Next, Now, Queue};
-use crate::payload::{check, for_split};
-use crate::types::{Changed, Key, Outline, Payload, PayloadProblem, Target};
+use crate::labels::{Catalog, Misfit, listed};
+use crate::payload::{check, for_listed, for_split};
+use crate::types::{Changed, Key, Metrics, Outline, Payload, PayloadProblem, Target};
 use leaderboard_api::evalai_status::Outcome;
 
 /// Payloads that are held at once: with a second one, a write that EvalAI does not answer holds no other up.
@@ -26,7 +27,7 @@ pub type Place = Option<OwnedSemaphorePermit>;
 #[derive(Debug)]
 pub(super) struct Held {
     of: Arc<Outline>,
-    /// Its results name the split of this Leaderboard.
+    /// Its results are for the splits of this Leaderboard.
     target: Arc<Target>,
     /// None while it is being read.
     read: Option<Read>,
@@ -117,26 +118,30 @@ impl Queue {
         let before = sub.view.clone();
         let is_partial = sub.next_write().is_some_and(|(write, _)| write == Write::Partial);
         let has_results = is_partial || sub.end.as_ref().is_some_and(|end| end.what.0 == Outcome::Finished);
-        match answer {
-            Ok((payload, place)) => {
-                let target = &held.target;
-                let payload = for_split(payload, &target.split);
-                let misfit = check(&payload, &target.split, &target.labels)
-                    .err()
-                    .filter(|_| has_results);
+        let challenge = self.challenges.get(&held.target.challenge);
+        let catalog = challenge.and_then(|challenge| challenge.check.catalog.as_ref());
+        let fit = |payload| {
+            if has_results {
+                fitted(payload, &held, catalog)
+            } else {
+                Some((payload, None))
+            }
+        };
+        match answer.map(|(payload, place)| (fit(payload), place)) {
+            Ok((None, _)) => sub.read_failed("EvalAI has not shown its leaderboards yet".to_owned(), &now),
+            Ok((Some((_, misfit @ Some(_))), _)) if is_partial => {
                 sub.view.unread = None;
-                if is_partial && misfit.is_some() {
-                    sub.view.partial_done = held.of.stored.as_ref().map(|stored| stored.done);
-                    (sub.partial, sub.view.last_error) = (None, misfit);
-                } else {
-                    sub.misfit = misfit;
-                    let read = Some(Read {
-                        payload: Arc::new(payload),
-                        until: now.at + KEPT,
-                        _place: place,
-                    });
-                    self.held.insert(key.clone(), Held { read, ..held });
-                }
+                sub.view.partial_done = held.of.stored.as_ref().map(|stored| stored.done);
+                (sub.partial, sub.view.last_error) = (None, misfit);
+            }
+            Ok((Some((payload, misfit)), place)) => {
+                (sub.view.unread, sub.misfit) = (None, misfit);
+                let read = Some(Read {
+                    payload: Arc::new(payload),
+                    until: now.at + KEPT,
+                    _place: place,
+                });
+                self.held.insert(key.clone(), Held { read, ..held });
             }
             Err(_) if is_partial => sub.partial = None,
             Err(PayloadProblem::Unfit(why)) => sub.payload_failed(why, &now),
@@ -161,4 +166,19 @@ impl Queue {
             sub.write_failures = sub.write_failures.max(failures);
         }
     }
+}
+
+/// Results as their Leaderboard publishes them, and why they are not sent. None while it is not known what EvalAI lists.
+fn fitted(payload: Payload, held: &Held, catalog: Option<&Catalog>) -> Option<(Payload, Option<String>)> {
+    let (target, phase) = (held.target.as_ref(), held.of.phase);
+    if let Metrics::Fixed(labels) = &target.metrics {
+        let payload = for_split(payload, &target.split);
+        let misfit = check(&payload, &target.split, labels).err();
+        return Some((payload, misfit));
+    }
+    let listed = listed(target, catalog?, phase).ok_or_else(|| Misfit::Unnamed { phase }.to_string());
+    Some(match listed.and_then(|listed| for_listed(&payload.result, &listed)) {
+        Ok(result) => (Payload { result, ..payload }, None),
+        Err(why) => (payload, Some(why)),
+    })
 }

@@ -252,7 +252,7 @@ fn a_result_without_a_metric_is_sent_once_its_leaderboard_wants_it_no_more() {
     let mut bench = Bench::new();
     bench.running(7);
     let wants_more = Target {
-        labels: ["Driving score".to_owned(), "Agent blocked".to_owned()].into(),
+        metrics: Metrics::Fixed(["Driving score".to_owned(), "Agent blocked".to_owned()].into()),
         ..target()
     };
     bench.update_of(&wants_more, DesiredUpdate::Final(Outcome::Finished, results(43.0)));
@@ -262,6 +262,83 @@ fn a_result_without_a_metric_is_sent_once_its_leaderboard_wants_it_no_more() {
     bench.expect_nothing();
     bench.becomes(&key(100), &target());
     bench.read_and_write(7, "finished");
+    assert!(matches!(bench.view(7).end, Some(Ended::Published { .. })));
+}
+
+/// A Leaderboard whose labels are those that EvalAI lists, and which has the score in this split.
+fn takes_what_is_listed(split: Option<&str>) -> Target {
+    let score = serde_json::json!({"split": split, "metric": "Driving score"});
+    Target {
+        metrics: Metrics::Listed(Arc::new([(1, serde_json::from_value(score).unwrap())].into())),
+        ..target()
+    }
+}
+
+impl Bench {
+    /// The check of the challenge, whose phase has one leaderboard with these labels.
+    fn checked(&mut self, codename: &str, labels: &[&str]) {
+        let split = Split {
+            id: 3,
+            phase: 1,
+            dataset_split: 5,
+            schema: Schema {
+                labels: labels.iter().map(|label| (*label).to_owned()).collect(),
+                default_order_by: None,
+                metadata: serde_json::Value::Null,
+            },
+        };
+        let phase = Phase {
+            id: 1,
+            shows_partial: false,
+        };
+        let codename = DatasetSplit {
+            codename: codename.to_owned(),
+        };
+        for (name, reply) in [
+            ("phases", Reply::Phases(Answer::Done(vec![phase]))),
+            ("splits", Reply::Splits(Answer::Done(vec![split]))),
+            ("dataset split", Reply::DatasetSplit(Answer::Done(codename))),
+        ] {
+            let ticket = self.expect(name);
+            self.answer(&ticket, reply);
+        }
+    }
+}
+
+#[test]
+fn a_result_for_what_evalai_lists_waits_until_that_is_known_and_is_refused_if_it_lacks_something() {
+    let (mut bench, board) = (Bench::new(), takes_what_is_listed(None));
+    bench.running(7);
+    bench.becomes(&key(100), &board);
+    bench.update_of(&board, DesiredUpdate::Final(Outcome::Finished, results(43.0)));
+    // The end goes first, and what EvalAI lists is not known yet.
+    for list in ["sweep of submitted", "sweep of resuming"] {
+        bench.list(list, vec![]);
+    }
+    let waits = |bench: &Bench| (bench.view(7).end, bench.view(7).last_error.is_some());
+    assert_eq!(waits(&bench), (None, true), "it is no fault of the results");
+    bench.checked("leaderboard", &["Driving score", "Agent blocked"]);
+    bench.wait(5.0);
+    bench.get(7, row(7, Status::Running));
+    let refused = "the split leaderboard of the results lacks the metrics Agent blocked";
+    assert_eq!(bench.view(7).end, Some(Ended::Refused(refused.into())));
+    // A host corrects the schema, and the Leaderboard is checked again for another reason.
+    let board = takes_what_is_listed(Some("leaderboard"));
+    bench.becomes(&key(100), &board);
+    bench.checked("leaderboard", &["Driving score"]);
+    bench.wait(600.0);
+    let sent = bench.read_and_write(7, "finished");
+    let expected = r#"[{"split":"leaderboard","show_to_participant":true,"accuracies":{"Driving score":43}}]"#;
+    assert_eq!(results_of(&sent), expected);
+    assert!(matches!(bench.view(7).end, Some(Ended::Published { .. })));
+}
+
+#[test]
+fn an_end_without_results_needs_no_label_of_evalais() {
+    let (mut bench, board) = (Bench::new(), takes_what_is_listed(None));
+    bench.running(7);
+    bench.update_of(&board, DesiredUpdate::Final(Outcome::Failed, results(43.0)));
+    bench.read_and_write(7, "failed");
     assert!(matches!(bench.view(7).end, Some(Ended::Published { .. })));
 }
 

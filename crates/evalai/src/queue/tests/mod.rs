@@ -18,7 +18,7 @@ use crate::answer::{About, Answer, Refusal, Silence};
 use crate::request::{Purpose, Reply};
 use crate::row::{DatasetSplit, Phase, PhaseSplit, Row, Schema, Split};
 use crate::token::Token;
-use crate::types::{ImageAnswer, Payload, PayloadProblem, Run, StoredResult, Usage};
+use crate::types::{ImageAnswer, Metrics, Payload, PayloadProblem, Run, StoredResult, Usage};
 use leaderboard_api::evalai_status::Status;
 use leaderboard_api::{Attempt, Order};
 use leaderboard_base::spans::LogSpan;
@@ -41,7 +41,7 @@ fn target() -> Target {
         sweep: Duration::from_mins(1),
         period: Duration::from_secs(10),
         phases: [1].into(),
-        labels: ["Driving score".to_owned()].into(),
+        metrics: Metrics::Fixed(["Driving score".to_owned()].into()),
         inbox: None,
         is_observed: false,
         since: wall(-3600),
@@ -125,7 +125,9 @@ fn results_in(bucket: &str, score: f64) -> Arc<Outline> {
 fn stored(outline: &Outline) -> Payload {
     let score = &outline.stored.as_ref().unwrap().prefix;
     Payload {
-        result: format!(r#"[{{"split":"leaderboard","accuracies":{{"Driving score":{score}}}}}]"#),
+        result: format!(
+            r#"[{{"split":"leaderboard","show_to_participant":true,"accuracies":{{"Driving score":{score}}}}}]"#
+        ),
         ..Payload::bare(outline)
     }
 }
