@@ -8,6 +8,8 @@ use leaderboard_protocol::files::{Host, Pair};
 pub const MERGED: &str = "agent/agent_results.json";
 /// Before the keys of EvalAI's texts.
 pub const EVALAI: &str = "evalai/";
+/// The metrics as EvalAI gets them.
+pub const RESULTS: &str = "evalai/results.json";
 /// The text that participants read in EvalAI.
 pub const STDOUT: &str = "evalai/stdout.txt";
 /// The merged file under EvalAI's name.
@@ -27,7 +29,7 @@ pub const SIMULATORS: &str = "simulator/";
 /// Before the keys of the evaluators' files; the number of the worker follows.
 pub const EVALUATORS: &str = "evaluators/";
 /// Name of the file in an evaluator's folder with its result.
-pub const RESULT: &str = "result.json";
+pub const RESULT_FILE: &str = "result.json";
 
 /// The folder of an agent, without a slash at its end.
 pub fn agent_folder(pair: Pair) -> String {
@@ -62,7 +64,7 @@ pub fn host_log(host: Host, pair: Pair) -> String {
 
 /// The result that the evaluator of a pair writes.
 pub fn result_path(pair: Pair) -> String {
-    format!("{}/{RESULT}", host_folder(Host::Evaluator, pair))
+    format!("{}/{RESULT_FILE}", host_folder(Host::Evaluator, pair))
 }
 
 /// What the agent of a pair has printed.

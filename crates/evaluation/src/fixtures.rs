@@ -1,4 +1,4 @@
-//! A run and its checkpoints, for the tests of this crate and of others.
+//! Runs and their results, for the tests of this crate and of others.
 
 use std::fs;
 use std::path::Path;
@@ -6,8 +6,8 @@ use std::path::Path;
 use leaderboard_protocol::files::{Mark, Member, Pair, Side, StatusFile};
 
 use leaderboard_api::{
-    Attempt, ByteQuantity, CarlaPlan, LeaderboardVersion, PlannedEvaluation, RouteSlice, RunPlan, S3Bucket, Storage,
-    Verify,
+    Attempt, ByteQuantity, CarlaPlan, ContainerPlan, EvaluationMode, LeaderboardVersion, MergeMethod, Order,
+    PlannedEvaluation, RouteSlice, RunPlan, S3Bucket, ScoreMetric, Storage, Verify,
 };
 use leaderboard_contract::run::{Run, SCHEMA, STATUS_FOLDER};
 
@@ -55,6 +55,50 @@ pub fn run() -> Run {
         logs: None,
         isolation: None,
     }
+}
+
+/// The same with other pairs.
+pub fn run_of(slices: Vec<RouteSlice>) -> Run {
+    let mut run = run();
+    if let PlannedEvaluation::Carla(carla) = &mut run.plan.evaluation {
+        carla.slices = slices;
+    }
+    run
+}
+
+/// Two workers of a host's evaluator, in phase 7.
+pub fn container_run() -> Run {
+    let mut run = run();
+    run.plan.track = "test".into();
+    run.plan.phase = Some(7);
+    run.plan.evaluation = PlannedEvaluation::Container(ContainerPlan {
+        mode: EvaluationMode::Interactive,
+        workers: 2,
+        merge: MergeMethod::Mean,
+        score: ScoreMetric {
+            split: None,
+            metric: "accuracy".to_owned(),
+            order: Order::Descending,
+        },
+        image: "evaluator".into(),
+    });
+    run
+}
+
+/// A result with an accuracy over the units `done` of `total`, which is final if none is missing.
+pub fn result(done: u32, total: u32, accuracy: f64) -> String {
+    let splits = serde_json::json!([{"name": "test", "metrics": {"accuracy": accuracy}}]);
+    let file = serde_json::json!({"schema": 1, "done": done, "total": total, "final": done == total, "splits": splits});
+    file.to_string()
+}
+
+/// Puts a result where the evaluator of a worker would.
+pub fn put_result(logs: &Path, worker: usize, text: &str) {
+    let folder = logs.join(format!("evaluators/{worker}"));
+    fs::create_dir_all(&folder).unwrap();
+    let part = folder.join(".result.json");
+    fs::write(&part, text).unwrap();
+    fs::rename(part, folder.join("result.json")).unwrap();
 }
 
 /// A V2 checkpoint with the routes `first..first + done` of `total`.

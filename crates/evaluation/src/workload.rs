@@ -91,6 +91,12 @@ pub struct ContentsVolume {
     pub read: &'static str,
 }
 
+/// The host's own command with its arguments, if there is one.
+pub(crate) fn of_host(command: Option<&[String]>, arguments: Option<&[String]>) -> Option<Vec<String>> {
+    let words = command?.iter().chain(arguments.unwrap_or_default());
+    Some(words.cloned().collect())
+}
+
 /// A flag of the runner, which counts seconds in 32 bits.
 pub(crate) fn seconds(what: &str, value: i64) -> String {
     let value = value.clamp(0, u32::MAX.into());

@@ -32,12 +32,6 @@ impl Adapter {
     }
 }
 
-/// The host's own command with its arguments, if there is one.
-pub fn of_host(command: Option<&[String]>, arguments: Option<&[String]>) -> Option<Vec<String>> {
-    let words = command?.iter().chain(arguments.unwrap_or_default());
-    Some(words.cloned().collect())
-}
-
 /// Copies the private contents into their volumes, which `contents` has below /tmp.
 pub fn contents() -> Vec<String> {
     // Without the second line an image that sets none of the three would have its whole file system copied.

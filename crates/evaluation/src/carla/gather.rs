@@ -12,7 +12,7 @@ use crate::carla::results_format;
 use crate::judge::Ending;
 use crate::{Gathered, Object, Objects, Refused, Results, Summary, Texts, WorkerSeen};
 use leaderboard_api::Verify;
-use leaderboard_contract::keys::{MERGED, METADATA, STDOUT, checkpoint_path};
+use leaderboard_contract::keys::{MERGED, METADATA, RESULTS, STDOUT, checkpoint_path};
 use leaderboard_contract::report::{Outcome, RefusedResults, ReportWorker};
 use leaderboard_contract::run::{Run, STATUS_FOLDER};
 use leaderboard_evidence::{Stamp, Tree, TreeError};
@@ -118,10 +118,7 @@ fn outcome(of_results: leaderboard_results::Outcome) -> Outcome {
 
 /// Takes in EvalAI's texts. The merged file can be large, so it is moved: it is in memory once, under both of its keys.
 fn take_texts(objects: &mut Objects, files: Files) -> Arc<Texts> {
-    objects.insert(
-        "evalai/results.json".to_owned(),
-        Object::new(files.results_json.clone()),
-    );
+    objects.insert(RESULTS.to_owned(), Object::new(files.results_json.clone()));
     objects.insert(STDOUT.to_owned(), Object::new(files.stdout_txt));
     if let Some(metadata) = files.metadata_json {
         let merged = Object::new(metadata);

@@ -6,7 +6,7 @@ use super::commands::{self, Adapter};
 use super::display;
 use super::layout::{CARLA_ROOT, LEADERBOARD_ROOT, SCENARIO_RUNNER_ROOT, python_path};
 use crate::workload::{
-    AGENT, Asked, Contents, ContentsVolume, HOST_LOG_LIMIT, Mount, Reserved, Role, Workload, literal, seconds,
+    AGENT, Asked, Contents, ContentsVolume, HOST_LOG_LIMIT, Mount, Reserved, Role, Workload, literal, of_host, seconds,
 };
 use leaderboard_api::{ByteQuantity, Carla, CarlaPlan, LeaderboardVersion, SimulatorContainer};
 use leaderboard_contract::keys::{agent_folder, host_folder, host_log_name};
@@ -58,7 +58,7 @@ pub(super) const RESERVED: Reserved = Reserved {
     folders: &[AGENT, SAVED],
 };
 
-/// What a workload depends on, of this kind.
+/// Settings of a workload, of this kind.
 struct Known<'a> {
     asked: &'a Asked<'a>,
     spec: &'a Carla,
@@ -82,7 +82,7 @@ fn port(pair: Pair) -> usize {
 pub(super) fn contents(asked: &Asked<'_>) -> Option<Contents> {
     let known = Known::of(asked)?;
     let spec = &known.spec.contents;
-    let host = commands::of_host(spec.command.as_deref(), spec.args.as_deref());
+    let host = of_host(spec.command.as_deref(), spec.args.as_deref());
     Some(Contents {
         image: known.plan.contents_image.to_string(),
         command: host.unwrap_or_else(commands::contents),
@@ -117,7 +117,7 @@ fn simulator(known: &Known<'_>, pair: Pair) -> Role {
     Role {
         image: known.plan.simulator_image.to_string(),
         flags,
-        command: commands::of_host(spec.command.as_deref(), spec.args.as_deref())
+        command: of_host(spec.command.as_deref(), spec.args.as_deref())
             .unwrap_or_else(|| commands::simulator(version, adapter(spec, known.asked.has_gpus))),
         env: [port].into_iter().chain(display::variables(spec, version)).collect(),
         mounts: [own].into_iter().chain(display::sockets(spec)).collect(),
@@ -155,7 +155,7 @@ fn agent(known: &Known<'_>, pair: Pair) -> Role {
         format!("--python-path={}", python_path()),
         format!("--route-runs={}", route_runs(known.plan, pair)),
     ];
-    let host = commands::of_host(spec.command.as_deref(), spec.args.as_deref());
+    let host = of_host(spec.command.as_deref(), spec.args.as_deref());
     let words = host.unwrap_or_else(|| commands::agent(known.plan.version));
     let own = Mount::Own {
         folder: agent_folder(pair),

@@ -9,7 +9,7 @@ use super::tests::seen_on_a_volume::{Volume, text};
 use super::*;
 use crate::Results;
 use crate::carla::gather::Gatherer;
-use crate::fixtures::{checkpoint, put_checkpoint, put_status, run};
+use crate::fixtures::{checkpoint, put_checkpoint, put_status, run, run_of};
 use leaderboard_api::RouteSlice;
 use leaderboard_contract::keys::MERGED;
 use leaderboard_contract::report::Outcome;
@@ -55,8 +55,7 @@ fn a_complete_run_stays_complete_when_all_its_evaluators_are_started_once_more()
 
 #[test]
 fn one_pair_whose_evaluator_died_before_its_global_record_stays_complete() {
-    let mut run = run();
-    run.plan.carla.slices = vec![RouteSlice { first: 0, last: 1 }];
+    let run = run_of(vec![RouteSlice { first: 0, last: 1 }]);
     let mut volume = Volume::new();
     let tree = Arc::new(Tree::open(volume.folder.path()).unwrap());
     volume.gatherer = Gatherer::new(&run, tree).unwrap();
@@ -81,11 +80,10 @@ fn one_pair_whose_evaluator_died_before_its_global_record_stays_complete() {
 
 /// A logcopy that reads the files of one pair, one after the other.
 fn read_in_turn(last_route: u32, files: &[String]) -> Gathered {
-    let mut run = run();
-    run.plan.carla.slices = vec![RouteSlice {
+    let run = run_of(vec![RouteSlice {
         first: 0,
         last: last_route,
-    }];
+    }]);
     let mut volume = Volume::new();
     let tree = Arc::new(Tree::open(volume.folder.path()).unwrap());
     volume.gatherer = Gatherer::new(&run, tree).unwrap();
@@ -193,6 +191,10 @@ fn a_checkpoint_that_its_agent_has_shut_is_the_agents() {
             refused.why.starts_with("pair 1: the checkpoint can't be read: "),
             "{refused}"
         );
-        assert_eq!(seen.spoiled, Some((refused, Duration::ZERO)), "{trouble}");
+        assert_eq!(
+            seen.spoiled,
+            Some((Ending::Invalid(refused), Duration::ZERO)),
+            "{trouble}"
+        );
     }
 }

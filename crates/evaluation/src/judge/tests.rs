@@ -99,8 +99,8 @@ fn nothing_is_waited_for_when_nothing_has_begun() {
 
 #[test]
 fn a_pair_that_ended_badly_ends_the_run() {
-    let refused = RefusedResults::new(Some(2), "pair 2 ended");
-    let end = Step::Finish(Ending::Invalid(refused.clone()));
+    let ending = Ending::Invalid(RefusedResults::new(Some(2), "pair 2 ended"));
+    let end = Step::Finish(ending.clone());
     let table = [
         (secs(4), None, false, Step::GoOn),
         (secs(5), None, false, Step::Cancel),
@@ -109,7 +109,7 @@ fn a_pair_that_ended_badly_ends_the_run() {
     ];
     for (since, cancelled, all_done, expected) in table {
         let seen = Situation {
-            spoiled: Some((refused.clone(), since)),
+            spoiled: Some((ending.clone(), since)),
             cancelled,
             all_done,
             quiet: secs(10),
@@ -123,12 +123,12 @@ pub(super) mod seen_on_a_volume {
     use std::fs;
     use std::sync::Arc;
 
-    use leaderboard_protocol::files::{Mark, Pair, Side};
+    use leaderboard_protocol::files::{Host, Mark, Pair, Side};
 
     use super::super::*;
     use crate::Results;
     use crate::carla::gather::{Gatherer, results_plan};
-    use crate::fixtures::{checkpoint, put_checkpoint, put_status, run};
+    use crate::fixtures::{checkpoint, put_checkpoint, put_status, run, run_of};
     use leaderboard_api::{RouteSlice, WorkerState};
     use leaderboard_contract::keys::{EVALAI, MERGED, checkpoint_path};
     use leaderboard_contract::report::Outcome;
@@ -179,7 +179,7 @@ pub(super) mod seen_on_a_volume {
         assert!(text(&gathered, "evalai/stdout.txt").starts_with("Initializing"));
         assert!(!gathered.objects.contains_key(MERGED));
 
-        put_status(volume.folder.path(), Side::Host, 1, Mark::Start(0));
+        put_status(volume.folder.path(), Side::Host(Host::Simulator), 1, Mark::Start(0));
         put_checkpoint(volume.folder.path(), 1, &checkpoint(0, 1, 2));
         let (gathered, seen) = volume.round();
         assert_eq!(
@@ -333,14 +333,11 @@ pub(super) mod seen_on_a_volume {
     #[test]
     fn the_checkpoints_of_all_pairs_share_one_bound() {
         for pairs in [1_u32, 4, 16] {
-            let mut run = run();
-            run.plan.carla.slices = (0..pairs)
-                .map(|pair| RouteSlice {
-                    first: pair,
-                    last: pair,
-                })
-                .collect();
-            let plan = results_plan(&run).unwrap();
+            let slices = (0..pairs).map(|pair| RouteSlice {
+                first: pair,
+                last: pair,
+            });
+            let plan = results_plan(&run_of(slices.collect())).unwrap();
             let bytes: usize = (0..plan.pairs.len()).map(|pair| plan.limits_of(pair).bytes).sum();
             assert!(bytes <= 48 << 20, "{pairs} pairs may hold {bytes} bytes");
         }
@@ -395,9 +392,9 @@ pub(super) mod seen_on_a_volume {
         assert_eq!((gathered.workers[1].done, seen.spoiled), (1, None));
         put_status(volume.folder.path(), Side::Agent, 2, Mark::Done);
         let (_, seen) = volume.round();
-        assert_eq!(seen.spoiled, Some((refused.clone(), Duration::ZERO)));
+        assert_eq!(seen.spoiled, Some((Ending::Invalid(refused.clone()), Duration::ZERO)));
         let (_, seen) = volume.round();
-        assert_eq!(seen.spoiled, Some((refused, Duration::from_secs(10))));
+        assert_eq!(seen.spoiled, Some((Ending::Invalid(refused), Duration::from_secs(10))));
         put_checkpoint(volume.folder.path(), 2, &checkpoint(2, 2, 2));
         let (gathered, seen) = volume.round();
         assert_eq!((gathered.first_refused(), seen.spoiled), (None, None));
@@ -412,7 +409,9 @@ pub(super) mod seen_on_a_volume {
         }
         let (gathered, seen) = volume.round();
         assert!(!gathered.is_complete() && seen.all_done && seen.complete.is_none());
-        let (refused, _) = seen.spoiled.unwrap();
+        let Some((Ending::Invalid(refused), _)) = seen.spoiled else {
+            panic!("{:?}", seen.spoiled)
+        };
         let why = &refused.why;
         assert_eq!(refused.worker, Some(1));
         assert!(why.starts_with("pair 1 ended with 1 of its 2 route runs."), "{why}");
@@ -433,9 +432,9 @@ pub(super) mod seen_on_a_volume {
         let mut volume = Volume::new();
         let folder = volume.folder.path().to_owned();
         for (side, mark) in [
-            (Side::Host, Mark::Start(0)),
-            (Side::Host, Mark::Crash(0)),
-            (Side::Host, Mark::Crash(1)),
+            (Side::Host(Host::Simulator), Mark::Start(0)),
+            (Side::Host(Host::Simulator), Mark::Crash(0)),
+            (Side::Host(Host::Simulator), Mark::Crash(1)),
             (Side::Agent, Mark::Crash(0)),
         ] {
             put_status(&folder, side, 1, mark);
@@ -448,9 +447,8 @@ pub(super) mod seen_on_a_volume {
     fn a_plan_that_does_not_hold_is_refused() {
         let slice = |first, last| RouteSlice { first, last };
         for slices in [vec![], vec![slice(0, 2), slice(2, 3)], vec![slice(3, 0)]] {
-            let mut run = run();
-            run.plan.carla.slices = slices;
-            assert!(results_plan(&run).is_err(), "{:?}", run.plan.carla.slices);
+            let run = run_of(slices);
+            assert!(results_plan(&run).is_err(), "{:?}", run.plan);
         }
     }
 }
