@@ -85,6 +85,10 @@ pub struct Words {
     pub worker: &'static str,
     /// What a participant can try an agent on, in the plural.
     pub practice: &'static str,
+    /// Next step after results that are refused, a sentence.
+    pub after_refused: &'static str,
+    /// Next step after complete results that do not count, a sentence.
+    pub after_rejected: &'static str,
 }
 
 /// The words where no kind is known yet.
@@ -94,6 +98,8 @@ const PLAIN: Words = Words {
     host: "host's container",
     worker: "worker",
     practice: "data",
+    after_refused: "Correct this, and submit again.",
+    after_rejected: "Compare the agent with the rules of the challenge, and submit again.",
 };
 
 /// One number of a result, under both of its names.

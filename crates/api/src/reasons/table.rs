@@ -171,7 +171,7 @@ reasons! {
             "The Pod was evicted for a full disk. A participant failure if the kubelet names what agents alone write, or `logcopy` \
              measured that they fill the logs; else an infrastructure failure.",
             "Write less to disk or to the log.",
-            after_failure: "Look at what fills the disk, such as the simulator's Saved and core dumps, or raise the limit; then resume the \
+            after_failure: "Look at what fills the disk, such as saved files and core dumps, or raise the limit; then resume the \
              submission.",
             log: "the log of the agent of the first pair that was not done, else of the first pair";
     }

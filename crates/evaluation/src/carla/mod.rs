@@ -25,6 +25,8 @@ const WORDS: Words = Words {
     host: HOST.name(),
     worker: "pair",
     practice: measures::UNIT,
+    after_refused: "Check what the agent writes into its checkpoint, and submit again.",
+    after_rejected: "Compare the agent's sensors with those the track allows, and submit again.",
 };
 const HOST: Host = Host::Simulator;
 

@@ -7,7 +7,7 @@ mod workload;
 
 use std::sync::Arc;
 
-use leaderboard_api::{Order, Ranking, Track};
+use leaderboard_api::{Order, Ranking, ScoreMetric, Track};
 use leaderboard_contract::run::Run;
 use leaderboard_evidence::Tree;
 use leaderboard_protocol::files::{Host, Pair};
@@ -24,6 +24,8 @@ const WORDS: Words = Words {
     host: HOST.name(),
     worker: "worker",
     practice: "data",
+    after_refused: "Check what the agent sends to the evaluator, and submit again.",
+    after_rejected: "Compare the agent with the rules of the challenge, and submit again.",
 };
 
 /// An evaluation by a container of the host's.
@@ -52,7 +54,7 @@ impl Evaluation for Container {
     fn ranking(&self, track: &Track) -> Ranking {
         let score = track.container.as_ref().map(|own| &own.score);
         Ranking {
-            metric: score.map(|score| score.name()).unwrap_or_default(),
+            metric: score.map(ScoreMetric::name).unwrap_or_default(),
             order: score.map_or(Order::default(), |score| score.order),
         }
     }
