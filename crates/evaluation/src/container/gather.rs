@@ -184,12 +184,7 @@ fn if_ended((id, worker): (u32, &Worker)) -> Option<Ending> {
     if worker.good.as_ref().is_some_and(|good| good.is_final) {
         return None;
     }
-    let why = || {
-        format!(
-            "evaluator {id} ended without a final result. Have it write {} last, and once.",
-            RESULT_FILE
-        )
-    };
+    let why = || format!("evaluator {id} ended without a final result. Have it write {RESULT_FILE} last, and once.");
     let unfinished = || Ending::Unusable(RefusedResults::new(Some(id), why()));
     Some(worker.refused.clone().unwrap_or_else(unfinished))
 }
@@ -256,7 +251,7 @@ impl Worker {
             )));
             return;
         }
-        let reason = format!("evaluator {pair}: {} can't be read on this node: {error}", RESULT_FILE);
+        let reason = format!("evaluator {pair}: {RESULT_FILE} can't be read on this node: {error}");
         if self.unreadable.as_ref() != Some(&reason) {
             tracing::warn!("{reason}. It is tried again in each round.");
         }
@@ -272,7 +267,7 @@ impl Worker {
 }
 
 fn unusable(pair: Pair, problem: &dyn std::fmt::Display) -> RefusedResults {
-    let why = format!("evaluator {pair}: {} can't be used: {problem}", RESULT_FILE);
+    let why = format!("evaluator {pair}: {RESULT_FILE} can't be used: {problem}");
     RefusedResults::new(Some(pair.get().into()), why)
 }
 

@@ -263,14 +263,14 @@ mod tests {
     use super::*;
     use crate::container::parse;
 
-    fn result(done: u32, is_final: bool, splits: Value) -> ResultFile {
+    fn result(done: u32, is_final: bool, splits: &Value) -> ResultFile {
         let total = if is_final { done } else { 100 };
         let document = json!({"schema": 1, "done": done, "total": total, "final": is_final, "splits": splits});
         parse(document.to_string().as_bytes()).unwrap()
     }
 
-    fn one(done: u32, is_final: bool, metrics: Value) -> ResultFile {
-        result(done, is_final, json!([{"name": "test", "metrics": metrics}]))
+    fn one(done: u32, is_final: bool, metrics: &Value) -> ResultFile {
+        result(done, is_final, &json!([{"name": "test", "metrics": metrics}]))
     }
 
     fn merged(method: MergeMethod, workers: &[ResultFile]) -> Result<Merged, MergeError> {
@@ -314,22 +314,22 @@ mod tests {
             (Sum, [(30, 1.5), (10, 2.0)], "3.5"),
             (Sum, [(0, 1.0), (0, 2.0)], "3.0"),
         ] {
-            let workers = values.map(|(done, value)| one(done, false, json!({"x": value})));
+            let workers = values.map(|(done, value)| one(done, false, &json!({"x": value})));
             assert_eq!(
                 numbers(&merged(method, &workers).unwrap()),
                 [("x", expected)],
                 "{method:?} {values:?}"
             );
         }
-        let counts = [one(1, true, json!({"n": 3})), one(1, true, json!({"n": 4}))];
+        let counts = [one(1, true, &json!({"n": 3})), one(1, true, &json!({"n": 4}))];
         assert_eq!(
             numbers(&merged(Sum, &counts).unwrap()),
             [("n", "7")],
             "whole numbers stay whole"
         );
         let most = [
-            one(1, true, json!({"n": i64::MAX})),
-            one(1, true, json!({"n": i64::MAX})),
+            one(1, true, &json!({"n": i64::MAX})),
+            one(1, true, &json!({"n": i64::MAX})),
         ];
         assert_eq!(numbers(&merged(Sum, &most).unwrap()), [("n", "1.8446744073709552e+19")]);
     }
@@ -337,7 +337,7 @@ mod tests {
     #[test]
     fn a_metric_that_a_final_result_lacks_cannot_be_merged_as_a_mean() {
         let (whole, lacking) = (json!({"x": 1, "y": 2}), json!({"x": 3}));
-        let of = |is_final| [one(1, is_final, lacking.clone()), one(1, is_final, whole.clone())];
+        let of = |is_final| [one(1, is_final, &lacking), one(1, is_final, &whole)];
         let error = merged(MergeMethod::Mean, &of(true)).unwrap_err();
         assert!(
             error
@@ -350,8 +350,8 @@ mod tests {
             numbers(&merged(MergeMethod::Sum, &of(true)).unwrap()),
             [("x", "4"), ("y", "2")]
         );
-        let other = result(1, true, json!([{"name": "other", "metrics": {"x": 1}}]));
-        let error = merged(MergeMethod::Mean, &[one(1, true, json!({"x": 1})), other]).unwrap_err();
+        let other = result(1, true, &json!([{"name": "other", "metrics": {"x": 1}}]));
+        let error = merged(MergeMethod::Mean, &[one(1, true, &json!({"x": 1})), other]).unwrap_err();
         assert!(
             error
                 .to_string()
@@ -362,7 +362,7 @@ mod tests {
 
     #[test]
     fn numbers_and_names_stay_within_bounds() {
-        let large = [one(2, true, json!({"x": 1e308})), one(2, true, json!({"x": 1e308}))];
+        let large = [one(2, true, &json!({"x": 1e308})), one(2, true, &json!({"x": 1e308}))];
         for method in [MergeMethod::Mean, MergeMethod::Sum] {
             let error = merged(method, &large).unwrap_err();
             assert!(matches!(error, MergeError::TooLarge { .. }), "{method:?}: {error}");
@@ -372,7 +372,7 @@ mod tests {
                 .map(|n| json!({"name": n.to_string(), "metrics": {}}))
                 .collect()
         };
-        let many = [result(1, true, splits(0)), result(1, true, splits(9))];
+        let many = [result(1, true, &splits(0)), result(1, true, &splits(9))];
         assert_eq!(merged(MergeMethod::Sum, &many), Err(MergeError::TooMany));
         let metrics = |from: usize| -> Value {
             (from..from + 20)
@@ -380,7 +380,7 @@ mod tests {
                 .collect::<serde_json::Map<_, _>>()
                 .into()
         };
-        let many = [one(1, true, metrics(0)), one(1, true, metrics(20))];
+        let many = [one(1, true, &metrics(0)), one(1, true, &metrics(20))];
         assert_eq!(merged(MergeMethod::Sum, &many), Err(MergeError::TooMany));
     }
 
@@ -390,7 +390,10 @@ mod tests {
         for (i, a) in values.iter().enumerate() {
             for (j, b) in values.iter().enumerate() {
                 let (done_a, done_b) = (u32::try_from(i).unwrap() * 7, u32::try_from(j).unwrap() * 3);
-                let workers = [one(done_a, false, json!({"x": a})), one(done_b, false, json!({"x": b}))];
+                let workers = [
+                    one(done_a, false, &json!({"x": a})),
+                    one(done_b, false, &json!({"x": b})),
+                ];
                 let found = merged(MergeMethod::Mean, &workers).unwrap();
                 let mean = found.splits[0].metric("x").unwrap().value();
                 let slack = 1e-12 * a.abs().max(b.abs());
@@ -405,8 +408,8 @@ mod tests {
 
     #[test]
     fn it_is_final_when_each_worker_is_and_eligible_only_if_all_are() {
-        let done = one(1, true, json!({"x": 1}));
-        let under_way = one(1, false, json!({"x": 1}));
+        let done = one(1, true, &json!({"x": 1}));
+        let under_way = one(1, false, &json!({"x": 1}));
         let rejected = ResultFile {
             eligible: false,
             ..done.clone()
@@ -432,7 +435,7 @@ mod tests {
     fn a_status_shows_the_score_and_no_name_twice() {
         let names =
             |summary: &Summary| -> Vec<String> { summary.metrics.iter().map(|metric| metric.name.clone()).collect() };
-        let found = one(1, true, json!({"x": 0.5, "y": 2}));
+        let found = one(1, true, &json!({"x": 0.5, "y": 2}));
         let summary = merged(MergeMethod::Mean, &[found]).unwrap().summary(&score(None, "y"));
         assert_eq!(
             summary.score,
@@ -444,7 +447,7 @@ mod tests {
         assert_eq!(names(&summary), ["x"]);
 
         let splits = json!([{"name": "a", "metrics": {"x": 1, "b_x": 2}}, {"name": "a_b", "metrics": {"x": 3}}, {"name": "s".repeat(64), "metrics": {"x": 4}}]);
-        let found = merged(MergeMethod::Mean, &[result(1, true, splits)]).unwrap();
+        let found = merged(MergeMethod::Mean, &[result(1, true, &splits)]).unwrap();
         let summary = found.summary(&score(Some("a_b"), "x"));
         assert_eq!(summary.score.clone().map(|score| score.value).as_deref(), Some("3"));
         assert_eq!(
@@ -457,7 +460,7 @@ mod tests {
 
     #[test]
     fn a_participant_reads_numbers_and_messages() {
-        let workers = [one(2, true, json!({"x": 0.5})), one(3, false, json!({"x": 0.5}))];
+        let workers = [one(2, true, &json!({"x": 0.5})), one(3, false, &json!({"x": 0.5}))];
         let text = merged(MergeMethod::Mean, &workers)
             .unwrap()
             .stdout(&[(2, "Episode 4 of 100 has begun.")]);

@@ -105,15 +105,15 @@ pub fn parse(bytes: &[u8]) -> Result<ResultFile, ResultError> {
         return Err(ResultError::TooLarge(bytes.len()));
     }
     // Another version may have other fields.
-    let Numbered { schema } = serde_json::from_slice(bytes).map_err(malformed)?;
+    let Numbered { schema } = serde_json::from_slice(bytes).map_err(|error| malformed(&error))?;
     if schema != SCHEMA {
         return Err(ResultError::Schema(schema));
     }
-    let document: Document<'_> = serde_json::from_slice(bytes).map_err(malformed)?;
+    let document: Document<'_> = serde_json::from_slice(bytes).map_err(|error| malformed(&error))?;
     document.checked()
 }
 
-fn malformed(error: serde_json::Error) -> ResultError {
+fn malformed(error: &serde_json::Error) -> ResultError {
     ResultError::Malformed(one_line(&error.to_string(), MAX_TEXT))
 }
 

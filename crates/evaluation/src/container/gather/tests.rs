@@ -1,4 +1,6 @@
 use std::fs;
+use std::io;
+use std::os::unix::fs::symlink;
 use std::path::Path;
 use std::time::Duration;
 
@@ -278,29 +280,26 @@ fn results_that_do_not_fit_together_end_the_run_when_all_are_done() {
     assert_eq!((unusable.worker, gathered.first_refused()), (Some(1), None));
 }
 
+/// A name, and how it is made.
+type Place<'a> = (&'a str, &'a dyn Fn(&Path) -> io::Result<()>);
+
 /// Each in place of the result: none is followed, opened for ever, or read whole.
 #[test]
 fn only_a_regular_file_of_few_bytes_is_read() {
     let outside = tempfile::NamedTempFile::new().unwrap();
     fs::write(outside.path(), result(10, 10, 1.0)).unwrap();
-    let place: [(&str, &dyn Fn(&Path)); 5] = [
-        ("link", &|path| {
-            std::os::unix::fs::symlink(outside.path(), path).unwrap()
-        }),
-        ("dangling link", &|path| {
-            std::os::unix::fs::symlink("nowhere", path).unwrap()
-        }),
-        ("pipe", &|path| nix::unistd::mkfifo(path, Mode::S_IRWXU).unwrap()),
-        ("folder", &|path| fs::create_dir(path).unwrap()),
-        ("10 GB with holes", &|path| {
-            fs::File::create(path).unwrap().set_len(10 << 30).unwrap()
-        }),
+    let place: [Place<'_>; 5] = [
+        ("link", &|path| symlink(outside.path(), path)),
+        ("dangling link", &|path| symlink("nowhere", path)),
+        ("pipe", &|path| Ok(nix::unistd::mkfifo(path, Mode::S_IRWXU)?)),
+        ("folder", &|path| fs::create_dir(path)),
+        ("10 GB with holes", &|path| fs::File::create(path)?.set_len(10 << 30)),
     ];
     for (name, make) in place {
         let mut volume = Volume::new();
         let path = volume.result_path(1);
         fs::create_dir_all(path.parent().unwrap()).unwrap();
-        make(&path);
+        make(&path).unwrap();
         volume.done(&[1]);
         let (gathered, seen) = volume.round();
         assert_eq!(unusable_of(&gathered).len(), 1, "{name}");
@@ -314,7 +313,7 @@ fn only_a_regular_file_of_few_bytes_is_read() {
     // A whole folder of the volume as a link.
     let mut volume = Volume::new();
     fs::create_dir(volume.path().join("evaluators")).unwrap();
-    std::os::unix::fs::symlink("/etc", volume.path().join("evaluators/1")).unwrap();
+    symlink("/etc", volume.path().join("evaluators/1")).unwrap();
     assert!(volume.round().0.merged.is_none());
 }
 

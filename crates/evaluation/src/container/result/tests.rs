@@ -191,7 +191,7 @@ fn texts_that_are_no_json_of_serde_are_refused_too() {
     }
     let error = parse(b"{\"schema\":1,\"\xff\":1}").unwrap_err();
     assert!(matches!(error, ResultError::Malformed(_)), "{error}");
-    assert!(parse(&[b' '; MAX_BYTES]).is_err());
+    assert!(parse(&vec![b' '; MAX_BYTES]).is_err());
 }
 
 /// Beyond any stack if each level took some of it.
