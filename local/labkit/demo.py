@@ -118,7 +118,7 @@ def make_images(settings: Settings, names: Collection[str] = ()) -> dict[str, st
     search = image.Search({}, image.target_folder(settings.repository, os.environ), build.PROFILE)
     specs = [
         spec
-        for file in ("operator-image.toml", "challenge/images.toml")
+        for file in ("operator-image.toml", "challenge/images.toml", "games/images.toml")
         for spec in image.specs(settings.local / file)
         if not names or spec.name in names
     ]

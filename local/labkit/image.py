@@ -106,7 +106,7 @@ def push(settings: Settings, crane: Path, spec: ImageSpec, image: layer.Image) -
         raise LabError(
             f"the registry changed {reference} on its way: run `local/lab down`, `local/lab up` and push again"
         )
-    say(f"pushed {spec.name} ({len(image.blobs[image.layer]) / 1e6:.1f} MB)")
+    say(f"pushed {spec.name} ({sum(len(image.blobs[one]) for one in image.layers) / 1e6:.1f} MB)")
     return pinned
 
 
@@ -124,9 +124,17 @@ def stored_digest(settings: Settings, spec: ImageSpec) -> str | None:
 def build(settings: Settings, spec: ImageSpec, search: Search) -> layer.Image:
     entries = [layer.Entry(item.path, item.mode, uid=item.uid, gid=item.gid) for item in spec.dirs]
     for item in spec.files:
-        entries += file_entries(settings, item, search, spec.name)
+        if item.kind != "python":
+            entries += file_entries(settings, item, search, spec.name)
     entries += [layer.Entry(item.to, 0o777, target=item.target) for item in spec.symlinks]
-    return layer.build(entries, run_config(spec), architecture())
+    below = [python(settings, item) for item in spec.files if item.kind == "python"]
+    return layer.build(entries, run_config(spec), architecture(), *below)
+
+
+def python(settings: Settings, item: FileSpec) -> layer.Packed:
+    """The layer of an entry that speaks of Python. Equal ones are one layer, which node and registry have once."""
+    site = Path(sysconfig.get_path("purelib", vars={"base": str(pythonenv.ensure(settings).parent)}))
+    return pythonimage.packed(site, tuple(name for name in item.value.split(",") if name), item.to)
 
 
 def architecture() -> str:
@@ -152,10 +160,6 @@ def file_entries(settings: Settings, item: FileSpec, search: Search, image: str)
         yield layer.Entry(
             item.to, 0o644 if item.mode is None else item.mode, item.value.encode(), uid=item.uid, gid=item.gid
         )
-        return
-    if item.kind == "python":
-        site = Path(sysconfig.get_path("purelib", vars={"base": str(pythonenv.ensure(settings).parent)}))
-        yield from pythonimage.entries(site, item.value.split(","), item.to)
         return
     source = locate(settings, item, search, image)
     if source.is_dir():

@@ -33,17 +33,30 @@ class Entry:
 
 
 @dataclass(frozen=True)
+class Packed:
+    """A layer as it is stored, and the digest (hex) of the tar in it."""
+
+    blob: bytes
+    content: str
+
+
+@dataclass(frozen=True)
 class Image:
     """A built image: its blobs by digest (hex), its manifest's digest, and what the archive formats need to know."""
 
     blobs: dict[str, bytes]
     manifest: str
     config: str
-    layer: str
+    layers: tuple[str, ...]
 
     @property
     def digest(self) -> str:
         return f"sha256:{self.manifest}"
+
+    @property
+    def layer(self) -> str:
+        """The uppermost layer, which is the image's own."""
+        return self.layers[-1]
 
 
 def sha256(content: bytes) -> str:
@@ -84,19 +97,23 @@ def as_json(value: object) -> bytes:
     return json.dumps(value, sort_keys=True, separators=(",", ":")).encode()
 
 
-def build(entries: Iterable[Entry], config: dict[str, object], architecture: str) -> Image:
-    """An image of one layer. `config` holds Env, Entrypoint, Cmd, User, WorkingDir as the OCI image format names them."""
+def pack(entries: Iterable[Entry]) -> Packed:
     content = tar(entries)
     # Fast: these images travel inside one machine only.
-    layer = gzip.compress(content, compresslevel=1, mtime=0)
+    return Packed(gzip.compress(content, compresslevel=1, mtime=0), sha256(content))
+
+
+def build(entries: Iterable[Entry], config: dict[str, object], architecture: str, *below: Packed) -> Image:
+    """An image of one layer, over those `below`. `config` holds Env, Entrypoint, Cmd, User, WorkingDir as the OCI format names them."""
+    layers = [*below, pack(entries)]
     image_config = as_json(
         {
             "architecture": architecture,
             "os": "linux",
             "created": LONG_AGO,
             "config": config,
-            "rootfs": {"type": "layers", "diff_ids": [f"sha256:{sha256(content)}"]},
-            "history": [{"created": LONG_AGO, "created_by": "local/lab image"}],
+            "rootfs": {"type": "layers", "diff_ids": [f"sha256:{one.content}" for one in layers]},
+            "history": [{"created": LONG_AGO, "created_by": "local/lab image"} for _ in layers],
         }
     )
     manifest = as_json(
@@ -104,11 +121,12 @@ def build(entries: Iterable[Entry], config: dict[str, object], architecture: str
             "schemaVersion": 2,
             "mediaType": MANIFEST_TYPE,
             "config": descriptor(CONFIG_TYPE, image_config),
-            "layers": [descriptor(LAYER_TYPE, layer)],
+            "layers": [descriptor(LAYER_TYPE, one.blob) for one in layers],
         }
     )
-    blobs = {sha256(blob): blob for blob in (layer, image_config, manifest)}
-    return Image(blobs, sha256(manifest), sha256(image_config), sha256(layer))
+    stored = [one.blob for one in layers]
+    blobs = {sha256(blob): blob for blob in (*stored, image_config, manifest)}
+    return Image(blobs, sha256(manifest), sha256(image_config), tuple(sha256(blob) for blob in stored))
 
 
 def descriptor(media_type: str, content: bytes) -> dict[str, object]:
@@ -130,7 +148,8 @@ def layout(image: Image, name: str) -> dict[str, bytes]:
             }
         ],
     }
-    legacy = [{"Config": f"blobs/sha256/{image.config}", "RepoTags": [name], "Layers": [f"blobs/sha256/{image.layer}"]}]
+    layers = [f"blobs/sha256/{digest}" for digest in image.layers]
+    legacy = [{"Config": f"blobs/sha256/{image.config}", "RepoTags": [name], "Layers": layers}]
     files = {f"blobs/sha256/{digest}": blob for digest, blob in image.blobs.items()}
     return files | {
         "oci-layout": as_json({"imageLayoutVersion": "1.0.0"}),

@@ -8,13 +8,14 @@ import re
 import subprocess
 import sys
 import sysconfig
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
+from functools import cache
 from importlib.metadata import Distribution, distributions
 from pathlib import Path
 
 from .elf import parse_ldd
 from .errors import LabError
-from .layer import Entry
+from .layer import Entry, Packed, pack
 
 PROGRAM = "/usr/local/bin/python3"
 # Parts of the library that no server needs, most of its bytes.
@@ -33,7 +34,13 @@ IDLE = {
 NAME = re.compile(r"[A-Za-z0-9._-]+")
 
 
-def entries(site: Path, packages: list[str], to: str) -> Iterator[Entry]:
+@cache
+def packed(site: Path, packages: tuple[str, ...], to: str) -> Packed:
+    """What `entries` gives, as a layer that is made once for all images of a run."""
+    return pack(entries(site, packages, to))
+
+
+def entries(site: Path, packages: Sequence[str], to: str) -> Iterator[Entry]:
     """The interpreter, and in `to` the packages with all that they require; `site` is where they are installed."""
     interpreter = Path(sys.executable).resolve()
     yield Entry(str(interpreter), 0o755, interpreter.read_bytes())
@@ -49,7 +56,7 @@ def entries(site: Path, packages: list[str], to: str) -> Iterator[Entry]:
                 yield from with_libraries(place, f"{to}/{place.relative_to(site)}")
 
 
-def closure(site: Path, names: list[str]) -> list[Distribution]:
+def closure(site: Path, names: Sequence[str]) -> list[Distribution]:
     """The named packages and all that they require, but for their extras."""
     installed = {normal(one.metadata["Name"]): one for one in distributions(path=[str(site)])}
     found: dict[str, Distribution] = {}

@@ -72,6 +72,20 @@ class Content(unittest.TestCase):
         for digest, blob in image.blobs.items():
             self.assertEqual(layer.sha256(blob), digest)
 
+    def test_images_over_one_layer_share_its_blob(self) -> None:
+        below = layer.pack(ENTRIES)
+        one, other = (layer.build([Entry("/a", 0o644, text)], {}, "amd64", below) for text in (b"1", b"2"))
+        self.assertEqual(one.layers[0], other.layers[0])
+        self.assertEqual(one.blobs[one.layers[0]], below.blob)
+        config = json.loads(one.blobs[one.config])
+        plain = [layer.sha256(gzip.decompress(one.blobs[digest])) for digest in one.layers]
+        self.assertEqual(config["rootfs"]["diff_ids"], [f"sha256:{digest}" for digest in plain])
+        manifest = json.loads(one.blobs[one.manifest])
+        self.assertEqual([each["digest"] for each in manifest["layers"]], [f"sha256:{digest}" for digest in one.layers])
+        self.assertEqual(len(config["history"]), len(one.layers))
+        files = layer.layout(one, "a:1")
+        self.assertEqual(len(json.loads(files["manifest.json"])[0]["Layers"]), 2)
+
 
 if __name__ == "__main__":
     unittest.main()
