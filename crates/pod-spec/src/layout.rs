@@ -2,16 +2,16 @@
 
 use leaderboard_contract::run::{IDENTITY, LOGS, NAME_FILES, PODINFO, TOOLS};
 use leaderboard_evaluation::workload::Reserved;
+use leaderboard_protocol::files::Member;
 
-/// The volumes of ours beside the contents. Nothing but our own mounts of them keeps a stranger from what is in them.
-pub(super) const OWN_VOLUMES: [&str; 4] = [LOGS_VOLUME, TOOLS_VOLUME, PODINFO_VOLUME, IDENTITY_VOLUME];
+const OWN_VOLUMES: [&str; 4] = [LOGS_VOLUME, TOOLS_VOLUME, PODINFO_VOLUME, IDENTITY_VOLUME];
 
 pub const LOGS_VOLUME: &str = "logs";
 pub(super) const TOOLS_VOLUME: &str = "tools";
 pub(super) const PODINFO_VOLUME: &str = "podinfo";
 pub(super) const IDENTITY_VOLUME: &str = "identity";
-/// Shared memory of an agent; the number of its worker follows.
-pub const SHM_VOLUME: &str = "shm-agent-";
+/// Shared memory of one container of a worker, whose name follows.
+pub const SHM_VOLUME: &str = "shm-";
 /// Where programs look for it.
 pub(super) const SHM: &str = "/dev/shm";
 
@@ -22,6 +22,12 @@ pub(super) const STATUS: &str = "/tmp/status";
 
 /// Annotation that keeps EKS from putting the ServiceAccount's role into the containers it names.
 pub(super) const ANNOTATION_SKIP_CONTAINERS: &str = "eks.amazonaws.com/skip-containers";
+
+/// True for a volume of ours beside the contents. Nothing but our own mounts of it keeps a stranger from what is in it.
+pub(super) fn is_own_volume(name: &str) -> bool {
+    let member = name.strip_prefix(SHM_VOLUME).and_then(Member::parse);
+    OWN_VOLUMES.contains(&name) || member.is_some()
+}
 
 /// Paths at and below which an overlay may mount nothing.
 pub(super) fn protected_mounts(reserved: &Reserved) -> impl Iterator<Item = &'static str> {

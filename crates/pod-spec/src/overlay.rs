@@ -5,24 +5,26 @@
 //! `mountPath`; variables are replaced whole, tolerations added, all other lists replaced; `null` removes;
 //! the names of the two roles stand for the containers of every worker, `agent-2` for one, whichever comes first in the list.
 
+#[cfg(test)]
+mod kind_tests;
 mod rules;
 #[cfg(test)]
 mod tests;
 
 use leaderboard_api::LeaderboardSpec;
-use leaderboard_evaluation::workload::Reserved;
-use leaderboard_protocol::files::Side;
+use leaderboard_evaluation::Evaluation;
+use leaderboard_protocol::files::{Host, Side};
 use serde_json::{Map, Value};
 
 pub use rules::{OverlayError, validate, validate_overlay};
 
-/// Names that stand for the containers of all workers.
-const ALIASES: [&str; 2] = [Side::Host.name(), Side::Agent.name()];
+/// Names that stand for the containers of all workers, of any kind of evaluation.
+const ALIASES: [&str; 3] = [Host::Simulator.name(), Host::Evaluator.name(), Side::Agent.name()];
 
 /// Lays a Leaderboard's overlay over a template. One that the rules refuse is not applied at all, so that nothing gets around them.
-pub(super) fn lay(template: &mut Value, spec: &LeaderboardSpec, reserved: &Reserved) {
+pub(super) fn lay(template: &mut Value, spec: &LeaderboardSpec, kind: &dyn Evaluation) {
     let overlay = spec.pod_overrides.as_ref();
-    if let Some(overlay) = overlay.filter(|pod| validate_overlay(pod, reserved).is_ok()) {
+    if let Some(overlay) = overlay.filter(|pod| validate_overlay(pod, kind).is_ok()) {
         apply(template, overlay);
     }
 }

@@ -40,7 +40,7 @@ pub(super) fn kubernetes_expand(word: &str, lookup: &dyn Fn(&str) -> Option<Stri
 }
 
 /// A container as the kubelet starts it: its words and its variables, `image` being those of its image.
-fn started(container: &Value, image: &[(&str, &str)]) -> (Vec<String>, BTreeMap<String, String>) {
+pub(super) fn started(container: &Value, image: &[(&str, &str)]) -> (Vec<String>, BTreeMap<String, String>) {
     let mut env: BTreeMap<String, String> = image
         .iter()
         .map(|(name, value)| ((*name).into(), (*value).into()))
@@ -60,13 +60,16 @@ fn started(container: &Value, image: &[(&str, &str)]) -> (Vec<String>, BTreeMap<
 }
 
 /// What the runner parses from its words, and the command behind it as it starts that.
-fn behind_runner(words: &[String], env: &mut BTreeMap<String, String>) -> (args::Job, Vec<String>) {
+pub(super) fn behind_runner(words: &[String], env: &mut BTreeMap<String, String>) -> (args::Job, Vec<String>) {
     assert_eq!(words[0], "/leaderboard-tools/leaderboard-runner");
     let args::Request::Run(job) = args::parse(words[1..].iter().map(OsString::from)).unwrap() else {
         panic!("{words:?} asks for nothing to run");
     };
     if let args::Role::Agent {
-        python_path: Some(front),
+        program: args::Program::Driver {
+            python_path: Some(front),
+            ..
+        },
         ..
     } = &job.role
     {
@@ -321,11 +324,13 @@ fn the_runner_gets_the_deadlines() {
     assert_eq!(simulator.status, Path::new("/tmp/status"));
     assert_eq!(
         simulator.role,
-        args::Role::Simulator {
-            port: 2200,
+        args::Role::Host {
+            server: args::Server::Simulator {
+                port: 2200,
+                answer: Duration::from_secs(10),
+            },
             flush: seconds(50),
             cancel: seconds(40),
-            answer: Duration::from_secs(10),
             log: Some("/home/carla/CarlaUE4/Saved/console-3.log".into()),
             gpu: Some(leaderboard_protocol::graphics::Needs::Vulkan),
             agent_gpu: false,
@@ -349,12 +354,14 @@ fn the_runner_gets_the_deadlines() {
     let (agent, _) = behind_runner(&words, &mut env);
     assert_eq!(agent.member().to_string(), "agent-3");
     let role = args::Role::Agent {
+        program: args::Program::Driver {
+            checkpoint: "/tmp/agent/agent_results.json".into(),
+            python_path: Some(FRONT.into()),
+            route_runs: Some(5),
+        },
         work: "/tmp/agent".into(),
-        checkpoint: "/tmp/agent/agent_results.json".into(),
         idle: seconds(30),
-        python_path: Some(FRONT.into()),
         report_gpu: false,
-        route_runs: Some(5),
     };
     assert_eq!((agent.role, agent.log_limit), (role, 2_097_152));
 }

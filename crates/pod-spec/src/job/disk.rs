@@ -15,14 +15,12 @@ const AGENT: [&str; 2] = ["2Gi", "20Gi"];
 const HOST: [&str; 2] = ["2Gi", "10Gi"];
 /// What the volumes usually hold.
 const VOLUMES_REQUEST: &str = "1Gi";
-/// What the volumes of the private contents may hold, which have no limit of their own.
-const CONTENTS_BYTES: u64 = 10 << 30;
 
-/// Fills in what is missing. `logs` is the limit of that volume in bytes.
+/// Fills in what is missing. `volumes` is the limit of all volumes in bytes.
 ///
 /// What a host names stays as it is, with nothing of ours added. A request alone is the choice to have no limit; then the other side
 /// gets none of ours either, since the sum would be the limit of both.
-pub(super) fn fill(pod: &mut Value, logs: u64) {
+pub(super) fn fill(pod: &mut Value, volumes: u64) {
     let mut nothing = Vec::new();
     let workers = pod["containers"].as_array_mut().unwrap_or(&mut nothing);
     let is_unlimited = |container: &Value| names_disk(container, "requests") && !names_disk(container, "limits");
@@ -41,7 +39,7 @@ pub(super) fn fill(pod: &mut Value, logs: u64) {
         set(logcopy, "requests", VOLUMES_REQUEST);
         // Alone it would be the limit of the whole Pod.
         if limited {
-            set(logcopy, "limits", &logs.saturating_add(CONTENTS_BYTES).to_string());
+            set(logcopy, "limits", &volumes.to_string());
         }
     }
 }

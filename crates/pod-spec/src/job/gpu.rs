@@ -35,7 +35,7 @@ pub(super) fn variables(source: GpuSource<'_>, member: Member) -> Vec<EnvVar> {
         GpuSource::Claim(_) => Some(NO_DEVICE),
     };
     let devices = devices.map(|devices| variable(DEVICES, devices));
-    let index = (member.side == Side::Host).then(|| variable(INDEX, &index));
+    let index = matches!(member.side, Side::Host(_)).then(|| variable(INDEX, &index));
     devices
         .into_iter()
         .chain([variable(CAPABILITIES, "all")])
@@ -56,7 +56,7 @@ pub(super) fn resources(
     };
     match (source, member.side) {
         (GpuSource::None, _) | (GpuSource::NodeIndex(_), Side::Agent) => hosts,
-        (GpuSource::PerContainer(resource), _) | (GpuSource::NodeIndex(resource), Side::Host) => {
+        (GpuSource::PerContainer(resource), _) | (GpuSource::NodeIndex(resource), Side::Host(_)) => {
             is_requested(hosts.unwrap_or_default(), resource)
         }
         (GpuSource::Claim(_), _) => {
@@ -94,7 +94,7 @@ fn claim_name(worker: Pair) -> String {
 pub(super) fn flags(source: GpuSource<'_>, side: Side, draws: Option<Needs>) -> impl Iterator<Item = String> {
     let own = draws.filter(|_| source != GpuSource::None);
     let of_agent = is_by_index(source).then(|| match side {
-        Side::Host => "--agent-gpu=true".to_owned(),
+        Side::Host(_) => "--agent-gpu=true".to_owned(),
         Side::Agent => "--report-gpu=true".to_owned(),
     });
     own.map(|needs| format!("--gpu={needs}")).into_iter().chain(of_agent)
@@ -143,6 +143,7 @@ pub(super) fn is_gpu(resource: &str, source: GpuSource<'_>) -> bool {
 /// is its own alone: without `gpu` the other one would have none, and with a claim the worker would take two.
 pub fn unclear(spec: &LeaderboardSpec, template: &Value) -> Option<String> {
     let source = source(spec);
+    let worker = leaderboard_evaluation::of(spec).words().worker;
     let containers = template["spec"]["containers"].as_array()?;
     let mut of_workers = containers.iter().filter(|container| member(container).is_some());
     let (container, resource) =
@@ -150,11 +151,11 @@ pub fn unclear(spec: &LeaderboardSpec, template: &Value) -> Option<String> {
     match (&spec.gpu, source) {
         (None, _) => Some(format!(
             "{container} requests {resource} and the Leaderboard has no field gpu, so it is not known what the other container of the \
-             pair is to have. Set gpu.resourceName: {resource} and remove it from resources; or set gpu.mode: None, and only the \
+             {worker} is to have. Set gpu.resourceName: {resource} and remove it from resources; or set gpu.mode: None, and only the \
              containers that request a GPU themselves have one."
         )),
         (Some(_), GpuSource::Claim(_)) => Some(format!(
-            "{container} requests {resource} of a device plugin, and gpu.mode is Claim: a pair would take two GPUs. Remove {resource} from \
+            "{container} requests {resource} of a device plugin, and gpu.mode is Claim: a {worker} would take two GPUs. Remove {resource} from \
              resources and podOverrides."
         )),
         (Some(_), GpuSource::None | GpuSource::PerContainer(_) | GpuSource::NodeIndex(_)) => None,

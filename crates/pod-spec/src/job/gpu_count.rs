@@ -10,17 +10,17 @@ use leaderboard_api::{GpuSource, LeaderboardSpec, RunPlan, Track};
 
 /// GPUs that the Pod of a plan requests or claims; shares of GPUs and MIG slices count as one each.
 pub fn gpus(spec: &LeaderboardSpec, track: Option<&Track>, plan: &RunPlan) -> i64 {
-    let source = source(spec);
+    let (source, kind) = (source(spec), leaderboard_evaluation::of_plan(plan));
     let of_worker = |worker: Pair| {
-        [worker.host(), worker.agent()].map(|member| {
-            let hosts = spec.given(track, workers::part(member.side)).resources;
-            let resources = gpu::resources(source, member, hosts);
+        [worker.host(kind.host()), worker.agent()].map(|member| {
+            let hosts = spec.given(track, workers::part(member.side));
+            let resources = gpu::resources(source, member, hosts.and_then(|hosts| hosts.resources));
             json!({"name": member.to_string(), "resources": resources})
         })
     };
     let containers: Vec<Value> = Pair::first(plan.workers()).flat_map(of_worker).collect();
     let mut template = json!({"spec": {"containers": containers}});
-    pod_overlay::lay(&mut template, spec, &leaderboard_evaluation::of_plan(plan).reserved());
+    pod_overlay::lay(&mut template, spec, kind);
     let containers = template.pointer("/spec/containers").and_then(Value::as_array);
     let each = containers
         .into_iter()
@@ -54,7 +54,7 @@ mod tests {
     use serde_json::json;
 
     use super::*;
-    use crate::job::tests::lay;
+    use crate::job::tests::{Case, lay};
     use leaderboard_api::effective;
 
     /// GPUs of a Leaderboard of four pairs with these fields.
@@ -71,7 +71,7 @@ mod tests {
         spec["evaluation"]["carla"]["simulator"]["image"] = json!("simulator:1");
         let spec: LeaderboardSpec = serde_json::from_value(spec).unwrap();
         let track = spec.tracks[0].clone();
-        let plan = effective::plan(&spec, &track, "77".parse().unwrap(), "a:1".into(), false);
+        let plan = effective::plan(&spec, &track, "77".parse().unwrap(), "a:1".into(), false).unwrap();
         gpus(&spec, Some(&track), &plan)
     }
 
@@ -140,6 +140,23 @@ mod tests {
         ];
         for (what, fields, expected) in cases {
             assert_eq!(counted(&fields), expected, "{what}");
+        }
+    }
+
+    #[test]
+    fn gpus_of_evaluators_are_counted_as_those_of_simulators() {
+        let overlay = json!({"spec": {"containers": [{"name": "evaluator-1", "resources": null}]}});
+        for (container, more, expected) in [
+            (json!({}), json!({}), 0),
+            (json!({"resources": one()}), json!({}), 3),
+            (json!({}), json!({"gpu": {"resourceName": "nvidia.com/gpu"}}), 6),
+            (json!({"resources": one()}), json!({"podOverrides": overlay}), 2),
+        ] {
+            let mut container = container;
+            container["workers"] = json!(3);
+            let case = Case::container(container, &more);
+            let spec = &case.leaderboard.spec;
+            assert_eq!(gpus(spec, spec.tracks.first(), &case.plan), expected, "{more}");
         }
     }
 

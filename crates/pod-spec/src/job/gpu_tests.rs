@@ -122,6 +122,33 @@ fn each_mode_gives_a_pair_its_gpu_and_nobody_else_any() {
 }
 
 #[test]
+fn an_evaluator_and_its_agent_have_what_a_simulator_and_its_agent_have() {
+    for (gpu, evaluator, agent) in modes() {
+        let job = Case::container(json!({"workers": 2}), &json!({"gpu": gpu})).json();
+        let runner = words(container(&job, "evaluator-2"));
+        assert_eq!(given(container(&job, "evaluator-2")), evaluator, "{gpu}");
+        assert_eq!(given(container(&job, "agent-2")), agent, "{gpu}");
+        // GPUs of an evaluator may be of any maker, and the runner knows NVIDIA's alone.
+        assert!(
+            !runner.iter().any(|word| word.starts_with("--gpu=")),
+            "{gpu}: {runner:?}"
+        );
+        assert_eq!(
+            runner.contains(&"--agent-gpu=true"),
+            gpu["mode"] == "NodeIndex",
+            "{gpu}: {runner:?}"
+        );
+    }
+    let limits = json!({"limits": {GPU: "1"}});
+    let case = Case::container(json!({"resources": limits}), &json!({}));
+    let found = unclear(&case.leaderboard.spec, &case.json()["spec"]["template"]).unwrap();
+    assert!(
+        found.contains("what the other container of the worker is to have"),
+        "{found}"
+    );
+}
+
+#[test]
 fn each_pair_has_a_claim_of_its_own_from_one_template() {
     for (claim, template) in [
         (json!({"resourceClaimTemplateName": "mine"}), "mine"),

@@ -14,7 +14,8 @@ fn is_own(container: &Value) -> bool {
 
 #[test]
 fn every_container_is_confined_by_default() {
-    for container in containers(&Case::new("V2", json!({})).json()) {
+    let jobs = [Case::new("V2", json!({})), Case::container(json!({}), &json!({}))].map(|case| case.json());
+    for container in jobs.iter().flat_map(containers) {
         let context = &container["securityContext"];
         assert_eq!(context["allowPrivilegeEscalation"], false);
         assert_eq!(context["capabilities"], json!({"drop": ["ALL"]}));
@@ -208,6 +209,19 @@ fn a_pod_requests_and_may_fill_so_much_of_its_nodes_disk() {
     ] {
         let expected = expected.map(|(request, limit)| amounts(request, limit));
         assert_eq!(of(simulator.clone(), agent.clone()), expected, "{simulator} {agent}");
+    }
+}
+
+#[test]
+fn without_contents_their_disk_is_not_counted() {
+    let volumes = ((20 + 2 + 1) * (1_u64 << 30)).to_string();
+    let job = Case::container(json!({}), &json!({})).json();
+    for (name, expected) in [
+        ("evaluator-1", amounts("2Gi", "10Gi")),
+        ("agent-1", amounts("2Gi", "20Gi")),
+        ("logcopy", amounts("1Gi", &volumes)),
+    ] {
+        assert_eq!(disk(&job, name), expected, "{name}");
     }
 }
 

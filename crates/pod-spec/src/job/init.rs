@@ -16,13 +16,13 @@ use leaderboard_contract::run::{ENV_CHECKSUMS, ENV_POD_UID, ENV_ROLE_ARN, ENV_RU
 /// Copying prints little; what floods must not fill the disk. In bytes.
 const CONTENTS_LOG_LIMIT: u64 = 16 << 20;
 
-/// Copies the private contents into their volumes.
-pub(super) fn contents(input: &JobInput<'_>) -> Container {
+/// Copies the private contents into their volumes, where the kind of evaluation has some.
+pub(super) fn contents(input: &JobInput<'_>) -> Option<Container> {
     let (contents, hosts) = (
-        input.kind().contents(&input.asked()),
-        input.spec().given(None, Part::Contents),
+        input.kind().contents(&input.asked())?,
+        input.spec().given(None, Part::Contents)?,
     );
-    Container {
+    Some(Container {
         name: names::CONTAINER_CONTENTS.into(),
         image: Some(contents.image),
         command: Some(kept(contents.command)),
@@ -31,7 +31,7 @@ pub(super) fn contents(input: &JobInput<'_>) -> Container {
         security_context: Some(context(hosts.security)),
         volume_mounts: Some(volumes::of_contents(input)),
         ..Container::default()
-    }
+    })
 }
 
 /// What it prints is in a file too, from which `logcopy` sends it to CloudWatch.

@@ -18,6 +18,8 @@ mod command_tests;
 #[cfg(test)]
 mod container_tests;
 #[cfg(test)]
+mod evaluator_tests;
+#[cfg(test)]
 mod gpu_tests;
 #[cfg(test)]
 mod hardening_tests;
@@ -42,7 +44,7 @@ use crate::owner::owner_reference;
 pub use gpu_count::gpus;
 use leaderboard_api::{
     Attempt, Deadlines, Enforcement, FailedNode, GpuSource, JobNumber, Leaderboard, LeaderboardSpec, PolicySource,
-    Reason, RunPlan, Submission, Track, conditions, effective, names,
+    Reason, RunPlan, Submission, Track, Verify, conditions, effective, names,
 };
 use leaderboard_contract::run::{Isolation, Run, SCHEMA};
 use leaderboard_evaluation::Evaluation;
@@ -106,6 +108,7 @@ impl JobInput<'_> {
             spec: self.spec(),
             track: self.track(),
             plan: self.plan,
+            attempt: self.number.attempt,
             deadlines: self.deadlines(),
             resume: is_resumed(self),
             has_gpus: source(self.spec()) != GpuSource::None,
@@ -133,7 +136,7 @@ pub fn build_object(input: &JobInput<'_>) -> DynamicObject {
     let workloads = workers::workloads(input);
     let mut spec = serde_json::to_value(ours(input, &workloads)).unwrap_or_default();
     let template = &mut spec["template"];
-    pod_overlay::lay(template, input.spec(), &input.kind().reserved());
+    pod_overlay::lay(template, input.spec(), input.kind());
     settle(template, input, &workloads);
     skip_strangers(template);
     DynamicObject {
@@ -160,7 +163,8 @@ fn run_document(input: &JobInput<'_>) -> Run {
             .unwrap_or_default(),
         attempt: input.number.attempt,
         plan: input.plan.clone(),
-        verify: spec.evaluation.carla.verify,
+        // Other kinds of evaluation have nothing to recompute.
+        verify: spec.evaluation.carla().map_or(Verify::Disabled, |carla| carla.verify),
         period_seconds: unsigned(spec.sync_period_seconds),
         flush_seconds: unsigned(spec.deadlines.flush_seconds),
         cancel_seconds: unsigned(spec.deadlines.cancel_seconds),
@@ -282,14 +286,15 @@ fn generation(input: &JobInput<'_>) -> i64 {
 
 fn pod(input: &JobInput<'_>, workloads: &[Workload]) -> PodSpec {
     let identity = input.spec().pod_identity.as_ref();
+    // `workspace` is first, since it makes the folders and the runner that the others have.
+    let init = [
+        Some(init::workspace(input)),
+        init::contents(input),
+        Some(init::logcopy(input)),
+    ];
     PodSpec {
         restart_policy: Some("OnFailure".into()),
-        init_containers: Some(vec![
-            // First, since it makes the folders and the runner that the other one has.
-            init::workspace(input),
-            init::contents(input),
-            init::logcopy(input),
-        ]),
+        init_containers: Some(init.into_iter().flatten().collect()),
         containers: workers::all(input, workloads),
         volumes: Some(volumes::all(input, workloads)),
         active_deadline_seconds: active_deadline(&input.deadlines()),
@@ -344,7 +349,7 @@ fn settle(template: &mut Value, input: &JobInput<'_>, workloads: &[Workload]) {
     }
     gpu::place(pod, gpus);
     failed_nodes::avoid(pod, input.failed_nodes);
-    disk::fill(pod, volumes::logs_limit(input));
+    disk::fill(pod, volumes::disk_limit(input));
 }
 
 /// Names every container but our own two for EKS, those of the overlay too.

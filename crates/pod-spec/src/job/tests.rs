@@ -45,6 +45,30 @@ impl Case {
             "storage": {"s3": {"bucket": "results", "prefix": "runs/", "region": "eu-west-1"}},
         });
         lay(&mut spec, &more);
+        Self::of(&spec)
+    }
+
+    /// A Leaderboard with an evaluator of the host's and one track, `container` and `more` laid over evaluation and spec.
+    #[allow(clippy::needless_pass_by_value, reason = "the cases read better")]
+    pub(super) fn container(container: Value, more: &Value) -> Self {
+        let mut evaluation = json!({"mode": "Interactive", "image": "registry.example/evaluator:1", "command": ["python3", "/evaluate.py"]});
+        for (key, value) in container.as_object().unwrap() {
+            evaluation[key] = value.clone();
+        }
+        let mut spec = json!({
+            "evaluation": {"container": evaluation},
+            "tracks": [{"name": "test", "container": {"score": {"metric": "accuracy"}}}],
+            "agent": {"command": ["/agent"]},
+            "storage": {"s3": {"bucket": "results", "prefix": "runs/", "region": "eu-west-1"}},
+        });
+        for (key, value) in more.as_object().unwrap() {
+            spec[key] = value.clone();
+        }
+        Self::of(&spec)
+    }
+
+    /// The first track of a Leaderboard with this spec.
+    fn of(spec: &Value) -> Self {
         let leaderboard: Leaderboard = serde_json::from_value(json!({
             "apiVersion": "leaderboard.carla.org/v1alpha1", "kind": "Leaderboard",
             "metadata": {"name": "carla", "namespace": "challenge", "uid": "leaderboard-uid"}, "spec": spec,
@@ -63,7 +87,8 @@ impl Case {
             "4711".parse().unwrap(),
             image,
             false,
-        );
+        )
+        .unwrap();
         Self {
             submission,
             leaderboard,
@@ -157,11 +182,46 @@ fn the_job_of_leaderboard_2_is_as_committed() {
 }
 
 #[test]
+fn the_job_of_an_evaluator_without_a_port_is_as_committed() {
+    golden("interactive-1.json", &Case::container(json!({}), &json!({})));
+}
+
+#[test]
+fn the_job_of_two_evaluators_with_ports_and_gpus_is_as_committed() {
+    let container = json!({
+        "workers": 2, "port": 9000, "shmSize": "256Mi", "answerSeconds": 60,
+        "args": ["--split", "$(PHASE)"], "env": [{"name": "LABELS", "value": "/data/labels.csv"}],
+        "resources": {"limits": {"memory": "4Gi"}}, "securityContext": {"runAsUser": 1000},
+    });
+    let more = json!({
+        "podIdentity": role(),
+        "gpu": {"resourceName": "nvidia.com/gpu"},
+        "tracks": [{"name": "test", "phase": 2, "container": {"score": {"split": "test", "metric": "accuracy"}}}],
+        "agent": {"command": ["/agent", "--server", "$(EVALUATOR_ADDRESS)"], "shmSize": "1Gi"},
+    });
+    let mut case = Case::container(container, &more);
+    case.number.attempt = Attempt(2);
+    golden("interactive-2.json", &case);
+}
+
+#[test]
 fn the_job_has_no_field_that_kubernetes_does_not_know() {
-    let case = Case::new("V2", json!({"podIdentity": role()}));
-    let json = case.json();
-    let typed: Job = serde_json::from_value(json.clone()).unwrap();
-    assert_eq!(serde_json::to_value(typed).unwrap(), json);
+    for case in [
+        Case::new("V2", json!({"podIdentity": role()})),
+        Case::container(json!({"port": 9000}), &json!({})),
+    ] {
+        let json = case.json();
+        let typed: Job = serde_json::from_value(json.clone()).unwrap();
+        assert_eq!(serde_json::to_value(typed).unwrap(), json);
+    }
+}
+
+#[test]
+fn a_plan_of_another_kind_than_its_leaderboards_has_no_container_of_a_worker() {
+    let mut case = Case::new("V2", json!({}));
+    case.leaderboard.spec.evaluation = Case::container(json!({}), &json!({})).leaderboard.spec.evaluation;
+    let pod = &case.json()["spec"]["template"]["spec"];
+    assert_eq!(pod["containers"], json!([]), "the API server refuses such a Job");
 }
 
 #[test]

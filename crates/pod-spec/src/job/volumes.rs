@@ -6,22 +6,24 @@ use k8s_openapi::api::core::v1::{
 };
 use k8s_openapi::apimachinery::pkg::api::resource::Quantity;
 
-use super::JobInput;
+use super::{JobInput, workers};
 use crate::layout::{
     CONTENTS_LOG_FOLDER, IDENTITY_VOLUME, LOGS_VOLUME, PODINFO_VOLUME, SHM, SHM_VOLUME, STATUS, TOOLS_VOLUME,
 };
-use leaderboard_api::{ByteQuantity, names};
+use leaderboard_api::names;
 use leaderboard_contract::run::{
     IDENTITY, IDENTITY_TOKEN_FILE, LOGS, NAME_FILES, PODINFO, STATUS_FOLDER, STOP_FILE, TOOLS,
 };
-use leaderboard_evaluation::workload::{Mount, Workload};
-use leaderboard_protocol::files::{Member, Pair, Side};
+use leaderboard_evaluation::workload::{Mount, Role, Workload};
+use leaderboard_protocol::files::Member;
 
 const AUDIENCE: &str = "sts.amazonaws.com";
 const TOKEN_SECONDS: i64 = 3600;
 /// Room in `logs` beyond what the limits on uploads and logs add up to: filling it up evicts the Pod with 1 s of grace,
 /// so those limits must be met first.
 const LOGS_MARGIN: u64 = 1 << 30;
+/// What the volumes of the private contents may hold, which have no limit of their own.
+const CONTENTS_BYTES: u64 = 10 << 30;
 
 /// Every volume of the Pod.
 pub(super) fn all(input: &JobInput<'_>, workloads: &[Workload]) -> Vec<Volume> {
@@ -37,8 +39,10 @@ pub(super) fn all(input: &JobInput<'_>, workloads: &[Workload]) -> Vec<Volume> {
         podinfo(),
     ];
     let identity = input.spec().has_role().then(identity);
-    let shared = input.spec().agent.shm_size.iter();
-    let shared = shared.flat_map(|size| Pair::first(input.workers()).map(|worker| memory(worker, size)));
+    let shared = workers::members(input).filter_map(|member| {
+        let size = workers::role(workloads, member)?.shm?;
+        Some(memory(member, size))
+    });
     let all = contents.chain(own).chain(identity);
     all.chain(of_node(workloads)).chain(shared).collect()
 }
@@ -64,12 +68,12 @@ fn of_node(workloads: &[Workload]) -> Vec<Volume> {
     volumes.collect()
 }
 
-/// The shared memory of one agent, which no other one sees.
-fn memory(pair: Pair, size: &ByteQuantity) -> Volume {
+/// The shared memory of one container, which no other one sees. `size` is in bytes.
+fn memory(member: Member, size: u64) -> Volume {
     Volume {
-        name: format!("{SHM_VOLUME}{pair}"),
+        name: format!("{SHM_VOLUME}{member}"),
         empty_dir: Some(EmptyDirVolumeSource {
-            size_limit: Some(Quantity(size.bytes().to_string())),
+            size_limit: Some(Quantity(size.to_string())),
             medium: Some("Memory".into()),
         }),
         ..Volume::default()
@@ -77,7 +81,7 @@ fn memory(pair: Pair, size: &ByteQuantity) -> Volume {
 }
 
 /// Most bytes of the `logs` volume.
-pub(super) fn logs_limit(input: &JobInput<'_>) -> u64 {
+fn logs_limit(input: &JobInput<'_>) -> u64 {
     let workers = u64::try_from(input.workers()).unwrap_or(u64::MAX);
     let agent_logs = workers.saturating_mul(input.spec().agent.log_size_limit.bytes());
     input
@@ -88,6 +92,12 @@ pub(super) fn logs_limit(input: &JobInput<'_>) -> u64 {
         .bytes()
         .saturating_add(agent_logs)
         .saturating_add(LOGS_MARGIN)
+}
+
+/// Most bytes that the volumes on the node's disk hold together.
+pub(super) fn disk_limit(input: &JobInput<'_>) -> u64 {
+    let has_contents = !input.kind().reserved().volumes.is_empty();
+    logs_limit(input).saturating_add(if has_contents { CONTENTS_BYTES } else { 0 })
 }
 
 fn empty(name: &str, size_limit: Option<Quantity>) -> Volume {
@@ -168,11 +178,10 @@ pub(super) fn of_logcopy(input: &JobInput<'_>) -> Vec<VolumeMount> {
 }
 
 /// What a container of a worker sees.
-pub(super) fn of_member(input: &JobInput<'_>, member: Member, mounts: &[Mount]) -> Vec<VolumeMount> {
-    let (of_node, of_pod): (Vec<&Mount>, Vec<&Mount>) =
-        mounts.iter().partition(|mount| matches!(mount, Mount::OfNode { .. }));
-    let has_shared = member.side == Side::Agent && input.spec().agent.shm_size.is_some();
-    let shared = has_shared.then(|| mount(&format!("{SHM_VOLUME}{}", member.pair), SHM));
+pub(super) fn of_member(member: Member, role: &Role) -> Vec<VolumeMount> {
+    let is_of_node = |mount: &&Mount| matches!(mount, Mount::OfNode { .. });
+    let (of_node, of_pod): (Vec<&Mount>, Vec<&Mount>) = role.mounts.iter().partition(is_of_node);
+    let shared = role.shm.map(|_| mount(&format!("{SHM_VOLUME}{member}"), SHM));
     runner_and_status(&member.to_string())
         .into_iter()
         .chain(of_pod.into_iter().map(mounted))

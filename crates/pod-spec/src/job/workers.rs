@@ -16,30 +16,34 @@ use leaderboard_protocol::files::{Member, Pair, Side};
 pub(super) fn workloads(input: &JobInput<'_>) -> Vec<Workload> {
     let (kind, asked) = (input.kind(), input.asked());
     Pair::first(input.workers())
-        .map(|worker| kind.workload(&asked, worker))
+        .filter_map(|worker| kind.workload(&asked, worker))
         .collect()
 }
 
-fn role(workloads: &[Workload], member: Member) -> Option<&Role> {
+/// The hosts' containers of all workers, then the agents'.
+pub(super) fn members(input: &JobInput<'_>) -> impl Iterator<Item = Member> {
+    let (host, workers) = (input.kind().host(), Pair::first(input.workers()));
+    let hosts = workers.clone().map(move |worker| worker.host(host));
+    hosts.chain(workers.map(Pair::agent))
+}
+
+pub(super) fn role(workloads: &[Workload], member: Member) -> Option<&Role> {
     let workload = workloads.get(member.pair.index())?;
     match member.side {
-        Side::Host => Some(&workload.host),
+        Side::Host(_) => Some(&workload.host),
         Side::Agent => workload.agent.as_ref(),
     }
 }
 
-/// The hosts' containers of all workers, then the agents'.
 pub(super) fn all(input: &JobInput<'_>, workloads: &[Workload]) -> Vec<Container> {
-    let workers = Pair::first(input.workers());
-    let members = workers.clone().map(Pair::host).chain(workers.map(Pair::agent));
-    members
-        .filter_map(|member| Some(container(input, member, role(workloads, member)?)))
+    members(input)
+        .filter_map(|member| container(input, member, role(workloads, member)?))
         .collect()
 }
 
-fn container(input: &JobInput<'_>, member: Member, role: &Role) -> Container {
+fn container(input: &JobInput<'_>, member: Member, role: &Role) -> Option<Container> {
     let (gpus, name) = (source(input.spec()), member.to_string());
-    let hosts = input.spec().given(input.track(), part(member.side));
+    let hosts = input.spec().given(input.track(), part(member.side))?;
     let env = role.env.iter().map(|(name, value)| variable(name, value));
     let env = env.chain(gpu::variables(gpus, member)).collect();
     let flags = role
@@ -47,7 +51,7 @@ fn container(input: &JobInput<'_>, member: Member, role: &Role) -> Container {
         .iter()
         .cloned()
         .chain(gpu::flags(gpus, member.side, role.draws));
-    Container {
+    Some(Container {
         image: Some(role.image.clone()),
         // Kubernetes asks for `latest` anew before each container: a worker, or a restart, could get another image.
         image_pull_policy: (member.side == Side::Agent).then(|| "IfNotPresent".into()),
@@ -55,15 +59,15 @@ fn container(input: &JobInput<'_>, member: Member, role: &Role) -> Container {
         env: Some(merged(env, hosts.env, input.kind().reserved().env)),
         resources: gpu::resources(gpus, member, hosts.resources),
         security_context: Some(context(hosts.security)),
-        volume_mounts: Some(volumes::of_member(input, member, &role.mounts)),
+        volume_mounts: Some(volumes::of_member(member, role)),
         name,
         ..Container::default()
-    }
+    })
 }
 
 pub(super) fn part(side: Side) -> Part {
     match side {
-        Side::Host => Part::Host,
+        Side::Host(_) => Part::Host,
         Side::Agent => Part::Agent,
     }
 }

@@ -6,10 +6,12 @@ use k8s_openapi::api::core::v1::PodTemplateSpec;
 use serde_json::{Map, Value};
 
 use super::without_nulls;
-use crate::layout::{ANNOTATION_SKIP_CONTAINERS, OWN_VOLUMES, protected_mounts};
+use crate::layout::{ANNOTATION_SKIP_CONTAINERS, is_own_volume, protected_mounts};
 use leaderboard_api::{LeaderboardSpec, Part, names};
 use leaderboard_contract::run::{ENV_POD_UID, ENV_ROLE_ARN, ENV_RUN};
+use leaderboard_evaluation::Evaluation;
 use leaderboard_evaluation::workload::Reserved;
+use leaderboard_protocol::files::{Member, Side};
 
 /// Why a Leaderboard's `podOverrides` cannot be used. `path` is below `spec` of the Leaderboard.
 #[derive(thiserror::Error, Debug, PartialEq, Eq)]
@@ -104,18 +106,20 @@ const OWN_ENV: [&str; 6] = [
 
 /// Checks all of a Leaderboard that goes into its Pods: `podOverrides`, and the variables of its containers.
 pub fn validate(spec: &LeaderboardSpec) -> Checked {
-    let reserved = &leaderboard_evaluation::of(spec).reserved();
-    for part in [Part::Host, Part::Agent] {
-        let hosts = spec.given(None, part);
+    let kind = leaderboard_evaluation::of(spec);
+    for hosts in [Part::Host, Part::Agent]
+        .into_iter()
+        .filter_map(|part| spec.given(None, part))
+    {
         let names = hosts.env.iter().map(|variable| variable.name.as_str());
-        fixed_names(&format!("{}.env", hosts.path), names, reserved)?;
+        fixed_names(&format!("{}.env", hosts.path), names, &kind.reserved())?;
     }
     let overlay = spec.pod_overrides.as_ref();
-    overlay.map_or(Ok(()), |pod| validate_overlay(pod, reserved))
+    overlay.map_or(Ok(()), |pod| validate_overlay(pod, kind))
 }
 
 /// Checks a Leaderboard's `podOverrides`. The API server's answer to a dry run of the Job then judges what is left.
-pub fn validate_overlay(pod: &Value, reserved: &Reserved) -> Checked {
+pub fn validate_overlay(pod: &Value, kind: &dyn Evaluation) -> Checked {
     let template = object(pod, "podOverrides")?;
     only(
         template,
@@ -127,7 +131,7 @@ pub fn validate_overlay(pod: &Value, reserved: &Reserved) -> Checked {
         metadata(object(value, "podOverrides.metadata")?)?;
     }
     if let Some(value) = template.get("spec") {
-        spec(object(value, "podOverrides.spec")?, reserved)?;
+        spec(object(value, "podOverrides.spec")?, kind)?;
     }
     let typed: Result<PodTemplateSpec, _> = serde_json::from_value(without_nulls(pod));
     typed.map(|_| ()).map_err(|error| OverlayError::Template {
@@ -159,15 +163,15 @@ fn metadata(metadata: &Map<String, Value>) -> Checked {
     Ok(())
 }
 
-fn spec(spec: &Map<String, Value>, reserved: &Reserved) -> Checked {
+fn spec(spec: &Map<String, Value>, kind: &dyn Evaluation) -> Checked {
     fields(spec, "podOverrides.spec", &POD_FIELDS)?;
     if let Some(value) = spec.get("volumes") {
-        volumes(value, reserved)?;
+        volumes(value, &kind.reserved())?;
     }
     for (field, init) in [("initContainers", true), ("containers", false)] {
         let Some(value) = spec.get(field) else { continue };
         for (path, container) in named(value, &format!("podOverrides.spec.{field}"))? {
-            check_container(&path, container, init, reserved)?;
+            check_container(&path, container, init, kind)?;
         }
     }
     Ok(())
@@ -176,7 +180,7 @@ fn spec(spec: &Map<String, Value>, reserved: &Reserved) -> Checked {
 fn volumes(value: &Value, reserved: &Reserved) -> Checked {
     for (path, volume) in named(value, "podOverrides.spec.volumes")? {
         if let Some(name) = volume["name"].as_str()
-            && (OWN_VOLUMES.contains(&name) || reserved.volumes.iter().any(|known| known.name == name))
+            && (is_own_volume(name) || reserved.volumes.iter().any(|known| known.name == name))
         {
             return protected(path, "the operator fills this volume; give yours another name");
         }
@@ -204,12 +208,20 @@ enum Whose {
     Worker,
     /// An init container of the host's.
     Added,
+    /// One that only another kind of evaluation has.
+    OfAnotherKind,
 }
 
-fn check_container(path: &str, container: &Map<String, Value>, init: bool, reserved: &Reserved) -> Checked {
-    let name = container["name"].as_str().unwrap_or_default();
-    let whose = whose(name);
+fn check_container(path: &str, container: &Map<String, Value>, init: bool, kind: &dyn Evaluation) -> Checked {
+    let (name, reserved) = (container["name"].as_str().unwrap_or_default(), &kind.reserved());
+    let whose = whose(name, kind);
     match (whose, init) {
+        (Whose::OfAnotherKind, _) => {
+            return protected(
+                path.into(),
+                "only Pods of another kind of evaluation have it; take another name",
+            );
+        }
         (Whose::Own | Whose::Contents, false) => return protected(path.into(), "it is an init container"),
         (Whose::Worker, true) => return protected(path.into(), "it belongs to containers"),
         (Whose::Added, false) => {
@@ -231,16 +243,17 @@ fn check_container(path: &str, container: &Map<String, Value>, init: bool, reser
     env(path, container, whose, reserved)
 }
 
-fn whose(name: &str) -> Whose {
-    let numbered = |side: &str| {
-        let number = name.strip_prefix(side).and_then(|rest| rest.strip_prefix('-'));
-        number.is_some_and(|number| number.parse::<u8>().is_ok_and(|n| n > 0 && n.to_string() == number))
-    };
-    match name {
-        names::CONTAINER_WORKSPACE | names::CONTAINER_LOGCOPY => Whose::Own,
-        names::CONTAINER_CONTENTS => Whose::Contents,
-        name if super::ALIASES.iter().any(|alias| *alias == name || numbered(alias)) => Whose::Worker,
-        _ => Whose::Added,
+fn whose(name: &str, kind: &dyn Evaluation) -> Whose {
+    let sides = [Side::Host(kind.host()), Side::Agent];
+    let is_alias = sides.iter().any(|side| side.name() == name);
+    match (name, Member::parse(name)) {
+        (names::CONTAINER_WORKSPACE | names::CONTAINER_LOGCOPY, _) => Whose::Own,
+        (names::CONTAINER_CONTENTS, _) if kind.reserved().volumes.is_empty() => Whose::OfAnotherKind,
+        (names::CONTAINER_CONTENTS, _) => Whose::Contents,
+        (_, Some(member)) if sides.contains(&member.side) => Whose::Worker,
+        (_, Some(_)) => Whose::OfAnotherKind,
+        (_, None) if is_alias => Whose::Worker,
+        (_, None) => Whose::Added,
     }
 }
 
@@ -260,7 +273,7 @@ fn env(path: &str, container: &Map<String, Value>, whose: Whose, reserved: &Rese
             None => Ok(()),
         },
         Whose::Worker => fixed_names(&path, names, reserved),
-        Whose::Contents | Whose::Added => Ok(()),
+        Whose::Contents | Whose::Added | Whose::OfAnotherKind => Ok(()),
     }
 }
 
@@ -293,7 +306,7 @@ fn mounts(path: &str, container: &Map<String, Value>, reserved: &Reserved) -> Ch
         }
         let volume = mount.get("name").and_then(Value::as_str).unwrap_or_default();
         let read_only = mount.get("readOnly") == Some(&Value::Bool(true));
-        if OWN_VOLUMES.contains(&volume) {
+        if is_own_volume(volume) {
             return protected(path, format!("volume {volume} is mounted by the operator alone"));
         }
         if !read_only && reserved.volumes.iter().any(|known| known.name == volume) {

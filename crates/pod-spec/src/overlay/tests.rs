@@ -4,10 +4,9 @@ use serde_json::{Value, json};
 
 use super::*;
 use leaderboard_evaluation::carla;
-use leaderboard_evaluation::workload::Reserved;
 
-fn reserved() -> Reserved {
-    carla::of(leaderboard_api::LeaderboardVersion::V2).reserved()
+pub(super) fn carla() -> &'static dyn Evaluation {
+    carla::of(leaderboard_api::LeaderboardVersion::V2)
 }
 
 fn base() -> Value {
@@ -152,7 +151,7 @@ fn an_empty_overlay_changes_nothing() {
         json!({"spec": {}}),
         json!({"metadata": {"labels": {}}, "spec": {"containers": []}}),
     ] {
-        assert_eq!(validate_overlay(&overlay, &reserved()), Ok(()));
+        assert_eq!(validate_overlay(&overlay, carla()), Ok(()));
         check(overlay, "", base());
     }
 }
@@ -171,15 +170,20 @@ fn what_an_overlay_may_set_is_accepted() {
         json!({"spec": {"tolerations": null, "fieldOfTheFuture": [1]}}),
     ];
     for case in cases {
-        assert_eq!(validate_overlay(&case, &reserved()), Ok(()), "{case}");
+        assert_eq!(validate_overlay(&case, carla()), Ok(()), "{case}");
     }
 }
 
 /// Each overlay, written as JSON, with how the message starts.
 #[track_caller]
 fn refused(cases: &[(&str, &str)]) {
+    refused_by(carla(), cases);
+}
+
+#[track_caller]
+pub(super) fn refused_by(kind: &dyn Evaluation, cases: &[(&str, &str)]) {
     for (overlay, expected) in cases {
-        let error = validate_overlay(&serde_json::from_str(overlay).unwrap(), &reserved())
+        let error = validate_overlay(&serde_json::from_str(overlay).unwrap(), kind)
             .expect_err(overlay)
             .to_string();
         assert!(error.starts_with(expected), "{overlay}\n  {error}\n  {expected}");
