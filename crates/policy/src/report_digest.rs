@@ -3,16 +3,17 @@
 use serde_json::{Map, Value};
 
 use leaderboard_api::text::one_line;
-use leaderboard_api::{Attempt, Metric, Progress, Score};
+use leaderboard_api::{Attempt, MAX_METRICS, MAX_NAME, Metric, Progress, Score};
 use leaderboard_contract::keys::{METADATA, STDOUT};
 use leaderboard_contract::report::{ContentId, Logs, Outcome, RefusedResults, Report, ReportError, ReportWorker};
 use leaderboard_contract::run::Stop;
-use leaderboard_evaluation::labels;
 
 /// Largest text that is passed on to EvalAI, in bytes.
 pub const MAX_TEXT: u64 = 4 << 20;
 /// Longest text of a report that is kept, in characters.
 const LONGEST: usize = 500;
+/// Most splits of a result that are kept.
+const MAX_SPLITS: usize = 16;
 
 /// What is kept of a report. Its texts are read again when they are published.
 #[derive(Clone, Debug, Default, PartialEq)]
@@ -34,16 +35,27 @@ pub struct ReportDigest {
     pub stopped: Option<Stop>,
     /// Results that are refused for good.
     pub refused: Option<RefusedResults>,
+    /// Results that the host's own evaluator has spoiled for good.
+    pub unusable: Option<RefusedResults>,
     /// The first warning.
     pub warning: Option<String>,
     /// Whether the lines of the run come to CloudWatch.
     pub logs: Option<Logs>,
     /// The agents' folders fill the volume of the logs.
     pub agents_fill_disk: bool,
-    /// The metrics of a final report, for the table.
-    pub accuracies: Option<Box<Map<String, Value>>>,
+    /// The metrics of a final report, for the table; empty before.
+    pub splits: Box<[Split]>,
     /// Why EvalAI is not sent one of its texts.
     pub left_out: Option<Box<str>>,
+}
+
+/// The metrics of one split of a result.
+#[derive(Clone, Debug, PartialEq)]
+pub struct Split {
+    /// Its codename.
+    pub name: String,
+    /// Numbers by their labels.
+    pub accuracies: Map<String, Value>,
 }
 
 impl ReportDigest {
@@ -63,7 +75,8 @@ impl ReportDigest {
     /// only results that count do: another Job may go on, which stores no report of its own before its first round.
     pub fn is_verdict(&self) -> bool {
         let goes_on = matches!(self.stopped, Some(Stop::Interruption | Stop::Cancel));
-        let is_decided = self.is_complete() || (self.is_final && self.refused.is_some());
+        let is_spoiled = self.refused.is_some() || self.unusable.is_some();
+        let is_decided = self.is_complete() || (self.is_final && is_spoiled);
         is_decided && (self.eligible || !goes_on)
     }
 
@@ -77,6 +90,10 @@ impl ReportDigest {
     }
 
     pub fn of(report: &Report, id: ContentId) -> Self {
+        let for_good = |fault: &Option<RefusedResults>| {
+            let fault = fault.as_ref().filter(|_| report.is_final)?;
+            Some(RefusedResults::new(fault.worker, cut(&fault.why)))
+        };
         Self {
             id,
             attempt: report.attempt,
@@ -91,28 +108,38 @@ impl ReportDigest {
             eligible: report.eligible,
             outcome: report.outcome,
             stopped: report.stopped,
-            refused: report.refused.as_ref().filter(|_| report.is_final).map(|refused| {
-                let why = cut(&refused.why);
-                RefusedResults::new(refused.worker, why)
-            }),
+            refused: for_good(&report.refused),
+            unusable: for_good(&report.unusable),
             warning: report.warnings.first().map(|warning| cut(warning)),
             logs: report.logs.as_ref().map(|logs| match logs {
                 Logs::Sent => Logs::Sent,
                 Logs::Refused(why) => Logs::Refused(cut(why)),
             }),
             agents_fill_disk: report.agents_fill_disk,
-            accuracies: report.is_final.then(|| accuracies(&report.results)).flatten(),
+            splits: if report.is_final {
+                splits(&report.results)
+            } else {
+                Box::default()
+            },
             left_out: left_out(report).map(Into::into),
         }
     }
 }
 
-/// The metrics that a table has columns for, of either format.
-fn accuracies(results: &str) -> Option<Box<Map<String, Value>>> {
-    let mut parsed: Value = serde_json::from_str(results).ok()?;
-    let all = parsed.get_mut(0)?.get_mut("accuracies")?.as_object_mut()?;
-    let kept = labels().filter_map(|name| all.remove_entry(name));
-    Some(Box::new(kept.collect()))
+/// The numbers of EvalAI's text, as many as a result may have.
+fn splits(results: &str) -> Box<[Split]> {
+    let parsed: Vec<Value> = serde_json::from_str(results).unwrap_or_default();
+    let is_kept = |(label, value): &(String, Value)| value.is_number() && label.chars().count() <= MAX_NAME;
+    let split = |mut entry: Value| {
+        let Value::Object(all) = entry.get_mut("accuracies")?.take() else {
+            return None;
+        };
+        Some(Split {
+            name: one_line(entry["split"].as_str().unwrap_or_default(), MAX_NAME),
+            accuracies: all.into_iter().filter(is_kept).take(MAX_METRICS).collect(),
+        })
+    };
+    parsed.into_iter().filter_map(split).take(MAX_SPLITS).collect()
 }
 
 /// A number of a report as the status has it.
@@ -182,7 +209,7 @@ mod tests {
         assert!(bytes.len() > 80_000);
         let digest = ReportDigest::read(&bytes, "u").unwrap().unwrap();
         assert!(size(&digest) < 1536, "{} bytes", size(&digest));
-        assert_eq!((digest.accuracies, digest.refused), (None, None));
+        assert_eq!((digest.splits.len(), digest.refused), (0, None));
         let score = digest.score.map(|score| score.value);
         assert_eq!(
             (digest.done, digest.workers.len(), score.as_deref()),
@@ -193,9 +220,29 @@ mod tests {
     #[test]
     fn a_final_report_keeps_the_metrics_of_the_table_alone() {
         let digest = ReportDigest::read(&report(true), "u").unwrap().unwrap();
-        let metrics = digest.accuracies.unwrap();
-        assert_eq!(serde_json::to_string(&metrics).unwrap(), r#"{"Driving score":43.125}"#);
+        let metrics = &digest.splits[0].accuracies;
+        assert_eq!(serde_json::to_string(metrics).unwrap(), r#"{"Driving score":43.125}"#);
         assert_eq!(digest.refused.unwrap().why.chars().count(), LONGEST);
+    }
+
+    #[test]
+    fn labels_of_all_splits_are_kept_whatever_they_are_and_no_more_than_a_result_may_have() {
+        let many: Map<String, Value> = (0..40).map(|index| (format!("m{index:02}"), json!(index))).collect();
+        let odd = json!({"accuracy": 0.5, "text": "0.5", "none": null, "long".repeat(20): 1});
+        let text = |entries: Vec<Value>| Value::from(entries).to_string();
+        let found = splits(&text(vec![
+            json!({"split": "dev", "show_to_participant": true, "accuracies": odd}),
+            json!({"split": "test", "accuracies": many}),
+            json!({"split": "broken", "accuracies": []}),
+        ]));
+        let shown: Vec<(&str, usize)> = found
+            .iter()
+            .map(|split| (split.name.as_str(), split.accuracies.len()))
+            .collect();
+        assert_eq!(shown, [("dev", 1), ("test", MAX_METRICS)]);
+        let entry = json!({"split": "s", "accuracies": {}});
+        assert_eq!(splits(&text(vec![entry; 20])).len(), MAX_SPLITS);
+        assert!(splits("torn").is_empty());
     }
 
     #[test]

@@ -12,8 +12,8 @@ use crate::submissions::previous_controller;
 use leaderboard_api::conditions::{self, Truth};
 use leaderboard_api::leaderboard::Counts;
 use leaderboard_api::{
-    CarlaShape, Evalai, EvalaiUse, Leaderboard, LeaderboardStatus, Reason, ResourceExt, TableUse, TeamUse, Track,
-    TrackStatus, effective, names,
+    CarlaShape, ContainerShape, Evalai, EvalaiUse, Leaderboard, LeaderboardStatus, Reason, ResourceExt, TableUse,
+    TeamUse, Track, TrackStatus, effective, names,
 };
 use leaderboard_contract::verdict::WorkspaceVerdict;
 
@@ -304,15 +304,20 @@ fn tracks(view: &LeaderboardView) -> Vec<TrackStatus> {
     let leaderboard = view.leaderboard.as_ref();
     let number = |count| i32::try_from(count).unwrap_or(i32::MAX);
     let status = |track: &Track| {
-        let shape = effective::shape(&leaderboard.spec, track);
+        let evaluation = &leaderboard.spec.evaluation;
+        let carla = evaluation.carla().map(|carla| effective::shape(carla, track));
+        let container = evaluation
+            .container()
+            .map(|container| effective::workers(container, track));
         let ranking = standings::ranked(leaderboard, track, &view.named).ranking;
         TrackStatus {
             name: track.name.clone(),
-            carla: CarlaShape {
+            carla: carla.map(|shape| CarlaShape {
                 pairs: number(shape.pairs),
                 routes: number(shape.routes),
                 repetitions: number(shape.repetitions),
-            },
+            }),
+            container: container.map(|workers| ContainerShape { workers }),
             standings: standings::of_track(leaderboard, track, &ranking, view.results.as_ref()),
             ranking: Some(ranking),
         }

@@ -4,7 +4,7 @@ use std::collections::{BTreeMap, BTreeSet};
 use std::sync::Arc;
 
 use leaderboard_api::standings::{is_candidate, shown, standings, track_of};
-use leaderboard_api::{Leaderboard, Ranking, ResourceExt, Standing, Submission, Track, TrackStatus};
+use leaderboard_api::{Leaderboard, Ranking, ResourceExt, ScoreMetric, Standing, Submission, Track, TrackStatus};
 use leaderboard_evaluation as evaluation;
 
 /// Results that a Leaderboard's standings are made of.
@@ -30,19 +30,29 @@ pub struct Ranked {
 /// How a track ranks: as EvalAI does, else as it did before, else as its evaluation asks.
 pub fn ranked(leaderboard: &Leaderboard, track: &Track, named: &Named) -> Ranked {
     let evaluation = evaluation::of(&leaderboard.spec);
-    let is_shown = |ranking: &Ranking| evaluation.measures().contains(&ranking.metric.as_str());
+    let is_shown = |ranking: &Ranking| evaluation.shows(&ranking.metric);
     let phase = track.phase.filter(|_| leaderboard.spec.evalai.is_some());
     let wanted = match (phase, named) {
-        (Some(phase), Some(named)) => named.get(&phase).cloned(),
+        (Some(phase), Some(named)) => named.get(&phase).map(|ranking| as_shown(track, ranking)),
         (Some(_), None) => stored(leaderboard, track).and_then(|stored| stored.ranking.clone()),
         (None, _) => None,
     };
     match wanted {
         Some(ranking) if is_shown(&ranking) => Ranked { ranking, lacking: None },
         lacking => Ranked {
-            ranking: evaluation.ranking(),
+            ranking: evaluation.ranking(track),
             lacking,
         },
+    }
+}
+
+/// A ranking of EvalAI's with the name that results here have for its metric: that of the split whose metric is the track's score.
+fn as_shown(track: &Track, ranking: &Ranking) -> Ranking {
+    let score = track.container.as_ref().map(|own| &own.score);
+    let name = |score: &ScoreMetric| score.name_of(score.split.as_deref().unwrap_or_default(), &ranking.metric);
+    Ranking {
+        metric: score.map_or_else(|| ranking.metric.clone(), name),
+        order: ranking.order,
     }
 }
 

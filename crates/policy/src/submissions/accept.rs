@@ -16,8 +16,8 @@ use leaderboard_api::conditions::{self, Truth};
 use leaderboard_api::evalai_status::Status;
 use leaderboard_api::text::{LONGEST_NAME, one_line, sentence};
 use leaderboard_api::{
-    Attempt, Failure, ImagePattern, ImageReference, LeaderboardSpec, Reason, Repository, RunPlan, Team, TeamStatus,
-    Track, effective, image_pattern,
+    Attempt, Evaluation, Failure, ImagePattern, ImageReference, LeaderboardSpec, Reason, Repository, RunPlan, Team,
+    TeamStatus, Track, effective, image_pattern,
 };
 
 /// Pins the plan and returns true if the submission may go on to its turn. Otherwise the draft shows why not. EvalAI's own end goes before all
@@ -53,7 +53,9 @@ pub(super) fn decide(draft: &mut PlanBuilder<'_>) -> bool {
     if gates::closed(draft, &[Gate::Leaderboard, Gate::Policy]).is_some() {
         return false;
     }
-    pin(draft, leaderboard, track, image);
+    if !pin(draft, leaderboard, track, image) {
+        return false;
+    }
     draft.condition(conditions::ACCEPTED, Truth::True, Reason::Accepted, "");
     draft.condition(conditions::SUCCEEDED, Truth::Unknown, Reason::InProgress, "");
     true
@@ -76,7 +78,9 @@ fn allowed_image(draft: &mut PlanBuilder<'_>, leaderboard: &LeaderboardSpec, tra
         }
     };
     let Some(found) = fault else { return Some(image) };
-    pin(draft, leaderboard, track, image);
+    if !pin(draft, leaderboard, track, image) {
+        return None;
+    }
     draft.condition(conditions::ACCEPTED, Truth::False, found.reason.clone(), &found.message);
     end::failed(draft, found);
     None
@@ -270,25 +274,58 @@ fn image_patterns(draft: &PlanBuilder<'_>, leaderboard: &LeaderboardSpec) -> Opt
     }
 }
 
-fn pin(draft: &mut PlanBuilder<'_>, leaderboard: &LeaderboardSpec, track: &Track, image: String) {
-    let info = draft.evalai_info();
-    let resumed = info.is_some_and(|i| i.standing == Standing::Resumed);
-    let plan = if let Some(pinned) = draft.status.plan.take() {
-        again(draft, leaderboard, pinned, image)
-    } else {
-        let resume = resumed || draft.spec().attempt > Attempt::FIRST || draft.is_adopted();
-        let plan = effective::plan(leaderboard, track, draft.submission().run_id(), image, resume);
-        let plan = if draft.spec().check { plan.of_check() } else { plan };
-        RunPlan {
-            earlier_attempts: attempts_before(draft),
-            submission_uid: draft.submission().metadata.uid.clone(),
-            ..plan
+/// Pins the plan. False, with the reason shown, if the Leaderboard of today can't run the submission.
+fn pin(draft: &mut PlanBuilder<'_>, leaderboard: &LeaderboardSpec, track: &Track, image: String) -> bool {
+    let plan = match draft.status.plan.take() {
+        Some(pinned) if is_of_kind(&pinned, leaderboard) => Some(again(draft, leaderboard, pinned, image)),
+        Some(pinned) => {
+            draft.status.plan = Some(pinned);
+            None
         }
+        None => first_plan(draft, leaderboard, track, image),
+    };
+    let Some(plan) = plan else {
+        let why = if draft.status.plan.is_some() {
+            "It was made anew with another kind of evaluation than the submission was accepted for. Cancel this submission.".to_owned()
+        } else {
+            format!(
+                "Its track {} names no score. Set container.score of the track.",
+                track.name
+            )
+        };
+        let message = format!(
+            "Leaderboard {} can't run the submission. {why}",
+            draft.spec().leaderboard_name
+        );
+        draft.refuse(Reason::TrackNotFound, &message);
+        return false;
     };
     draft.status.results_url = Some(effective::results_url(&plan.storage.s3, &plan.run_id));
     draft.status.plan = Some(plan);
     if draft.status.times.accepted.is_none() {
         draft.status.times.accepted = Some(draft.time());
+    }
+    true
+}
+
+/// The plan of a submission that has none; `None` for a track without what its kind of evaluation needs.
+fn first_plan(draft: &PlanBuilder<'_>, leaderboard: &LeaderboardSpec, track: &Track, image: String) -> Option<RunPlan> {
+    let resumed = draft.evalai_info().is_some_and(|i| i.standing == Standing::Resumed);
+    let resume = resumed || draft.spec().attempt > Attempt::FIRST || draft.is_adopted();
+    let plan = effective::plan(leaderboard, track, draft.submission().run_id(), image, resume)?;
+    let plan = if draft.spec().check { plan.of_check() } else { plan };
+    Some(RunPlan {
+        earlier_attempts: attempts_before(draft),
+        submission_uid: draft.submission().metadata.uid.clone(),
+        ..plan
+    })
+}
+
+/// True if a plan is of the kind of evaluation that the Leaderboard has.
+fn is_of_kind(plan: &RunPlan, leaderboard: &LeaderboardSpec) -> bool {
+    match &leaderboard.evaluation {
+        Evaluation::Carla(_) => plan.carla().is_some(),
+        Evaluation::Container(_) => plan.container().is_some(),
     }
 }
 

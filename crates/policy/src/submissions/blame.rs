@@ -16,7 +16,8 @@ use super::{cause, failure};
 use crate::report_digest::clamp;
 use crate::view::{ContainerView, EndView, PodView};
 use leaderboard_api::{EndReason, Failure, LastEnd, SubmissionStatus, WorkerState, WorkerStatus};
-use leaderboard_protocol::files::{Member, Pair, Side};
+use leaderboard_evaluation::of_plan;
+use leaderboard_protocol::files::{Host, Member, Pair, Side};
 use leaderboard_protocol::verdict::{CODE_NO_PROCESS, CODE_NODE_REFUSED, What};
 
 /// Exit codes of a container that was ended with all others of its Pod, as by a sandbox that is made anew: killed, or lost from sight.
@@ -40,8 +41,36 @@ pub(super) struct Crash {
     pub(super) is_settled: bool,
 }
 
-/// The table. `None`: neither side has crashed; whether their Pod is lost is not judged here.
-pub(super) fn last_crash(host: Option<&ContainerView>, agent: Option<&ContainerView>, now: Timestamp) -> Option<Crash> {
+/// The last crash of a worker with this kind of host. `None`: neither side has crashed; whether their Pod is lost is not judged here.
+pub(super) fn last_crash(
+    kind: Host,
+    host: Option<&ContainerView>,
+    agent: Option<&ContainerView>,
+    now: Timestamp,
+) -> Option<Crash> {
+    let crash = table(host, agent, now)?;
+    if kind == Host::Simulator {
+        return Some(crash);
+    }
+    // An evaluator has the last word: what becomes of its agent after that is no crash.
+    let has_result = |host: &ContainerView| host.last.as_ref().and_then(what) == Some(What::Finished);
+    let cause = of_evaluator(crash.cause);
+    (!host.is_some_and(has_result)).then_some(Crash { cause, ..crash })
+}
+
+/// A cause of the table where the host's container is an evaluator, whose agent writes no results of its own.
+fn of_evaluator(cause: EndReason) -> EndReason {
+    match cause {
+        EndReason::SimulatorCrashed | EndReason::SimulatorSilent => EndReason::EvaluatorCrashed,
+        EndReason::SimulatorNotReady => EndReason::EvaluatorNotReady,
+        EndReason::SimulatorNotStarted => EndReason::EvaluatorNotStarted,
+        EndReason::Incomplete => EndReason::Exited,
+        cause => cause,
+    }
+}
+
+/// The table, in a simulator's words.
+fn table(host: Option<&ContainerView>, agent: Option<&ContainerView>, now: Timestamp) -> Option<Crash> {
     if let Some(crash) = from_outside(host, agent) {
         return Some(crash);
     }
@@ -142,6 +171,9 @@ fn is_hosts_own(host: Option<&ContainerView>, crash: &Crash) -> bool {
             | EndReason::SimulatorNotReady
             | EndReason::SimulatorSilent
             | EndReason::SimulatorNotStarted
+            | EndReason::EvaluatorCrashed
+            | EndReason::EvaluatorNotReady
+            | EndReason::EvaluatorNotStarted
     );
     is_its && !was_ended
 }
@@ -290,13 +322,14 @@ fn of_start_error(end: &EndView) -> EndReason {
 
 /// Counts the crashes of each worker and remembers the last one: its Pod may be gone when the cause is looked for.
 pub(super) fn note_crashes(status: &mut SubmissionStatus, pod: &PodView, now: Timestamp) {
+    let kind = host_of(status);
     let ids: BTreeSet<i32> = pod.containers.iter().filter_map(|c| pair_of(&c.name)).collect();
     for id in ids {
         let its = pod.containers.iter().filter(|c| pair_of(&c.name) == Some(id));
         let counted = its.map(count_crashes).max().unwrap_or(0);
-        let crash = last_crash_of(pod, id, now);
+        let crash = last_crash_of(pod, kind, id, now);
         if counted > 0 || crash.is_some() {
-            let host = pair_with(id).and_then(|pair| container(pod, pair.host()));
+            let host = pair_with(id).and_then(|pair| container(pod, pair.host(kind)));
             let worker = worker_entry(status, id);
             worker.environment_failed |= crash.is_some_and(|crash| is_hosts_own(host, &crash));
             take_crash(worker, counted, crash);
@@ -328,7 +361,7 @@ fn count_crashes(container: &ContainerView) -> i32 {
     let Some(last) = container.last.as_ref() else {
         return container.restarts;
     };
-    let is_host = Member::parse(&container.name).is_some_and(|member| member.side == Side::Host);
+    let is_host = Member::parse(&container.name).is_some_and(|member| member.side != Side::Agent);
     if is_host && lacked_processes(container, last) {
         return 0;
     }
@@ -343,9 +376,16 @@ fn count_crashes(container: &ContainerView) -> i32 {
     }
 }
 
-fn last_crash_of(pod: &PodView, id: i32, now: Timestamp) -> Option<Crash> {
+fn last_crash_of(pod: &PodView, kind: Host, id: i32, now: Timestamp) -> Option<Crash> {
     let pair = pair_with(id)?;
-    last_crash(container(pod, pair.host()), container(pod, pair.agent()), now)
+    last_crash(kind, container(pod, pair.host(kind)), container(pod, pair.agent()), now)
+}
+
+/// What the hosts' containers of the workers run.
+pub(super) fn host_of(status: &SubmissionStatus) -> Host {
+    let plan = status.plan.as_ref();
+    // Without a plan nothing is decided before it is pinned anew.
+    plan.map_or(Host::Simulator, |plan| of_plan(plan).host())
 }
 
 pub(super) fn pair_with(id: i32) -> Option<Pair> {
@@ -381,7 +421,7 @@ fn worker_entry(status: &mut SubmissionStatus, id: i32) -> &mut WorkerStatus {
 
 /// The failure of a pair that has crashed as often as it may, or cannot start at all. It waits until the cause is settled.
 pub(super) fn too_many(draft: &mut PlanBuilder<'_>) -> Option<Failure> {
-    let limit = draft.retries().per_worker.saturating_add(1);
+    let (limit, kind) = (draft.retries().per_worker.saturating_add(1), host_of(&draft.status));
     let is_too_many = |worker: &&WorkerStatus| {
         worker.crashes >= limit || (worker.crashes > 0 && failure::cause_of(worker).is_some_and(is_hopeless))
     };
@@ -391,7 +431,7 @@ pub(super) fn too_many(draft: &mut PlanBuilder<'_>) -> Option<Failure> {
             continue;
         };
         let pod = draft.view.pod.as_ref();
-        let crash = pod.and_then(|pod| last_crash_of(pod, worker.id, draft.now()));
+        let crash = pod.and_then(|pod| last_crash_of(pod, kind, worker.id, draft.now()));
         // Who goes on to fail while the other side's word is waited for puts its end off no further.
         match crash.filter(|crash| !crash.is_settled && worker.crashes <= limit) {
             None => return Some(failure::of_worker(worker, cause, &draft.status)),

@@ -392,7 +392,10 @@ pub(super) fn disk_full(draft: &PlanBuilder<'_>) -> Option<Failure> {
             let report = draft.view.report.ours().filter(|report| report.pod_uid == pod.uid);
             report.is_some_and(|report| report.agents_fill_disk)
         }
-        Account::Volume(name) => name.starts_with(SHM_VOLUME) || is_of_agents_alone(name, draft.leaderboard()),
+        Account::Volume(name) => {
+            let member = name.strip_prefix(SHM_VOLUME);
+            member.is_some_and(names::is_agent_container) || is_of_agents_alone(name, draft.leaderboard())
+        }
         Account::Pod => false,
     };
     Some(if is_agents {

@@ -1,7 +1,7 @@
 //! The end of an attempt: which outcome it has, or whether an infrastructure failure gives it another Job.
 //!
 //! Some infrastructure failures an agent can provoke. The first of an attempt gets another Job, on another node where there is one; after a
-//! further one a Job follows only if the Job before it has finished a route.
+//! further one a Job follows only if the Job before it has finished a unit of work.
 
 use k8s_openapi::apimachinery::pkg::apis::meta::v1::Time;
 
@@ -139,7 +139,10 @@ fn cause(draft: &PlanBuilder<'_>, report: Option<&ReportDigest>, job_end: Option
     // A refused checkpoint may still be fixed while the run goes on; only the last one counts.
     let verdict = report.filter(|r| r.is_verdict());
     if let Some(refused) = verdict.and_then(|r| r.refused.as_ref()) {
-        return failure::invalid_results(refused);
+        return failure::invalid_results(refused, draft.words());
+    }
+    if let Some(unusable) = verdict.and_then(|r| r.unusable.as_ref()) {
+        return failure::unusable_results(unusable);
     }
     if let Some(report) = verdict {
         return failure::not_eligible(report, &draft.status);
@@ -300,8 +303,9 @@ fn duration(seconds: i64) -> String {
 }
 
 /// An announced end of a node is `NodeInterrupted`, which no agent can provoke.
-const REASONS: [Reason; 8] = [
+const REASONS: [Reason; 9] = [
     Reason::SimulationCrashed,
+    Reason::EvaluatorFailed,
     Reason::ResultsNotStored,
     Reason::JobFailed,
     Reason::CannotStart,
@@ -310,10 +314,6 @@ const REASONS: [Reason; 8] = [
     Reason::DiskFull,
     Reason::ImagePull,
 ];
-
-/// Added to the words of a failure that gets no further Job because of the rule.
-const NO_ROUTE: &str =
-    "The attempt had such an end before, and this Job has finished no route, so no further Job follows.";
 
 /// True if an agent can have provoked a failure.
 fn is_provoked(found: &Failure) -> bool {
@@ -330,13 +330,13 @@ pub(super) fn may_go_on(found: &Failure, before: Option<i32>, stored: i32) -> bo
 
 /// True if the rule leaves another Job after the present one.
 fn leaves_a_job(draft: &PlanBuilder<'_>, found: &Failure) -> bool {
-    may_go_on(found, draft.status.done_before, stored_routes(draft))
+    may_go_on(found, draft.status.done_before, stored_units(draft))
 }
 
 /// Notes what the next Job begins with.
 fn note_provoked(draft: &mut PlanBuilder<'_>, found: &Failure) {
     if is_provoked(found) || draft.status.done_before.is_some() {
-        draft.status.done_before = Some(stored_routes(draft));
+        draft.status.done_before = Some(stored_units(draft));
     }
 }
 
@@ -346,13 +346,17 @@ fn explained(draft: &PlanBuilder<'_>, found: Failure) -> Failure {
         return found;
     }
     Failure {
-        message: format!("{} {NO_ROUTE}", found.message),
+        message: format!(
+            "{} The attempt had such an end before, and this Job has finished no {}, so no further Job follows.",
+            found.message,
+            draft.words().unit
+        ),
         ..found
     }
 }
 
 /// Units of the attempt that are stored. What an earlier attempt has reached counts among them.
-fn stored_routes(draft: &PlanBuilder<'_>) -> i32 {
+fn stored_units(draft: &PlanBuilder<'_>) -> i32 {
     let reached = draft.status.progress.as_ref().map_or(0, |progress| progress.done);
     draft.view.report.ours().map_or(reached, |report| clamp(report.done))
 }

@@ -8,9 +8,9 @@ use leaderboard_api::text::sentence;
 use leaderboard_api::{
     EndReason, Failure, FailureClass, Reason, ReasonName, SubmissionStatus, WorkerStatus, names, reasons,
 };
-use leaderboard_contract::keys::agent_log;
+use leaderboard_contract::keys::{agent_log, host_log};
 use leaderboard_contract::report::{Outcome, RefusedResults};
-use leaderboard_contract::run::{Stop, console};
+use leaderboard_contract::run::Stop;
 use leaderboard_evaluation::{Words, words};
 
 /// A failure that is the participant's: `what` happened, in one sentence, and what each reader does about it.
@@ -101,11 +101,19 @@ pub(super) fn results_not_stored() -> Failure {
     )
 }
 
-pub(super) fn invalid_results(refused: &RefusedResults) -> Failure {
+pub(super) fn invalid_results(refused: &RefusedResults, words: &Words) -> Failure {
     let what = format!("The results cannot be used: {}", sentence(&refused.why));
     Failure {
         worker: refused.worker.map(clamp),
-        ..charged(Reason::InvalidResults, &what)
+        ..participant(Reason::InvalidResults, &what, &for_both(words.after_refused))
+    }
+}
+
+/// Results that the host's own evaluator has spoiled.
+pub(super) fn unusable_results(found: &RefusedResults) -> Failure {
+    Failure {
+        worker: found.worker.map(clamp),
+        ..infrastructure(Reason::EvaluatorFailed, &sentence(&capitalized(&found.why)))
     }
 }
 
@@ -115,7 +123,8 @@ pub(super) fn not_eligible(report: &ReportDigest, status: &SubmissionStatus) -> 
         return named_crash(report, status);
     }
     let what = format!("The run ended as {}, so its results do not count.", report.outcome);
-    charged(Reason::NotEligible, &what)
+    let next = for_both(words(status.plan.as_ref()).after_rejected);
+    participant(Reason::NotEligible, &what, &next)
 }
 
 /// Results that name a crash of the simulation. The agent writes them, and knows its score by then, so a crash that no host's container had is
@@ -136,7 +145,7 @@ fn named_crash(report: &ReportDigest, status: &SubmissionStatus) -> Failure {
         );
         return Failure {
             worker: Some(id),
-            ..charged(Reason::InvalidResults, &what)
+            ..participant(Reason::InvalidResults, &what, &for_both(words.after_refused))
         };
     }
     // One of an older operator's Pod names no pair.
@@ -189,9 +198,9 @@ pub(super) fn of_worker(worker: &WorkerStatus, cause: EndReason, status: &Submis
     };
     let failure = if let Some((reason, what)) = of_node(id, &times, (cause, node), words) {
         infrastructure(reason, &what)
-    } else if let Some(what) = of_host(cause) {
-        let what = format!("The {} of pair {id} failed {times}: {what}.", words.host);
-        infrastructure(Reason::SimulationCrashed, &what)
+    } else if let Some((reason, what)) = of_host(cause) {
+        let what = format!("The {} of {} {id} failed {times}: {what}.", words.host, words.worker);
+        infrastructure(reason, &what)
     } else {
         let (reason, what, next) = of_agent(id, &times, cause, words);
         participant(reason, &what, &next)
@@ -204,20 +213,21 @@ pub(super) fn of_worker(worker: &WorkerStatus, cause: EndReason, status: &Submis
 
 /// The node's fault: it cannot draw, or start an agent.
 fn of_node(id: i32, times: &str, (cause, node): (EndReason, Option<&str>), words: &Words) -> Option<(Reason, String)> {
-    let host = words.host;
+    let Words { host, worker, .. } = words;
     let node = node.map_or_else(|| "the node".to_owned(), |node| format!("node {node}"));
     match cause {
         EndReason::NoGPU => Some((
             Reason::NoGPU,
             format!(
-                "Pair {id} lacks a GPU on {node}, although the Leaderboard gives it one: its {host} or its agent saw none. The \
-                 {host}'s log says which."
+                "{} {id} lacks a GPU on {node}, although the Leaderboard gives it one: its {host} or its agent saw none. The \
+                 {host}'s log says which.",
+                capitalized(worker)
             ),
         )),
         EndReason::GraphicsDriverMissing => Some((
             Reason::GraphicsDriverMissing,
             format!(
-                "The {host} of pair {id} had a GPU and could not draw: the NVIDIA driver of {node} has no Vulkan/OpenGL part \
+                "The {host} of {worker} {id} had a GPU and could not draw: the NVIDIA driver of {node} has no Vulkan/OpenGL part \
                  (nvidia_icd.json)."
             ),
         )),
@@ -229,22 +239,31 @@ fn of_node(id: i32, times: &str, (cause, node): (EndReason, Option<&str>), words
         )),
         EndReason::EndedFromOutside => Some((
             Reason::JobFailed,
-            format!("The containers of pair {id} were ended from outside the Pod on {node}."),
+            format!("The containers of {worker} {id} were ended from outside the Pod on {node}."),
         )),
         _ => None,
     }
 }
 
 /// The end of the host's container, if that was the cause.
-fn of_host(cause: EndReason) -> Option<&'static str> {
-    match cause {
-        EndReason::SimulatorCrashed => Some("it crashed"),
-        EndReason::SimulatorNotReady => Some("it was not ready in time"),
-        EndReason::SimulatorSilent => Some("its server did not answer any more"),
-        EndReason::SimulatorNotStarted => Some("its container could not be started"),
-        _ => None,
-    }
+fn of_host(cause: EndReason) -> Option<(Reason, &'static str)> {
+    let (reason, what) = match cause {
+        EndReason::SimulatorCrashed => (Reason::SimulationCrashed, "it crashed"),
+        EndReason::SimulatorNotReady => (Reason::SimulationCrashed, "it was not ready in time"),
+        EndReason::SimulatorSilent => (Reason::SimulationCrashed, "its server did not answer any more"),
+        EndReason::SimulatorNotStarted => (Reason::SimulationCrashed, NOT_STARTED),
+        EndReason::EvaluatorCrashed => (Reason::EvaluatorFailed, "it ended without a final result"),
+        EndReason::EvaluatorNotReady => (
+            Reason::EvaluatorFailed,
+            "it did not listen on its port in time, or had no final result in time",
+        ),
+        EndReason::EvaluatorNotStarted => (Reason::EvaluatorFailed, NOT_STARTED),
+        _ => return None,
+    };
+    Some((reason, what))
 }
+
+const NOT_STARTED: &str = "its container could not be started";
 
 fn of_agent(id: i32, times: &str, cause: EndReason, words: &Words) -> (Reason, String, Steps) {
     let host = words.host;
@@ -274,7 +293,10 @@ fn of_agent(id: i32, times: &str, cause: EndReason, words: &Words) -> (Reason, S
         ),
         EndReason::NoProcess => (
             Reason::AgentCrashed,
-            format!("Pair {id} failed {times}: the agents left the Pod no process to start it again."),
+            format!(
+                "{} {id} failed {times}: the agents left the Pod no process to start it again.",
+                capitalized(words.worker)
+            ),
             for_both("Let the agents start fewer processes and threads, and submit again."),
         ),
         EndReason::BlamesHost => (
@@ -286,7 +308,8 @@ fn of_agent(id: i32, times: &str, cause: EndReason, words: &Words) -> (Reason, S
             Reason::AgentCrashed,
             format!("Another container of the Pod listened on the port of {host} {id}, which failed {times}."),
             for_both(&format!(
-                "Let the agents listen on no port of a {host}, and submit again."
+                "Let the agents listen on no port of {} {host}, and submit again.",
+                article(host)
             )),
         ),
         _ => (
@@ -318,7 +341,7 @@ fn in_the_log_of(agent: i32, words: &Words) -> Steps {
         hosts: of_participant(Reason::AgentCrashed).replace("<n>", &agent.to_string()),
         participant: format!(
             "Reproduce it on {} of your own, fix the agent and submit again; the challenge's hosts have its log.",
-            words.units
+            words.practice
         ),
     }
 }
@@ -355,6 +378,7 @@ fn infrastructure_for_participants(reason: Reason) -> String {
         Reason::NodeInterrupted => "The machine that ran the submission was taken away.",
         Reason::ResultsNotStored => "The results could not be stored.",
         Reason::SimulationCrashed => "The simulation crashed.",
+        Reason::EvaluatorFailed => "The challenge's evaluator failed.",
         Reason::NoGPU => "The machine that ran the submission had no GPU for it.",
         Reason::NodeCannotStart => "The machine that was to run the submission could not start it.",
         Reason::DiskFull => "The run's disk was full.",
@@ -382,10 +406,13 @@ pub(super) fn log_places(status: &SubmissionStatus, pod: Option<&PodView>) -> Ve
     let Some(pair) = super::blame::pair_with(id) else {
         return Vec::new();
     };
-    let (agent, host) = (pair.agent().to_string(), pair.host().to_string());
+    let kind = super::blame::host_of(status);
+    let (agent, host) = (pair.agent().to_string(), pair.host(kind).to_string());
     let on_node = |container: &str| pod.and_then(|pod| on_node(pod, container));
     let found = match failure.reason.known() {
-        Some(Reason::SimulationCrashed) => vec![on_node(&host), Some(stored(&host, console(pair)))],
+        Some(Reason::SimulationCrashed | Reason::EvaluatorFailed) => {
+            vec![on_node(&host), Some(stored(&host, host_log(kind, pair)))]
+        }
         Some(Reason::StartDeadline) => vec![pod.and_then(failing_before_agents).and_then(on_node)],
         Some(Reason::ResultsNotStored | Reason::JobFailed) => vec![
             on_node(names::CONTAINER_LOGCOPY),
@@ -414,6 +441,22 @@ pub(super) fn log_places(status: &SubmissionStatus, pod: Option<&PodView>) -> Ve
 fn failing_before_agents(pod: &PodView) -> Option<&str> {
     let is_failing = |c: &&ContainerView| c.is_before_agents() && c.last.as_ref().is_some_and(|l| l.exit_code != 0);
     pod.containers.iter().find(is_failing).map(|c| c.name.as_str())
+}
+
+/// Words at the beginning of a sentence.
+fn capitalized(words: &str) -> String {
+    let mut letters = words.chars();
+    let first = letters.next().map(|first| first.to_ascii_uppercase());
+    first.into_iter().chain(letters).collect()
+}
+
+/// The article before a word of a kind of evaluation.
+fn article(word: &str) -> &'static str {
+    if word.starts_with(['a', 'e', 'i', 'o', 'u']) {
+        "an"
+    } else {
+        "a"
+    }
 }
 
 /// The first worker that has not done all its work: a failure of the whole run is most likely explained by its log.

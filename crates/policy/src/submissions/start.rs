@@ -250,7 +250,9 @@ fn stage(pod: &PodView) -> &'static str {
     let ended = |name: &str| end(name).is_some_and(|last| last.exit_code == 0);
     if pod.logcopy_running {
         "images are pulled, its containers start"
-    } else if ended(names::CONTAINER_CONTENTS) {
+    } else if ended(names::CONTAINER_CONTENTS)
+        || (ended(names::CONTAINER_WORKSPACE) && pod.container(names::CONTAINER_CONTENTS).is_none())
+    {
         "logcopy starts"
     } else if ended(names::CONTAINER_WORKSPACE) {
         "contents are pulled and copied"

@@ -403,3 +403,30 @@ fn before_the_first_look_only_what_is_surely_wrong_is_shown() {
     seen.is_looked_at = true;
     assert_eq!(decide(&seen).status.observed_generation, Some(2));
 }
+
+#[test]
+fn a_track_shows_the_numbers_and_the_ranking_of_its_kind_of_evaluation() {
+    let carla = leaderboard("carla", 1, 7, "https://a", "");
+    let mut container = Leaderboard::clone(&carla);
+    container.spec.evaluation = serde_json::from_value(json!({"container": {
+        "mode": "Interactive", "image": "e", "command": ["/e"], "workers": 3,
+    }}))
+    .unwrap();
+    let score = json!({"split": "test", "metric": "error", "order": "Ascending"});
+    let own = json!({"workers": 2, "score": score});
+    container.spec.tracks[0].container = Some(serde_json::from_value(own).unwrap());
+    let shown = |board: Leaderboard| {
+        let board = Arc::new(board);
+        let mut tracks = decide(&view(&board, &[])).status.tracks;
+        serde_json::to_value(tracks.remove(0)).unwrap()
+    };
+    let track = shown(Leaderboard::clone(&carla));
+    assert_eq!(track["carla"], json!({"pairs": 4, "routes": 20, "repetitions": 1}));
+    assert_eq!(track.get("container"), None);
+    let track = shown(container);
+    assert_eq!(
+        (track.get("carla"), &track["container"]),
+        (None, &json!({"workers": 2}))
+    );
+    assert_eq!(track["ranking"], json!({"metric": "test_error", "order": "Ascending"}));
+}

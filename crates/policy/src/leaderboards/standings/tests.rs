@@ -217,3 +217,43 @@ fn an_object_is_deleted_only_when_the_standings_are_right_without_it() {
     elsewhere.spec.tracks.remove(0);
     assert!(can_spare(&elsewhere, &finished("a", 40)), "the track is gone");
 }
+
+#[test]
+fn a_track_of_an_evaluator_ranks_by_its_own_score_or_by_what_evalai_names() {
+    let board = |split: Option<&str>| {
+        let mut board = leaderboard(true, &json!([]));
+        let evaluation = json!({"container": {"mode": "Interactive", "image": "e", "command": ["/e"]}});
+        board.spec.evaluation = serde_json::from_value(evaluation).unwrap();
+        let score = json!({"split": split, "metric": "accuracy", "order": "Descending"});
+        for track in &mut board.spec.tracks {
+            track.container = Some(serde_json::from_value(json!({"score": score})).unwrap());
+        }
+        board
+    };
+    let named = || Some([(7, ranking("loss", Order::Ascending))].into_iter().collect());
+    for (name, board, named, expected) in [
+        (
+            "not asked yet",
+            board(None),
+            None,
+            ranking("accuracy", Order::Descending),
+        ),
+        ("EvalAI's", board(None), named(), ranking("loss", Order::Ascending)),
+        (
+            "its own of a split",
+            board(Some("test")),
+            None,
+            ranking("test_accuracy", Order::Descending),
+        ),
+        (
+            "EvalAI's of a split",
+            board(Some("test")),
+            named(),
+            ranking("test_loss", Order::Ascending),
+        ),
+    ] {
+        let found = ranked(&board, &board.spec.tracks[0], &named);
+        assert_eq!((found.ranking, found.lacking), (expected, None), "{name}");
+        assert_eq!(notes(&board, &named), Vec::<String>::new(), "{name}");
+    }
+}

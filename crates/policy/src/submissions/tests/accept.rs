@@ -28,7 +28,7 @@ fn a_local_submission_is_accepted_and_its_job_made_in_one_reconcile() {
     assert_eq!(status.team.unwrap().id.as_deref(), Some("t1"));
     assert_eq!(status.times.submitted, Some(Time(at(0))));
     let pinned = status.plan.unwrap();
-    assert_eq!(pinned.carla.slices, leaderboard_api::effective::slices(4, 2));
+    assert_eq!(pinned.carla().unwrap().slices, leaderboard_api::effective::slices(4, 2));
     assert_eq!((pinned.image.as_str(), pinned.resume), ("team/agent:1", false));
 }
 

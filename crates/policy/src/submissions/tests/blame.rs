@@ -4,6 +4,7 @@ use super::builders::*;
 use crate::submissions::blame::last_crash;
 use crate::view::ContainerView;
 use leaderboard_api::EndReason;
+use leaderboard_protocol::files::Host;
 
 pub(super) struct Row {
     what: &'static str,
@@ -57,8 +58,12 @@ pub(super) fn since(second: i64, mut container: ContainerView) -> ContainerView 
 }
 
 pub(super) fn check(rows: Vec<Row>) {
+    check_of(Host::Simulator, rows);
+}
+
+pub(super) fn check_of(kind: Host, rows: Vec<Row>) {
     for row in rows {
-        let judge = |second| last_crash(row.simulator.as_ref(), row.agent.as_ref(), at(second));
+        let judge = |second| last_crash(kind, row.simulator.as_ref(), row.agent.as_ref(), at(second));
         let found = match judge(120) {
             None => NoCrash,
             Some(crash) if crash.is_settled => Settled(crash.cause),
@@ -119,9 +124,7 @@ fn a_simulator_that_failed_in_the_round_is_the_cause_whatever_the_agent_reports(
 
 #[test]
 fn an_agent_whose_simulator_followed_it_is_the_cause_by_its_own_report() {
-    use EndReason::{
-        BlamesHost, CannotStart, Exited, Idle, Incomplete, OutOfMemory, PortTaken, SilentDeath, Unseen,
-    };
+    use EndReason::{BlamesHost, CannotStart, Exited, Idle, Incomplete, OutOfMemory, PortTaken, SilentDeath, Unseen};
     let killed = without_verdict(ended("agent-1", 2, "exited", 1, 100), "OOMKilled", 137);
     check(vec![
         both("exited", "peerCrashed", "exited", Exited),

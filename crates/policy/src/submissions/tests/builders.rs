@@ -412,6 +412,7 @@ pub fn report(done: u32) -> Report {
         outcome: Outcome::Running,
         stopped: None,
         refused: None,
+        unusable: None,
         warnings: Vec::new(),
         logs: None,
         results: "[]".into(),

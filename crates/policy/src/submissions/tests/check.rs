@@ -20,17 +20,15 @@ fn check() -> World {
 fn it_runs_one_route_with_one_pair_and_has_no_row() {
     let plan = check().pass_to(Pending, Reason::Preparing);
     let run = plan.status.plan.as_ref().unwrap();
-    assert_eq!(run.carla.slices, [RouteSlice { first: 0, last: 0 }]);
-    assert_eq!(
-        (run.carla.routes, run.carla.repetitions, run.run_id.as_str()),
-        (1, 1, "sub")
-    );
+    let carla = run.carla().unwrap();
+    assert_eq!(carla.slices, [RouteSlice { first: 0, last: 0 }]);
+    assert_eq!((carla.routes, carla.repetitions, run.run_id.as_str()), (1, 1, "sub"));
     assert!(creates(&plan));
     assert!(!has(&plan, |a| matches!(
         a,
         Action::SetFinalizer(true) | Action::Record(_)
     )));
-    assert_eq!(World::local().pass().status.plan.unwrap().carla.routes, 4);
+    assert_eq!(World::local().pass().status.plan.unwrap().carla().unwrap().routes, 4);
 }
 
 #[test]

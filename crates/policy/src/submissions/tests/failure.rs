@@ -6,6 +6,7 @@ use crate::submissions::failure::{at_the_end, infrastructure, invalid_results, p
 use leaderboard_api::text::sentence;
 use leaderboard_api::{Failure, FailureClass, Reason};
 use leaderboard_contract::report::RefusedResults;
+use leaderboard_evaluation::words;
 
 #[test]
 fn a_next_step_is_added_at_the_end() {
@@ -33,7 +34,7 @@ fn words_become_one_sentence() {
         assert_eq!(sentence(words), wanted);
     }
     assert!(
-        !invalid_results(&RefusedResults::new(None, "a score of NaN."))
+        !invalid_results(&RefusedResults::new(None, "a score of NaN."), words(None))
             .message
             .contains("..")
     );

@@ -146,13 +146,15 @@ fn images_follow_the_leaderboard_until_the_job_is_made_and_the_rest_is_pinned() 
     let mut world = World::local();
     world.view.turn = Turn::Wait { position: 1, eta: None };
     world.pass();
-    world.leaderboard().evaluation.carla.simulator.image = "simulator:2".into();
-    world.leaderboard().evaluation.carla.pairs = 4;
+    let carla = world.leaderboard().evaluation.carla_mut().unwrap();
+    carla.simulator.image = "simulator:2".into();
+    carla.pairs = 4;
     world.view.turn = Turn::Go;
     world.pass();
     let pinned = world.status().plan.unwrap();
-    assert_eq!(pinned.carla.simulator_image, "simulator:2");
-    assert_eq!(pinned.carla.slices.len(), 2);
+    let carla = pinned.carla().unwrap();
+    assert_eq!(carla.simulator_image, "simulator:2");
+    assert_eq!(carla.slices.len(), 2);
 }
 
 #[test]

@@ -8,7 +8,7 @@ use leaderboard_api::State::{Cancelled, Failed, Pending, Running};
 use leaderboard_contract::report::{Outcome, RefusedResults, Report};
 
 /// The places of a request, in short: `node agent-1`, `last simulator-1` for the run before, `s3 agent/agent1/leaderboard.log`.
-fn places(plan: &Plan) -> Vec<String> {
+pub(super) fn places(plan: &Plan) -> Vec<String> {
     let requests = plan.actions.iter().filter_map(|a| match a {
         Action::KeepLog { places } => Some(places),
         _ => None,

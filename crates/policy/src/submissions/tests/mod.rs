@@ -3,10 +3,12 @@
 mod accept;
 mod after;
 mod blame;
+mod blame_of_evaluators;
 mod blame_of_neither;
 mod builders;
 mod check;
 mod clock;
+mod container;
 mod crashes;
 mod disk;
 mod end;

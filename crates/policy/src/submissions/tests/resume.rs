@@ -39,9 +39,9 @@ fn the_plan_is_kept_and_the_images_renewed() {
     for mut world in [failed(), cancelled()] {
         let before = world.status().plan.unwrap();
         let spec = world.leaderboard();
-        spec.evaluation.carla.pairs = 4;
-        spec.evaluation.carla.routes = 8;
-        spec.evaluation.carla.simulator.image = "simulator:2".into();
+        let carla = spec.evaluation.carla_mut().unwrap();
+        (carla.pairs, carla.routes) = (4, 8);
+        carla.simulator.image = "simulator:2".into();
         world.submission().spec.attempt = Attempt(2);
         world.submission().spec.cancel = false;
         let plan = world.pass_to(Pending, Reason::Preparing);
@@ -62,11 +62,9 @@ fn the_plan_is_kept_and_the_images_renewed() {
         assert_eq!(evalai_updates(&plan), [EvalaiUpdate::Queued]);
         let pinned = plan.status.plan.unwrap();
         assert!(pinned.resume);
-        assert_eq!(pinned.carla.simulator_image, "simulator:2");
-        assert_eq!(
-            (pinned.carla.slices, pinned.carla.routes),
-            (before.carla.slices, before.carla.routes)
-        );
+        let (carla, before) = (pinned.carla().unwrap(), before.carla().unwrap());
+        assert_eq!(carla.simulator_image, "simulator:2");
+        assert_eq!((&carla.slices, carla.routes), (&before.slices, before.routes));
 
         world.see_job();
         world.view.pod = Some(pod(500));

@@ -104,10 +104,10 @@ fn an_edited_leaderboard_leaves_the_plan_of_a_run_alone() {
     let mut world = World::local().running();
     let before = world.status();
     let spec = world.leaderboard();
-    spec.evaluation.carla.pairs = 4;
-    spec.evaluation.carla.routes = 8;
-    spec.evaluation.carla.simulator.image = "simulator:2".into();
-    spec.evaluation.carla.contents.image = "contents:2".into();
+    let carla = spec.evaluation.carla_mut().unwrap();
+    (carla.pairs, carla.routes) = (4, 8);
+    carla.simulator.image = "simulator:2".into();
+    carla.contents.image = "contents:2".into();
     assert_eq!(world.pass().status, before);
 }
 

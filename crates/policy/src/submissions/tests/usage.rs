@@ -11,7 +11,8 @@ use leaderboard_api::{Attempt, Reason, Use};
 fn with_gpus() -> World {
     let mut world = World::local();
     let resources = json!({"limits": {"nvidia.com/gpu": "1"}});
-    world.leaderboard().evaluation.carla.simulator.resources = Some(serde_json::from_value(resources).unwrap());
+    let carla = world.leaderboard().evaluation.carla_mut().unwrap();
+    carla.simulator.resources = Some(serde_json::from_value(resources).unwrap());
     world
 }
 
