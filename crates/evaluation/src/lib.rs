@@ -131,8 +131,3 @@ pub fn of_plan(plan: &RunPlan) -> &'static dyn Evaluation {
 pub fn words(plan: Option<&RunPlan>) -> &'static Words {
     plan.map_or(&PLAIN, |plan| of_plan(plan).words())
 }
-
-/// Labels of all kinds that have their own, for a reader that does not know the kind.
-pub fn labels() -> impl Iterator<Item = &'static str> {
-    carla::labels()
-}

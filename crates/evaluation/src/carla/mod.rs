@@ -101,9 +101,3 @@ fn results_format(version: LeaderboardVersion) -> Format {
         LeaderboardVersion::V2 => Format::V2,
     }
 }
-
-/// Labels of both versions.
-pub(crate) fn labels() -> impl Iterator<Item = &'static str> {
-    let of_all = [Format::V1, Format::V2].into_iter().flat_map(metrics);
-    of_all.map(|metric| metric.name)
-}
