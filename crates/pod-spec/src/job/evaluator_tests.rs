@@ -1,4 +1,4 @@
-//! What the containers of a host's evaluation get, and what an agent must not get.
+//! Words, folders and memory of a host's evaluators and of their agents.
 
 use std::time::Duration;
 

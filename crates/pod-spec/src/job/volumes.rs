@@ -22,7 +22,7 @@ const TOKEN_SECONDS: i64 = 3600;
 /// Room in `logs` beyond what the limits on uploads and logs add up to: filling it up evicts the Pod with 1 s of grace,
 /// so those limits must be met first.
 const LOGS_MARGIN: u64 = 1 << 30;
-/// What the volumes of the private contents may hold, which have no limit of their own.
+/// Most bytes of the volumes of the private contents, which have no limit of their own.
 const CONTENTS_BYTES: u64 = 10 << 30;
 
 /// Every volume of the Pod.

@@ -1,4 +1,4 @@
-//! What an overlay may say of the Pods of a host's evaluator.
+//! An overlay over the Pods of a host's evaluator: names, and all that stays the operator's.
 
 use serde_json::{Value, json};
 

@@ -381,7 +381,7 @@ fn last_crash_of(pod: &PodView, kind: Host, id: i32, now: Timestamp) -> Option<C
     last_crash(kind, container(pod, pair.host(kind)), container(pod, pair.agent()), now)
 }
 
-/// What the hosts' containers of the workers run.
+/// The program in the hosts' containers of the workers.
 pub(super) fn host_of(status: &SubmissionStatus) -> Host {
     let plan = status.plan.as_ref();
     // Without a plan nothing is decided before it is pinned anew.
