@@ -20,6 +20,9 @@ const LOGCOPY_FOLDER: &str = "logcopy";
 /// is not empty.
 pub const KEPT_CHECKPOINT: &str = "checkpoint.json";
 
+/// In an evaluator's folder of results, which is no status folder: its result, written under another name and renamed.
+pub const RESULT: &str = "result.json";
+
 /// Rounds a pair may count. Far above any `retries.perWorker`; it bounds what a reader looks up for a folder full of forgeries.
 pub const MAX_ROUNDS: u32 = 1000;
 

@@ -1,6 +1,7 @@
 //! The command line: parsed here once into a [`Job`] that cannot hold nonsense. Called by `main`; reads and changes nothing else.
 
 use std::ffi::{OsStr, OsString};
+use std::num::NonZeroU16;
 use std::os::unix::ffi::{OsStrExt, OsStringExt};
 use std::path::PathBuf;
 use std::str::FromStr;
@@ -8,35 +9,41 @@ use std::time::Duration;
 
 use thiserror::Error;
 
-use leaderboard_protocol::files::{Member, Pair, Side};
+use leaderboard_protocol::files::{Host, Member, Pair, RESULT, Side};
 use leaderboard_protocol::graphics::Needs;
 
 pub const USAGE: &str = "\
 usage: leaderboard-runner simulator --pair N --status DIR --port P [options] -- CMD ARGS...
+       leaderboard-runner evaluator --pair N --status DIR --results DIR [options] -- CMD ARGS...
        leaderboard-runner agent --pair N --status DIR --checkpoint FILE [options] -- CMD ARGS...
+       leaderboard-runner agent --pair N --status DIR --host evaluator [options] -- CMD ARGS...
        leaderboard-runner keep --log FILE [--log-limit BYTES] -- CMD ARGS...
        leaderboard-runner --version | --help
 
-Runs CMD as one container of a simulator-agent pair and speaks the status-file protocol in DIR; `keep` runs CMD and keeps its output.
+Runs CMD as one container of a pair, which is a simulator or an evaluator and its agent, and speaks the status-file protocol in DIR; `keep`
+runs CMD and keeps its output.
 
-both:       --ready-seconds 3600   how long a server may take until its port answers
-            --grace-seconds 20     between SIGTERM and SIGKILL
+all:        --ready-seconds 3600   how long a simulator or an evaluator may take until it listens on its port
+            --grace-seconds 20     between SIGTERM and SIGKILL; 30 for an evaluator
             --peer-seconds 600     how long to wait for the other side's end of a round
             --log-limit 2147483648 bytes of output that are kept in the log
             --termination-log /dev/termination-log  where the verdict is written
             --inotify true         false: files are looked for once a second
             --root /               where devices and drivers are looked for
-simulator:  --flush-seconds 1800   how long to hold the exit until the results are stored
-            --cancel-seconds 120   the same after a cancel
-            --answer-seconds 10    how long a server may take to answer when its agent has crashed
-            --log FILE             where output is kept, too
-            --gpu any|vulkan|opengl  the server needs a GPU, and the driver for what it draws with
-            --agent-gpu false      true: the agent is to see one too; the server is not announced before its runner has looked
-            --unset A,B            variables that the server does not get
+simulator   --flush-seconds 1800   how long to hold the exit until the results are stored
+and         --cancel-seconds 120   the same after a cancel
+evaluator:  --log FILE             where output is kept, too
+            --gpu any|vulkan|opengl  CMD needs a GPU, and the driver for what it draws with
+            --agent-gpu false      true: the agent is to see one too; it is not let begin before its runner has looked
+            --unset A,B            variables that CMD does not get
+simulator:  --answer-seconds 10    how long a server may take to answer when its agent has crashed
+evaluator:  --port P               it is ready when it listens there; without one, as soon as it is started
+            --answer-seconds 600   how long it may take, after its agent's exit with code 0, until its result is complete
 agent:      --work /tmp/agent      where leaderboard.log is written
             --idle-seconds 800     no output for so long ends the command
+            --report-gpu false     true: looks for a GPU before anything else, and reports it to its host
+            --host simulator       evaluator: CMD is a plain program, without the options below
             --python-path A:B:C    put in front of the image's own PYTHONPATH
-            --report-gpu false     true: looks for a GPU before anything else, and reports it to the simulator
             --route-runs N         the pair's routes times repetitions: CMD is not started on a checkpoint that has all of them
 ";
 
@@ -69,38 +76,107 @@ pub struct Job {
 /// Settings of one side.
 #[derive(Debug, Clone, PartialEq)]
 pub enum Role {
-    Simulator {
-        port: u16,
+    Host {
+        server: Server,
         flush: Duration,
         cancel: Duration,
-        answer: Duration,
         log: Option<PathBuf>,
-        /// Driver that the server draws with, if it is to have a GPU.
+        /// Driver that the command draws with, if it is to have a GPU.
         gpu: Option<Needs>,
         /// True if its agent is to see a GPU.
         agent_gpu: bool,
-        /// Variables that the server does not get.
+        /// Variables that the command does not get.
         unset: Vec<OsString>,
     },
     Agent {
+        program: Program,
         work: PathBuf,
-        checkpoint: PathBuf,
         idle: Duration,
-        python_path: Option<OsString>,
         /// True if it reports that it sees a GPU.
         report_gpu: bool,
-        /// How many route runs its evaluator is to drive, if that is known.
+    },
+}
+
+/// What a host's container runs.
+#[derive(Debug, Clone, PartialEq)]
+pub enum Server {
+    Simulator {
+        port: u16,
+        /// Time that the server may take to answer when its agent has crashed.
+        answer: Duration,
+    },
+    Evaluator {
+        /// Port on which its agent finds it. None: its agent need not find it.
+        port: Option<u16>,
+        /// Folder of its result.
+        results: PathBuf,
+        /// Time from its agent's regular end to the complete result.
+        answer: Duration,
+    },
+}
+
+/// What an agent's container runs.
+#[derive(Debug, Clone, PartialEq)]
+pub enum Program {
+    /// It evaluates itself against a simulator, and keeps a checkpoint.
+    Driver {
+        checkpoint: PathBuf,
+        python_path: Option<OsString>,
+        /// How many route runs it is to drive, if that is known.
         route_runs: Option<u32>,
     },
+    /// An evaluator evaluates it.
+    Plain,
 }
 
 impl Job {
     pub fn member(&self) -> Member {
         let side = match self.role {
-            Role::Simulator { .. } => Side::Host,
+            Role::Host { .. } => Side::Host(self.host()),
             Role::Agent { .. } => Side::Agent,
         };
         Member { side, pair: self.pair }
+    }
+
+    /// The other container of the pair.
+    pub fn peer(&self) -> Member {
+        match self.role {
+            Role::Host { .. } => self.pair.agent(),
+            Role::Agent { .. } => self.pair.host(self.host()),
+        }
+    }
+
+    /// The file of an evaluator's result.
+    pub fn result(&self) -> Option<PathBuf> {
+        match &self.role {
+            Role::Host {
+                server: Server::Evaluator { results, .. },
+                ..
+            } => Some(results.join(RESULT)),
+            _ => None,
+        }
+    }
+
+    /// What the host's container of the pair runs.
+    pub const fn host(&self) -> Host {
+        match &self.role {
+            Role::Host {
+                server: Server::Simulator { .. },
+                ..
+            }
+            | Role::Agent {
+                program: Program::Driver { .. },
+                ..
+            } => Host::Simulator,
+            Role::Host {
+                server: Server::Evaluator { .. },
+                ..
+            }
+            | Role::Agent {
+                program: Program::Plain,
+                ..
+            } => Host::Evaluator,
+        }
     }
 }
 
@@ -129,7 +205,7 @@ pub enum Request {
 pub enum UsageError {
     #[error("no arguments")]
     Nothing,
-    #[error("unknown subcommand {0:?}: simulator, agent or keep")]
+    #[error("unknown subcommand {0:?}: simulator, evaluator, agent or keep")]
     Subcommand(OsString),
     #[error("{0} is missing")]
     Missing(&'static str),
@@ -156,7 +232,8 @@ pub fn parse(arguments: impl IntoIterator<Item = OsString>) -> Result<Request, U
     let side = match first.to_str() {
         Some("--version" | "-V") => return Ok(Request::Version),
         Some("--help" | "-h" | "help") => return Ok(Request::Help),
-        Some("simulator") => Side::Host,
+        Some("simulator") => Side::Host(Host::Simulator),
+        Some("evaluator") => Side::Host(Host::Evaluator),
         Some("agent") => Side::Agent,
         Some("keep") => return keep(arguments).map(Request::Keep),
         _ => return Err(UsageError::Subcommand(first)),
@@ -167,7 +244,7 @@ pub fn parse(arguments: impl IntoIterator<Item = OsString>) -> Result<Request, U
         pair: options.required("--pair", "a number from 1 to 999")?,
         status: options.path("--status")?,
         ready: options.seconds("--ready-seconds", 3600)?,
-        grace: options.seconds("--grace-seconds", 20)?,
+        grace: options.seconds("--grace-seconds", grace_seconds(side))?,
         peer: options.seconds("--peer-seconds", 600)?,
         log_limit: options.log_limit()?,
         termination_log: options
@@ -199,15 +276,20 @@ fn keep(mut arguments: impl Iterator<Item = OsString>) -> Result<Kept, UsageErro
     Ok(kept)
 }
 
+/// An evaluator has to write down what it knows so far.
+const fn grace_seconds(side: Side) -> u32 {
+    match side {
+        Side::Host(Host::Evaluator) => 30,
+        Side::Host(Host::Simulator) | Side::Agent => 20,
+    }
+}
+
 fn role(side: Side, options: &mut Options) -> Result<Role, UsageError> {
     Ok(match side {
-        Side::Host => Role::Simulator {
-            port: options
-                .required::<std::num::NonZeroU16>("--port", "a port from 1 to 65535")?
-                .get(),
+        Side::Host(host) => Role::Host {
+            server: server(host, options)?,
             flush: options.seconds("--flush-seconds", 1800)?,
             cancel: options.seconds("--cancel-seconds", 120)?,
-            answer: options.seconds("--answer-seconds", 10)?,
             log: options
                 .take("--log")?
                 .filter(|path| !path.is_empty())
@@ -217,14 +299,44 @@ fn role(side: Side, options: &mut Options) -> Result<Role, UsageError> {
             unset: options.list("--unset")?,
         },
         Side::Agent => Role::Agent {
+            program: program(options)?,
             work: options.take("--work")?.map_or_else(|| WORK.into(), PathBuf::from),
-            checkpoint: options.path("--checkpoint")?,
             idle: options.seconds("--idle-seconds", 800)?,
-            python_path: options.take("--python-path")?.filter(|value| !value.is_empty()),
             report_gpu: options.optional("--report-gpu", "true or false")?.unwrap_or(false),
-            route_runs: options.optional("--route-runs", "a number of routes")?,
         },
     })
+}
+
+fn server(host: Host, options: &mut Options) -> Result<Server, UsageError> {
+    let port = options.optional::<NonZeroU16>("--port", "a port from 1 to 65535")?;
+    Ok(match host {
+        Host::Simulator => Server::Simulator {
+            port: port.ok_or(UsageError::Missing("--port"))?.get(),
+            answer: options.seconds("--answer-seconds", 10)?,
+        },
+        Host::Evaluator => Server::Evaluator {
+            port: port.map(NonZeroU16::get),
+            results: options.path("--results")?,
+            answer: options.seconds("--answer-seconds", 600)?,
+        },
+    })
+}
+
+fn program(options: &mut Options) -> Result<Program, UsageError> {
+    let host = options.take("--host")?;
+    match host.as_deref().map(OsStr::as_bytes) {
+        None | Some(b"simulator") => Ok(Program::Driver {
+            checkpoint: options.path("--checkpoint")?,
+            python_path: options.take("--python-path")?.filter(|value| !value.is_empty()),
+            route_runs: options.optional("--route-runs", "a number of routes")?,
+        }),
+        Some(b"evaluator") => Ok(Program::Plain),
+        Some(_) => Err(UsageError::Invalid {
+            option: "--host",
+            value: host.unwrap_or_default(),
+            expected: "simulator or evaluator",
+        }),
+    }
 }
 
 struct Options(Vec<(String, OsString)>);
@@ -323,171 +435,4 @@ impl Options {
 }
 
 #[cfg(test)]
-mod tests {
-    use super::*;
-
-    fn parse_line(line: &str) -> Result<Request, UsageError> {
-        parse(line.split_whitespace().map(OsString::from))
-    }
-
-    fn job(line: &str) -> Job {
-        match parse_line(line).unwrap() {
-            Request::Run(job) => *job,
-            other => panic!("{other:?}"),
-        }
-    }
-
-    #[test]
-    fn a_simulator_has_its_defaults() {
-        let job = job("simulator --pair 2 --status /s --port=2100 -- ./server --pair 9 -- x");
-        assert_eq!(job.member().to_string(), "simulator-2");
-        let flush = Duration::from_mins(30);
-        assert_eq!(
-            job.role,
-            Role::Simulator {
-                port: 2100,
-                flush,
-                cancel: Duration::from_mins(2),
-                answer: Duration::from_secs(10),
-                log: None,
-                gpu: None,
-                agent_gpu: false,
-                unset: Vec::new(),
-            }
-        );
-        assert_eq!(job.termination_log, PathBuf::from("/dev/termination-log"));
-        assert_eq!((job.log_limit, job.inotify), (2 << 30, true));
-        assert_eq!(
-            [job.ready, job.grace, job.peer].map(|time| time.as_secs()),
-            [3600, 20, 600]
-        );
-        assert_eq!(job.command, ["./server", "--pair", "9", "--", "x"]);
-    }
-
-    #[test]
-    fn a_simulator_has_a_gpu_and_loses_variables() {
-        let line = "simulator --pair 1 --status /s --port 1 --gpu=vulkan --agent-gpu=true --unset=DISPLAY,XAUTHORITY --root /r -- a";
-        let job = job(line);
-        let Role::Simulator {
-            gpu, agent_gpu, unset, ..
-        } = job.role
-        else {
-            panic!("a simulator's line");
-        };
-        assert_eq!((gpu, agent_gpu, job.root), (Some(Needs::Vulkan), true, "/r".into()));
-        assert_eq!(unset, ["DISPLAY", "XAUTHORITY"]);
-    }
-
-    #[test]
-    fn an_agent_has_its_defaults_and_options() {
-        let line = "agent --pair 1 --status /s --checkpoint /w/c.json";
-        let role = |job: Job| match job.role {
-            Role::Agent {
-                work,
-                idle,
-                python_path,
-                report_gpu,
-                route_runs,
-                ..
-            } => (
-                (work, idle.as_secs(), job.log_limit),
-                python_path,
-                (report_gpu, route_runs),
-            ),
-            Role::Simulator { .. } => panic!("an agent's line"),
-        };
-        assert_eq!(
-            role(job(&format!("{line} -- a"))),
-            ((WORK.into(), 800, 2 << 30), None, (false, None))
-        );
-        let more = job(&format!(
-            "{line} --work /w --idle-seconds 3 --log-limit 9 --python-path=/a:/b --report-gpu=true --route-runs 5 -- a"
-        ));
-        assert_eq!(role(more), (("/w".into(), 3, 9), Some("/a:/b".into()), (true, Some(5))));
-    }
-
-    #[test]
-    fn each_mistake_is_named() {
-        let cases = [
-            ("", "no arguments"),
-            ("monitor", "unknown subcommand \"monitor\": simulator, agent or keep"),
-            ("simulator --status /s --port 1 -- a", "--pair is missing"),
-            (
-                "simulator --pair 0 --status /s --port 1 -- a",
-                "--pair: \"0\" is not a number from 1 to 999",
-            ),
-            (
-                "simulator --pair 1 --status /s --port 0 -- a",
-                "--port: \"0\" is not a port from 1 to 65535",
-            ),
-            (
-                "simulator --pair 1 --pair 2 --status /s --port 1 -- a",
-                "--pair is given twice",
-            ),
-            (
-                "simulator --pair 1 --status /s --port 1 --idle-seconds 3 -- a",
-                "unknown option --idle-seconds",
-            ),
-            (
-                "simulator --pair 1 --status /s --port 1 --grace-seconds -1 -- a",
-                "--grace-seconds: \"-1\" is not a number of seconds",
-            ),
-            (
-                "simulator --pair 1 --status= --port 1 -- a",
-                "--status: \"\" is not a path",
-            ),
-            ("simulator --pair 1 --status /s --port", "--port needs a value"),
-            (
-                "simulator --pair 1 --status /s --port 1 --inotify off -- a",
-                "--inotify: \"off\" is not true or false",
-            ),
-            (
-                "simulator --pair 1 --status /s --port 1 --gpu directx -- a",
-                "--gpu: \"directx\" is not any, vulkan or opengl",
-            ),
-            (
-                "simulator --pair 1 --status /s --port 1",
-                "the command after -- is missing",
-            ),
-            (
-                "simulator --pair 1 --status /s --port 1 --",
-                "the command after -- is missing",
-            ),
-            ("simulator run --pair 1", "unknown option run"),
-            ("agent --pair 1 --status /s --work /w -- a", "--checkpoint is missing"),
-        ];
-        for (line, message) in cases {
-            assert_eq!(parse_line(line).unwrap_err().to_string(), message, "{line}");
-        }
-    }
-
-    #[test]
-    fn a_command_may_be_kept_alone() {
-        let parsed = |line: &str| parse(line.split_whitespace().map(OsString::from));
-        let kept = |log_limit| Kept {
-            log: "/l/c.log".into(),
-            log_limit,
-            command: ["/bin/bash", "-c", "x"].map(OsString::from).to_vec(),
-        };
-        assert_eq!(
-            parsed("keep --log=/l/c.log -- /bin/bash -c x"),
-            Ok(Request::Keep(kept(2 << 30)))
-        );
-        assert_eq!(
-            parsed("keep --log /l/c.log --log-limit 9 -- /bin/bash -c x"),
-            Ok(Request::Keep(kept(9)))
-        );
-        assert_eq!(parsed("keep -- a"), Err(UsageError::Missing("--log")));
-        assert_eq!(parsed("keep --log=/l --"), Err(UsageError::NoCommand));
-        assert_eq!(
-            parsed("keep --log=/l --pair=1 -- a"),
-            Err(UsageError::Unknown("--pair".into()))
-        );
-    }
-
-    #[test]
-    fn version_and_help_are_asked_for() {
-        assert_eq!(parse_line("--version").unwrap(), Request::Version);
-        assert_eq!(parse_line("--help").unwrap(), Request::Help);
-    }
-}
+mod tests;

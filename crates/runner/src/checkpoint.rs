@@ -111,7 +111,7 @@ pub(crate) fn open(path: &Path) -> Result<File, Unreadable> {
 
 /// Python writes `NaN` and `Infinity` where a number is none, and reads them; JSON has neither. No number counts here, so that each is
 /// read as a 0 of the same length.
-struct PythonJson<R> {
+pub(crate) struct PythonJson<R> {
     inner: R,
     place: Place,
 }
@@ -127,7 +127,7 @@ enum Place {
 }
 
 impl<R> PythonJson<R> {
-    fn of(inner: R) -> Self {
+    pub(crate) fn of(inner: R) -> Self {
         Self {
             inner,
             place: Place::Outside,

@@ -3,19 +3,57 @@
 //!
 //! Called by `run`, which does the looking and the doing. Knows no clock, no file, no process.
 //!
+//! In each pair one side has the last word: its results are the pair's, and its peer follows it. With a simulator that is the agent, and
+//! with an evaluator the evaluator.
+//!
 //! Rounds: both sides count their own crashes and name their files with the count. A side that has not started in a round
 //! its peer has crashed in steps over it (its own crash file, no exit); one that has started is brought down. So
 //! the two counts meet again however far apart the containers restart.
 
-use leaderboard_protocol::files::Side;
 use leaderboard_protocol::verdict::{CODE_NO_PROCESS, CODE_NODE_REFUSED};
+use leaderboard_runner::args::{Program, Role, Server};
+
+/// Part of a container in its pair.
+#[derive(Debug, Clone, Copy, PartialEq, Eq)]
+pub(crate) enum Part {
+    Simulator,
+    /// A simulator's agent, which evaluates itself.
+    Driver,
+    Evaluator,
+    /// An evaluator's agent.
+    Plain,
+}
+
+impl Part {
+    pub(crate) const fn of(role: &Role) -> Self {
+        match role {
+            Role::Host { server, .. } => match server {
+                Server::Simulator { .. } => Self::Simulator,
+                Server::Evaluator { .. } => Self::Evaluator,
+            },
+            Role::Agent { program, .. } => match program {
+                Program::Driver { .. } => Self::Driver,
+                Program::Plain => Self::Plain,
+            },
+        }
+    }
+
+    pub(crate) const fn is_host(self) -> bool {
+        matches!(self, Self::Simulator | Self::Evaluator)
+    }
+
+    /// True if its results are the pair's, and its peer follows it.
+    const fn has_last_word(self) -> bool {
+        matches!(self, Self::Driver | Self::Evaluator)
+    }
+}
 
 /// How far this container has come.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 pub(crate) enum Phase {
-    /// Nothing is launched. An agent waits here for its simulator.
+    /// Nothing is launched. An agent waits here for its host.
     Opening,
-    /// A simulator's server runs; its port has not answered yet.
+    /// A host's command runs; its agent may not begin yet.
     Booting,
     /// This round's start file is written.
     Running,
@@ -24,15 +62,15 @@ pub(crate) enum Phase {
 /// The command, seen from outside.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 pub(crate) enum Child {
-    /// Not launched, or alive (and, in [`Phase::Booting`], not answering).
+    /// Not launched, or alive (and, in [`Phase::Booting`], not ready).
     Quiet,
-    /// A simulator's server that answers.
+    /// A host's command that its agent can reach.
     Ready,
     /// It ended by itself.
     Ended,
 }
 
-/// GPU of the agent, as the simulator has read it.
+/// GPU of the agent, as its host has read it.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 pub(crate) enum AgentGpu {
     /// It does not matter, or the agent's command may have begun: from then on what lies in its folder is its own word.
@@ -52,6 +90,8 @@ pub(crate) struct Seen {
     pub(crate) peer_started: bool,
     pub(crate) peer_crashed: bool,
     pub(crate) peer_done: bool,
+    /// An evaluator's result is complete, or it has refused the submission by its exit code.
+    pub(crate) has_result: bool,
     pub(crate) cancel: bool,
     /// `logcopy.done`: the final results are stored.
     pub(crate) stored: bool,
@@ -61,7 +101,7 @@ pub(crate) struct Seen {
     pub(crate) terminated: bool,
     /// The agent has printed nothing for too long.
     pub(crate) idle: bool,
-    /// The simulator's server, or the agent's simulator, is late.
+    /// What this side waits for is late: its command to be ready, its host, or the result of an evaluator whose agent is done.
     pub(crate) overdue: bool,
 }
 
@@ -80,6 +120,10 @@ pub(crate) enum Cause {
     Terminated,
     AlreadyDone,
     PeerDone,
+    /// The evaluator's result is complete.
+    HasResult,
+    /// The agent is done, and its evaluator's result was not complete in time.
+    NoResult,
     PeerCrashed,
     Cancelled,
     ChildEnded,
@@ -118,24 +162,34 @@ pub(crate) enum Action {
 }
 
 /// Next step while nothing has ended yet.
-pub(crate) fn next(side: Side, phase: Phase, seen: &Seen) -> Action {
+pub(crate) fn next(part: Part, phase: Phase, seen: &Seen) -> Action {
     if seen.terminated {
         return Action::End(Cause::Terminated);
     }
-    match (side, phase) {
-        (_, Phase::Opening) => opening(side, seen),
-        (_, Phase::Booting) => booting(seen),
-        (Side::Host, Phase::Running) => simulator_running(seen),
-        (Side::Agent, Phase::Running) => agent_running(seen),
+    match phase {
+        Phase::Opening => opening(part, seen),
+        Phase::Booting => booting(part, seen),
+        Phase::Running if part.is_host() => host_running(part, seen),
+        Phase::Running => agent_running(part, seen),
     }
 }
 
-fn opening(side: Side, seen: &Seen) -> Action {
+/// The end that the side with the last word brings about. It comes first: complete results are complete, whatever became of the other side.
+fn last_word(part: Part, seen: &Seen) -> Option<Cause> {
+    match part {
+        Part::Evaluator => seen.has_result.then_some(Cause::HasResult),
+        Part::Simulator | Part::Plain => seen.peer_done.then_some(Cause::PeerDone),
+        // Its results are judged at its end, which is soon.
+        Part::Driver => None,
+    }
+}
+
+fn opening(part: Part, seen: &Seen) -> Action {
     if seen.own_done {
         return Action::End(Cause::AlreadyDone);
     }
-    if side == Side::Host && seen.peer_done {
-        return Action::End(Cause::PeerDone);
+    if let Some(cause) = last_word(part, seen) {
+        return Action::End(cause);
     }
     if seen.own_started {
         return Action::Skip(Skip::SilentDeath);
@@ -146,17 +200,18 @@ fn opening(side: Side, seen: &Seen) -> Action {
     if seen.peer_crashed {
         return Action::Skip(Skip::CatchUp);
     }
-    match side {
-        Side::Host => Action::Launch,
-        Side::Agent if seen.peer_started => Action::Launch,
-        Side::Agent if seen.overdue => Action::End(Cause::NotReady),
-        Side::Agent => Action::Wait,
+    if part.is_host() || seen.peer_started {
+        Action::Launch
+    } else if seen.overdue {
+        Action::End(Cause::NotReady)
+    } else {
+        Action::Wait
     }
 }
 
-fn booting(seen: &Seen) -> Action {
-    if seen.peer_done {
-        Action::End(Cause::PeerDone)
+fn booting(part: Part, seen: &Seen) -> Action {
+    if let Some(cause) = last_word(part, seen) {
+        Action::End(cause)
     } else if seen.cancel || seen.stored {
         Action::End(Cause::Cancelled)
     } else if seen.agent_gpu == AgentGpu::Missing {
@@ -177,24 +232,28 @@ fn booting(seen: &Seen) -> Action {
     }
 }
 
-/// The agent's word comes first: complete results are complete, whatever became of the server.
-fn simulator_running(seen: &Seen) -> Action {
-    if seen.peer_done {
-        Action::End(Cause::PeerDone)
+/// An agent's crash comes before that of its host, which can follow from it.
+fn host_running(part: Part, seen: &Seen) -> Action {
+    if let Some(cause) = last_word(part, seen) {
+        Action::End(cause)
     } else if seen.cancel {
         Action::End(Cause::Cancelled)
     } else if seen.peer_crashed {
         Action::End(Cause::PeerCrashed)
     } else if seen.child == Child::Ended {
         Action::End(Cause::ChildEnded)
+    } else if part == Part::Evaluator && seen.peer_done && seen.overdue {
+        Action::End(Cause::NoResult)
     } else {
         Action::Wait
     }
 }
 
-/// The command's own end comes first: only then its results are judged in spite of a cancel.
-fn agent_running(seen: &Seen) -> Action {
-    if seen.child == Child::Ended {
+/// The command's own end comes early: only then its results are judged in spite of a cancel.
+fn agent_running(part: Part, seen: &Seen) -> Action {
+    if let Some(cause) = last_word(part, seen) {
+        Action::End(cause)
+    } else if seen.child == Child::Ended {
         Action::End(Cause::ChildEnded)
     } else if seen.cancel {
         Action::End(Cause::Cancelled)
@@ -248,27 +307,38 @@ pub(crate) const CODE_NOT_RESUMED: i32 = 73;
 /// The status folder cannot be written (EX_IOERR).
 pub(crate) const CODE_MUTE: i32 = 74;
 
-const SIMULATOR_DONE: Conclusion = Conclusion {
-    mark: Some(EndMark::Done),
-    hold: Hold::Flush,
-    code: CODE_OVER,
-};
+/// A regular end.
+const fn done(part: Part) -> Conclusion {
+    Conclusion {
+        mark: Some(EndMark::Done),
+        hold: match part {
+            Part::Simulator | Part::Evaluator => Hold::Flush,
+            Part::Driver => Hold::Peer,
+            // The kubelet's word that its container has ended cannot be forged, as its mark can.
+            Part::Plain => Hold::Free,
+        },
+        code: CODE_OVER,
+    }
+}
 
-/// Judges the end, once every process has ended. `complete`: the agent's checkpoint has its global record, or all its routes.
-pub(crate) fn conclude(side: Side, cause: Cause, complete: bool, seen: &Seen) -> Conclusion {
+/// Judges the end, once every process has ended. `complete`: the driver's checkpoint has its global record, or all its routes; the
+/// evaluator's result is complete; the plain program has exited with code 0.
+pub(crate) fn conclude(part: Part, cause: Cause, complete: bool, seen: &Seen) -> Conclusion {
     match cause {
         Cause::Terminated => silent(Hold::Free, CODE_TERMINATED),
         Cause::Mute => silent(Hold::Free, CODE_MUTE),
-        Cause::AlreadyDone => silent(of_host(side, Hold::Flush), CODE_OVER),
-        Cause::Cancelled => silent(of_host(side, Hold::Cancel), CODE_OVER),
-        Cause::PeerDone => SIMULATOR_DONE,
+        Cause::AlreadyDone => silent(of_host(part, Hold::Flush), CODE_OVER),
+        Cause::Cancelled => silent(of_host(part, Hold::Cancel), CODE_OVER),
+        Cause::PeerDone => done(part),
         // The agent's image may take an hour to come, and nothing that it does helps.
         Cause::NoGpu | Cause::AgentHasNoGpu | Cause::GraphicsDriverMissing => Conclusion {
             mark: Some(EndMark::Crash),
             hold: Hold::Free,
             code: CODE_NO_GRAPHICS,
         },
-        Cause::PeerCrashed
+        Cause::HasResult
+        | Cause::NoResult
+        | Cause::PeerCrashed
         | Cause::ChildEnded
         | Cause::Idle
         | Cause::NotReady
@@ -276,28 +346,27 @@ pub(crate) fn conclude(side: Side, cause: Cause, complete: bool, seen: &Seen) ->
         | Cause::PortTaken
         | Cause::CannotStart(_)
         | Cause::NodeRefused
-        | Cause::NoProcess => crashed(side, cause, complete, seen),
+        | Cause::NoProcess => crashed(part, cause, complete, seen),
     }
 }
 
-/// Judges an end that is a crash, unless the run was over or asked to end by then.
-fn crashed(side: Side, cause: Cause, complete: bool, seen: &Seen) -> Conclusion {
+/// Judges an end that is a crash, unless the results are complete, or the run was over or asked to end by then.
+fn crashed(part: Part, cause: Cause, complete: bool, seen: &Seen) -> Conclusion {
     let ran = !matches!(
         cause,
         Cause::NotReady | Cause::CannotStart(_) | Cause::NodeRefused | Cause::NoProcess
     );
-    if side == Side::Host && seen.peer_done {
-        return SIMULATOR_DONE;
-    }
-    if side == Side::Agent && ran && complete {
-        return Conclusion {
-            mark: Some(EndMark::Done),
-            hold: Hold::Peer,
-            code: CODE_OVER,
-        };
+    let is_done = match part {
+        Part::Simulator => seen.peer_done,
+        Part::Driver | Part::Evaluator => ran && complete,
+        // A command that was asked to end may well exit with code 0.
+        Part::Plain => seen.peer_done || (cause == Cause::ChildEnded && complete),
+    };
+    if is_done {
+        return done(part);
     }
     if seen.cancel {
-        return silent(of_host(side, Hold::Cancel), CODE_OVER);
+        return silent(of_host(part, Hold::Cancel), CODE_OVER);
     }
     let code = match cause {
         Cause::CannotStart(code) => code,
@@ -317,8 +386,8 @@ fn silent(hold: Hold, code: i32) -> Conclusion {
 }
 
 /// Hold of the host's side; the agent's is free.
-fn of_host(side: Side, hold: Hold) -> Hold {
-    if side == Side::Host { hold } else { Hold::Free }
+fn of_host(part: Part, hold: Hold) -> Hold {
+    if part.is_host() { hold } else { Hold::Free }
 }
 
 /// Next step while the exit is held.
@@ -331,7 +400,7 @@ pub(crate) enum Leave {
 }
 
 /// True if the container may exit. `over`: the present hold has lasted as long as it may.
-pub(crate) fn leave(side: Side, conclusion: Conclusion, seen: &Seen, over: bool) -> Leave {
+pub(crate) fn leave(part: Part, conclusion: Conclusion, seen: &Seen, over: bool) -> Leave {
     let Conclusion { hold, code, .. } = conclusion;
     let exit_or_wait = |exit, code| if exit { Leave::Exit(code) } else { Leave::Wait };
     if seen.terminated || hold == Hold::Free {
@@ -342,17 +411,19 @@ pub(crate) fn leave(side: Side, conclusion: Conclusion, seen: &Seen, over: bool)
         hold: Hold::Cancel,
         code: CODE_OVER,
     };
-    match (hold, side) {
-        (Hold::Peer, Side::Host) if seen.peer_done => Leave::Hold(SIMULATOR_DONE),
+    match hold {
+        Hold::Peer if seen.peer_done && !part.has_last_word() => Leave::Hold(done(part)),
         // Exit 0, since after another code the container would be restarted for nothing.
-        (Hold::Peer, _) if seen.stored => Leave::Exit(CODE_OVER),
-        (Hold::Peer, Side::Host) if seen.cancel => Leave::Hold(cancelled),
-        (Hold::Peer, Side::Agent) if seen.cancel => Leave::Exit(CODE_OVER),
-        (Hold::Peer, _) => exit_or_wait(seen.peer_crashed || seen.peer_done || over, code),
-        (Hold::Flush, _) if seen.cancel && !seen.stored && !over => Leave::Hold(cancelled),
-        _ => exit_or_wait(seen.stored || over, code),
+        Hold::Peer if seen.stored => Leave::Exit(CODE_OVER),
+        Hold::Peer if seen.cancel && part.is_host() => Leave::Hold(cancelled),
+        Hold::Peer if seen.cancel => Leave::Exit(CODE_OVER),
+        Hold::Peer => exit_or_wait(seen.peer_crashed || seen.peer_done || over, code),
+        Hold::Flush if seen.cancel && !seen.stored && !over => Leave::Hold(cancelled),
+        Hold::Free | Hold::Flush | Hold::Cancel => exit_or_wait(seen.stored || over, code),
     }
 }
 
 #[cfg(test)]
 mod tests;
+#[cfg(test)]
+mod walk_tests;

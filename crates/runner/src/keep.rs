@@ -26,7 +26,7 @@ const PAUSE_NANOS: u64 = 15;
 const READABLE: u32 = 0o444;
 
 /// Size, time of change and inode: by which one content of a file differs from the next.
-type Stamp = (u64, i64, i64, u64);
+pub(crate) type Stamp = (u64, i64, i64, u64);
 
 /// The keeper of one agent's checkpoint.
 #[derive(Debug)]
@@ -210,7 +210,8 @@ fn replace(target: &Path, source: File) -> Result<(), Failure> {
     copied
 }
 
-fn stamp(path: &Path) -> Option<Stamp> {
+/// The stamp of a regular file.
+pub(crate) fn stamp(path: &Path) -> Option<Stamp> {
     let metadata = fs::symlink_metadata(path).ok()?;
     let stamp = (metadata.len(), metadata.mtime(), metadata.mtime_nsec(), metadata.ino());
     metadata.is_file().then_some(stamp)

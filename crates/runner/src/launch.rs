@@ -7,6 +7,7 @@ use std::io;
 use std::path::{Path, PathBuf};
 use std::process::{Command, Stdio};
 
+use leaderboard_protocol::graphics::ADAPTER;
 use thiserror::Error;
 
 use crate::checkpoint;
@@ -14,7 +15,7 @@ use crate::decide::Cause;
 use crate::group::{self, Group};
 use crate::kernel;
 use crate::tee::Tee;
-use leaderboard_runner::args::{Job, Role};
+use leaderboard_runner::args::{Job, Program, Role, Server};
 use leaderboard_runner::expand::expand;
 use leaderboard_runner::graphics::{self, NoGraphics};
 
@@ -43,25 +44,15 @@ impl CannotLaunch {
 /// Starts the command, with the tee of its output if that is kept. `round`: crashes so far.
 pub(crate) fn launch(job: &Job, round: u32) -> Result<(Group, Option<Tee>), CannotLaunch> {
     let started = match &job.role {
-        Role::Simulator { log, .. } => {
-            let mut command = server(job)?;
+        Role::Host { log, .. } => {
+            let mut command = of_host(job, round)?;
             match log {
                 None => Group::spawn(command.stdin(no_input())).map(|group| (group, None)),
                 Some(log) => teed(command, log.clone(), job.log_limit),
             }
         }
-        Role::Agent {
-            work,
-            checkpoint,
-            python_path,
-            ..
-        } => {
-            let partial = checkpoint::read(checkpoint).is_ok_and(|found| found.partial);
-            let own = |name: &str| env::var_os(name);
-            let mut environment = vec![("RESUME", resume(own("RESUME"), round, partial))];
-            if let Some(front) = python_path {
-                environment.push(("PYTHONPATH", in_front(front, own("PYTHONPATH"))));
-            }
+        Role::Agent { work, program, .. } => {
+            let environment = of_agent(program, round);
             let words = expand_all(&job.command, &environment);
             let log = work.join("leaderboard.log");
             teed(group::command(&words, &environment), log, job.log_limit)
@@ -73,30 +64,45 @@ pub(crate) fn launch(job: &Job, round: u32) -> Result<(Group, Option<Tee>), Cann
     })
 }
 
-/// The command of a simulator's server, on its own GPU and without the screen of its image.
-fn server(job: &Job) -> Result<Command, NoGraphics> {
-    let Role::Simulator { gpu, unset, .. } = &job.role else {
-        return Ok(group::command(&job.command, &[]));
+/// The command of a host, on its own GPU and without the variables that it is not to have, such as the screen of its image. The words of
+/// a simulator stay as they are.
+fn of_host(job: &Job, round: u32) -> Result<Command, NoGraphics> {
+    let (mut words, mut environment) = (job.command.clone(), Vec::new());
+    let Role::Host { server, gpu, unset, .. } = &job.role else {
+        return Ok(group::command(&words, &environment));
     };
-    let mut command = match gpu {
-        None => group::command(&job.command, &[]),
-        Some(needs) => {
-            let adapter = graphics::adapter(&job.root, *needs, |name| env::var_os(name))?;
-            let words: Vec<OsString> = job
-                .command
-                .iter()
-                .map(|word| graphics::with_adapter(word, adapter))
-                .collect();
-            group::command(
-                &words,
-                &[(leaderboard_protocol::graphics::ADAPTER, adapter.to_string().into())],
-            )
-        }
-    };
+    if let Some(needs) = gpu {
+        let adapter = graphics::adapter(&job.root, *needs, |name| env::var_os(name))?;
+        words = words.iter().map(|word| graphics::with_adapter(word, adapter)).collect();
+        environment.push((ADAPTER, adapter.to_string().into()));
+    }
+    if let Server::Evaluator { .. } = server {
+        environment.push(("RESUME", resume(env::var_os("RESUME"), round, false)));
+        words = expand_all(&words, &environment);
+    }
+    let mut command = group::command(&words, &environment);
     for name in unset {
         command.env_remove(name);
     }
     Ok(command)
+}
+
+/// What the runner adds to the environment of an agent.
+fn of_agent(program: &Program, round: u32) -> Vec<(&'static str, OsString)> {
+    let Program::Driver {
+        checkpoint,
+        python_path,
+        ..
+    } = program
+    else {
+        return Vec::new();
+    };
+    let partial = checkpoint::read(checkpoint).is_ok_and(|found| found.partial);
+    let mut environment = vec![("RESUME", resume(env::var_os("RESUME"), round, partial))];
+    if let Some(front) = python_path {
+        environment.push(("PYTHONPATH", in_front(front, env::var_os("PYTHONPATH"))));
+    }
+    environment
 }
 
 /// Starts the command with its output in a log, too.

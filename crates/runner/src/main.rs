@@ -1,4 +1,4 @@
-//! `leaderboard-runner`: PID 1 of every simulator and agent container, and of the host's contents. Parses its arguments and lives one life (`run`).
+//! `leaderboard-runner`: PID 1 of every simulator, evaluator and agent container, and of the host's contents. Parses its arguments and lives one life (`run`).
 //!
 //! It runs inside any image: no shell, any uid, a read-only root. It has one thread and no heap growth with the output.
 
@@ -12,6 +12,7 @@ mod launch;
 mod memory;
 mod own_folder;
 mod report;
+mod result;
 mod run;
 mod server;
 mod tee;

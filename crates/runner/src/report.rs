@@ -5,39 +5,38 @@ use std::io::{ErrorKind, Write};
 use std::os::unix::fs::OpenOptionsExt;
 use std::path::Path;
 
-use leaderboard_protocol::files::Side;
 use leaderboard_protocol::verdict::{Verdict, What};
 use nix::fcntl::OFlag;
 
 use crate::checkpoint::{Checkpoint, Unreadable};
-use crate::decide::Cause;
+use crate::decide::{Cause, Part};
 use crate::group::Status;
 
 /// An end, as far as it is known.
 #[derive(Debug)]
 pub(crate) struct End<'a> {
-    pub(crate) side: Side,
+    pub(crate) part: Part,
     pub(crate) round: u32,
     pub(crate) cause: Cause,
     /// How the command ended, if it was started.
     pub(crate) status: Option<Status>,
     pub(crate) out_of_memory: bool,
-    /// The agent's checkpoint, if it was looked at.
-    pub(crate) results: Option<&'a Result<Checkpoint, Unreadable>>,
+    /// The state of its results, if they were looked at.
+    pub(crate) left: Option<String>,
     /// Error, for the causes that are errors.
     pub(crate) detail: Option<&'a str>,
 }
 
 impl<'a> End<'a> {
     /// Without what only the command and its results show.
-    pub(crate) fn of(side: Side, round: u32, cause: Cause, detail: Option<&'a str>) -> Self {
+    pub(crate) fn of(part: Part, round: u32, cause: Cause, detail: Option<&'a str>) -> Self {
         Self {
-            side,
+            part,
             round,
             cause,
             status: None,
             out_of_memory: false,
-            results: None,
+            left: None,
             detail,
         }
     }
@@ -54,9 +53,9 @@ pub(crate) fn verdict(end: &End<'_>) -> Verdict {
     if end.out_of_memory {
         why.push_str("; the kernel killed a process of this container for lack of memory");
     }
-    if let Some(results) = end.results {
+    if let Some(left) = &end.left {
         why.push_str("; ");
-        why.push_str(&results_text(results));
+        why.push_str(left);
     }
     Verdict {
         exit_code,
@@ -69,11 +68,11 @@ pub(crate) fn verdict(end: &End<'_>) -> Verdict {
 const fn what(end: &End<'_>) -> What {
     match end.cause {
         Cause::Terminated => What::Stopped,
-        Cause::AlreadyDone | Cause::PeerDone => What::Finished,
+        Cause::AlreadyDone | Cause::PeerDone | Cause::HasResult => What::Finished,
         Cause::PeerCrashed => What::PeerCrashed,
         Cause::Cancelled => What::Cancelled,
         Cause::Idle => What::Idle,
-        Cause::NotReady => What::NotReady,
+        Cause::NotReady | Cause::NoResult => What::NotReady,
         Cause::ServerSilent => What::ServerSilent,
         Cause::PortTaken => What::PortTaken,
         Cause::NoGpu | Cause::AgentHasNoGpu => What::NoGpu,
@@ -89,28 +88,25 @@ const fn what(end: &End<'_>) -> What {
 }
 
 fn reason(end: &End<'_>) -> String {
-    let of = |simulator: &str, agent: &str| if end.side == Side::Host { simulator } else { agent }.to_owned();
+    let (own, peer) = (noun(end.part), peer(end.part));
     match end.cause {
         Cause::Terminated => "the container was ended from outside".to_owned(),
-        Cause::AlreadyDone => "the pair was done before this container began".to_owned(),
-        Cause::PeerDone => "the agent is done, so the server was stopped".to_owned(),
-        Cause::PeerCrashed => of(
-            "the agent crashed, so the server was stopped",
-            "the simulator crashed, so the agent was stopped",
-        ),
+        Cause::AlreadyDone => "the worker was done before this container began".to_owned(),
+        Cause::HasResult => "the evaluation has come to its end".to_owned(),
+        Cause::NoResult => "the agent is done, and the evaluator had no complete result in time".to_owned(),
+        Cause::PeerDone => format!("the {peer} is done, so the {own} was stopped"),
+        Cause::PeerCrashed => format!("the {peer} crashed, so the {own} was stopped"),
         Cause::Cancelled => "the submission was stopped".to_owned(),
         Cause::Idle => "the agent printed nothing for too long and was stopped".to_owned(),
-        Cause::NotReady => of(
-            "the server did not answer on its port in time",
-            "the simulator was not ready in time",
-        ),
+        Cause::NotReady if end.part.is_host() => format!("the {own} did not answer on its port in time"),
+        Cause::NotReady => format!("the {peer} was not ready in time"),
         Cause::ServerSilent => "the agent crashed, and the server does not answer any more".to_owned(),
         Cause::AgentHasNoGpu => {
             "the agent's container sees no GPU (no /dev/nvidia0 or any other number), and its Leaderboard gives it one; it was not begun"
                 .to_owned()
         }
-        Cause::PortTaken => end.detail.unwrap_or("another process of the Pod has a port of the server").to_owned(),
-        Cause::CannotStart(_)
+        Cause::PortTaken
+        | Cause::CannotStart(_)
         | Cause::NodeRefused
         | Cause::NoProcess
         | Cause::Mute
@@ -123,6 +119,24 @@ fn reason(end: &End<'_>) -> String {
     }
 }
 
+/// The command of a part, in sentences.
+pub(crate) const fn noun(part: Part) -> &'static str {
+    match part {
+        Part::Simulator => "server",
+        Part::Evaluator => "evaluator",
+        Part::Driver | Part::Plain => "agent",
+    }
+}
+
+/// The other side of a part, in sentences.
+const fn peer(part: Part) -> &'static str {
+    match part {
+        Part::Driver => "simulator",
+        Part::Plain => "evaluator",
+        Part::Simulator | Part::Evaluator => "agent",
+    }
+}
+
 fn how_it_ended(status: Option<Status>) -> String {
     match status {
         Some(Status::Exited(code)) => format!("the command exited with code {code}"),
@@ -131,7 +145,8 @@ fn how_it_ended(status: Option<Status>) -> String {
     }
 }
 
-fn results_text(results: &Result<Checkpoint, Unreadable>) -> String {
+/// The state of a driver's checkpoint.
+pub(crate) fn of_checkpoint(results: &Result<Checkpoint, Unreadable>) -> String {
     match results {
         Ok(Checkpoint { complete: true, .. }) => "its results are complete".to_owned(),
         Ok(Checkpoint { driven: Some(_), .. }) => "its routes are all driven (no global record)".to_owned(),
@@ -163,12 +178,12 @@ mod tests {
     use super::*;
 
     const END: End<'_> = End {
-        side: Side::Agent,
+        part: Part::Driver,
         round: 2,
         cause: Cause::ChildEnded,
         status: Some(Status::Exited(3)),
         out_of_memory: false,
-        results: None,
+        left: None,
         detail: None,
     };
 
@@ -184,7 +199,7 @@ mod tests {
         let cases = [
             (
                 End {
-                    results: Some(&partial),
+                    left: Some(of_checkpoint(&partial)),
                     ..END
                 },
                 What::Exited,
@@ -194,7 +209,7 @@ mod tests {
                 End {
                     status: killed,
                     out_of_memory: true,
-                    results: Some(&missing),
+                    left: Some(of_checkpoint(&missing)),
                     ..END
                 },
                 What::Killed,
@@ -221,12 +236,31 @@ mod tests {
             ),
             (
                 End {
-                    side: Side::Host,
+                    part: Part::Simulator,
                     cause: Cause::NotReady,
                     ..END
                 },
                 What::NotReady,
                 "the server did not answer on its port in time",
+            ),
+            (
+                End {
+                    part: Part::Plain,
+                    cause: Cause::PeerCrashed,
+                    ..END
+                },
+                What::PeerCrashed,
+                "the evaluator crashed, so the agent was stopped",
+            ),
+            (
+                End {
+                    part: Part::Evaluator,
+                    cause: Cause::NoResult,
+                    left: Some("its result is not final".to_owned()),
+                    ..END
+                },
+                What::NotReady,
+                "the agent is done, and the evaluator had no complete result in time; its result is not final",
             ),
         ];
         for (end, what, why) in cases {

@@ -3,6 +3,7 @@
 //! All waiting is one `poll` over signals, folders and output; a look once a second stands behind it. Policy is `decide`'s.
 
 mod agent_gpu;
+mod evaluated;
 mod nothing_left;
 mod own_server;
 
@@ -10,21 +11,20 @@ use std::io;
 use std::os::fd::AsFd;
 use std::time::{Duration, Instant};
 
-use leaderboard_protocol::files::{KEPT_CHECKPOINT, MAX_ROUNDS, Mark, Member, Progress, Side, StatusFile};
+use leaderboard_protocol::files::{KEPT_CHECKPOINT, MAX_ROUNDS, Mark, Member, Progress, StatusFile};
 use leaderboard_protocol::verdict::{CODE_NODE_REFUSED, Verdict};
 use nix::errno::Errno;
 use nix::poll::{PollFd, PollFlags, PollTimeout, poll};
 use nix::sys::signal::Signal;
 
-use crate::decide::{self, Action, Cause, Child, Conclusion, EndMark, Hold, Leave, Phase, Seen, Skip};
-use crate::group::{self, Group};
+use crate::decide::{self, Action, Cause, Child, Conclusion, EndMark, Hold, Leave, Part, Phase, Seen, Skip};
+use crate::group::{self, Group, Status};
 use crate::keep::Keeper;
 use crate::launch;
-use crate::server;
 use crate::tee::Tee;
 use crate::wake::{Folders, Signals};
-use crate::{checkpoint, kernel, memory, own_folder, report, say};
-use leaderboard_runner::args::{Job, Role};
+use crate::{kernel, memory, own_folder, report, result, say};
+use leaderboard_runner::args::{Job, Program, Role};
 
 /// Behind inotify, for whatever it misses.
 const SLOW_POLL: Duration = Duration::from_secs(1);
@@ -39,7 +39,9 @@ const LAST_WAIT: Duration = Duration::from_secs(10);
 #[derive(Debug)]
 pub(crate) struct Runner {
     job: Job,
+    part: Part,
     me: Member,
+    peer: Member,
     round: u32,
     phase: Phase,
     /// When the present phase, or an agent's present round, began.
@@ -50,35 +52,45 @@ pub(crate) struct Runner {
     terminated: bool,
     group: Option<Group>,
     tee: Option<Tee>,
-    /// An agent's.
+    /// A driver's.
     keeper: Option<Keeper>,
+    /// An evaluator's.
+    result: Option<result::Watched>,
+    /// When an evaluator that runs has seen that its agent is done.
+    agent_done: Option<Instant>,
     memory_kills: u64,
-    /// A port of the server that another container has.
+    /// A port of the host's command that another container has.
     taken_port: Option<u16>,
-    /// A simulator's server has answered once.
-    has_answered: bool,
+    /// A host's command was ready once.
+    was_ready: bool,
     detail: Option<String>,
 }
 
 impl Runner {
     /// Prepares it; nothing is started or written yet.
     pub(crate) fn new(job: Job, signals: Signals) -> Self {
-        let me = job.member();
+        let (me, peer) = (job.member(), job.peer());
         let logcopy = StatusFile::Stored.folder();
         let checkpoint = match &job.role {
-            Role::Agent { checkpoint, .. } => Some(checkpoint),
-            Role::Simulator { .. } => None,
+            Role::Agent {
+                program: Program::Driver { checkpoint, .. },
+                ..
+            } => Some(checkpoint.clone()),
+            _ => None,
         };
-        let watched = checkpoint.map(std::path::PathBuf::as_path);
-        let folders = Folders::watch(&job.status, &[me.peer().to_string(), logcopy], watched, job.inotify);
+        let result = job.result();
+        let watched = checkpoint.as_deref().or(result.as_deref());
+        let folders = Folders::watch(&job.status, &[peer.to_string(), logcopy], watched, job.inotify);
         let own = job.status.join(me.to_string());
         own_folder::reopen(&own);
-        let keeper = checkpoint.map(|checkpoint| Keeper::new(checkpoint.clone(), own.join(KEPT_CHECKPOINT)));
+        let keeper = checkpoint.map(|checkpoint| Keeper::new(checkpoint, own.join(KEPT_CHECKPOINT)));
         let round = Progress::read(&job.status, me).crashes;
         let now = Instant::now();
         Self {
+            part: Part::of(&job.role),
             job,
             me,
+            peer,
             round,
             phase: Phase::Opening,
             since: now,
@@ -89,9 +101,11 @@ impl Runner {
             group: None,
             tee: None,
             keeper,
+            result: result.map(result::Watched::new),
+            agent_done: None,
             memory_kills: memory::kills(),
             taken_port: None,
-            has_answered: false,
+            was_ready: false,
             detail: None,
         }
     }
@@ -101,6 +115,9 @@ impl Runner {
         self.write_verdict(&Verdict::silent_death(self.round));
         let cause = self.live();
         let cause = self.of_the_server(cause);
+        if cause == Cause::HasResult {
+            self.let_end();
+        }
         self.end_processes();
         let cause = self.of_its_ports(cause);
         let conclusion = self.conclude(cause);
@@ -118,7 +135,7 @@ impl Runner {
         }
         loop {
             let seen = self.look();
-            let done = match decide::next(self.me.side, self.phase, &seen) {
+            let done = match decide::next(self.part, self.phase, &seen) {
                 Action::Wait => {
                     self.wait(self.patience());
                     Ok(())
@@ -140,44 +157,38 @@ impl Runner {
             group.reap();
         }
         let child = self.child();
-        let round = self.round;
+        let has_result = self.has_result();
+        let (me, peer, round) = (self.me, self.peer, self.round);
         let of = |member, mark| StatusFile::Of(member, mark).exists(&self.job.status);
-        let (me, peer) = (self.me, self.me.peer());
+        let peer_done = of(peer, Mark::Done);
+        let since = peer_done.then(|| self.agent_done.unwrap_or_else(Instant::now));
+        self.agent_done = since.filter(|_| self.phase == Phase::Running);
         Seen {
             own_started: of(me, Mark::Start(round)),
             own_done: of(me, Mark::Done),
             peer_started: of(peer, Mark::Start(round)),
             peer_crashed: of(peer, Mark::Crash(round)),
-            peer_done: of(peer, Mark::Done),
+            peer_done,
+            has_result,
             cancel: StatusFile::Cancel.exists(&self.job.status),
             stored: StatusFile::Stored.exists(&self.job.status),
             child,
             agent_gpu: self.agent_gpu(),
             terminated: self.terminated,
             idle: self.idle_left() == Some(Duration::ZERO),
-            overdue: self.ready_left() == Some(Duration::ZERO),
+            overdue: self.time_left() == Some(Duration::ZERO),
         }
     }
 
     fn child(&mut self) -> Child {
-        if self.group.as_ref().is_some_and(|group| group.status().is_some()) {
+        if self.status().is_some() {
             return Child::Ended;
         }
-        if let (Phase::Booting, Some((port, _)), false) = (self.phase, self.server(), self.has_answered)
-            && Instant::now() >= self.next_probe
-        {
+        if self.phase == Phase::Booting && !self.was_ready && Instant::now() >= self.next_probe {
             self.next_probe = Instant::now() + (self.since.elapsed() / 8).clamp(FIRST_PROBE, PROBE_EVERY);
-            self.has_answered = server::answers(port) && self.is_own_server(port);
+            self.was_ready = self.is_ready();
         }
-        if self.has_answered { Child::Ready } else { Child::Quiet }
-    }
-
-    /// A simulator's port, and how long its server may take to answer.
-    const fn server(&self) -> Option<(u16, Duration)> {
-        match self.job.role {
-            Role::Simulator { port, answer, .. } => Some((port, answer)),
-            Role::Agent { .. } => None,
-        }
+        if self.was_ready { Child::Ready } else { Child::Quiet }
     }
 
     /// Until the agent has been silent for too long.
@@ -193,21 +204,22 @@ impl Runner {
         Some(idle.saturating_sub(tee.last_output().elapsed()))
     }
 
-    /// Until the server, or the agent's simulator, is late. An agent grants its simulator the time to say so first.
-    fn ready_left(&self) -> Option<Duration> {
-        let limit = match (self.me.side, self.phase) {
-            (Side::Host, Phase::Booting) => self.job.ready,
-            (Side::Agent, Phase::Opening) => self.job.ready + self.job.peer,
-            _ => return None,
+    /// Until what this side waits for is late. An agent grants its host the time to say so first.
+    fn time_left(&self) -> Option<Duration> {
+        let (since, limit) = match self.phase {
+            Phase::Opening if !self.part.is_host() => (self.since, self.job.ready + self.job.peer),
+            Phase::Booting => (self.since, self.job.ready),
+            Phase::Running => (self.agent_done?, self.result_limit()?),
+            Phase::Opening => return None,
         };
-        Some(limit.saturating_sub(self.since.elapsed()))
+        Some(limit.saturating_sub(since.elapsed()))
     }
 
     fn patience(&self) -> Duration {
         let probe = self.next_probe.saturating_duration_since(Instant::now());
-        let probe = (self.phase == Phase::Booting && !self.has_answered).then_some(probe);
+        let probe = (self.phase == Phase::Booting && !self.was_ready).then_some(probe);
         let copy = self.keeper.as_ref().and_then(Keeper::pause);
-        [probe, copy, self.idle_left(), self.ready_left()]
+        [probe, copy, self.idle_left(), self.time_left()]
             .into_iter()
             .flatten()
             .fold(SLOW_POLL, Duration::min)
@@ -225,14 +237,14 @@ impl Runner {
         }
         self.round = round + 1;
         self.write_verdict(&Verdict::silent_death(self.round));
-        if self.me.side == Side::Agent {
+        if !self.part.is_host() {
             self.since = Instant::now();
         }
         Ok(())
     }
 
     fn launch(&mut self) -> Result<(), Cause> {
-        if self.me.side == Side::Agent {
+        if !self.part.is_host() {
             self.mark(Mark::Start(self.round))?;
         }
         if let Some(Err(error)) = self.keeper.as_mut().map(Keeper::prepare) {
@@ -248,10 +260,10 @@ impl Runner {
             Ok((group, tee)) => {
                 self.say("the command is started");
                 (self.group, self.tee) = (Some(group), tee);
-                self.phase = if self.me.side == Side::Agent {
-                    Phase::Running
-                } else {
+                self.phase = if self.part.is_host() {
                     Phase::Booting
+                } else {
+                    Phase::Running
                 };
                 Ok(())
             }
@@ -265,17 +277,18 @@ impl Runner {
     fn announce(&mut self) -> Result<(), Cause> {
         self.mark(Mark::Start(self.round))?;
         self.say(&format!(
-            "the server answers after {:.1} s",
+            "the {} is ready after {:.1} s",
+            report::noun(self.part),
             self.since.elapsed().as_secs_f64()
         ));
         self.phase = Phase::Running;
         Ok(())
     }
 
-    /// Nobody crashes so often: an agent has made the files itself, and its simulator must not answer for it.
+    /// Nobody crashes so often: an agent has made the files itself, and its host must not answer for it.
     fn too_many_crashes(&mut self) -> Cause {
-        let of_peer = StatusFile::Of(self.me.peer(), Mark::Crash(MAX_ROUNDS - 1));
-        if self.me.side == Side::Host && of_peer.exists(&self.job.status) {
+        let of_peer = StatusFile::Of(self.peer, Mark::Crash(MAX_ROUNDS - 1));
+        if self.part.is_host() && of_peer.exists(&self.job.status) {
             return Cause::PeerCrashed;
         }
         self.mute("the status folder holds more crashes than can be counted".to_owned())
@@ -350,22 +363,20 @@ impl Runner {
     fn conclude(&mut self, cause: Cause) -> Conclusion {
         let ran = self.group.is_some();
         own_folder::reopen(&self.job.status.join(self.me.to_string()));
-        let results = match &self.job.role {
-            Role::Agent { checkpoint, .. } if ran => {
-                checkpoint::make_readable(checkpoint);
-                Some(checkpoint::read(checkpoint))
-            }
-            _ => None,
+        let (complete, left) = self.results(cause);
+        // What was complete a moment ago counts only if it still is, now that nothing can change it any more.
+        let cause = match cause {
+            Cause::HasResult if !complete => Cause::ChildEnded,
+            other => other,
         };
-        let complete = matches!(&results, Some(Ok(found)) if found.complete || self.is_driven(found));
         self.report(&report::End {
-            status: self.group.as_ref().and_then(Group::status),
+            status: self.status(),
             out_of_memory: ran && memory::kills() > self.memory_kills,
-            results: results.as_ref(),
+            left,
             ..self.end(cause)
         });
         let seen = self.look();
-        self.announce_end(decide::conclude(self.me.side, cause, complete, &seen))
+        self.announce_end(decide::conclude(self.part, cause, complete, &seen))
     }
 
     /// Writes the file that belongs to the conclusion; without it nobody could rely on the conclusion.
@@ -393,7 +404,7 @@ impl Runner {
         loop {
             let left = self.hold_limit(conclusion.hold).saturating_sub(since.elapsed());
             let seen = self.look();
-            match decide::leave(self.me.side, conclusion, &seen, left.is_zero()) {
+            match decide::leave(self.part, conclusion, &seen, left.is_zero()) {
                 Leave::Exit(code) => return code,
                 Leave::Wait => self.wait(left.min(SLOW_POLL)),
                 Leave::Hold(next) => {
@@ -407,8 +418,8 @@ impl Runner {
     fn hold_limit(&self, hold: Hold) -> Duration {
         match (hold, &self.job.role) {
             (Hold::Peer, _) => self.job.peer,
-            (Hold::Flush, Role::Simulator { flush, .. }) => *flush,
-            (Hold::Cancel, Role::Simulator { cancel, .. }) => *cancel,
+            (Hold::Flush, Role::Host { flush, .. }) => *flush,
+            (Hold::Cancel, Role::Host { cancel, .. }) => *cancel,
             (Hold::Free | Hold::Flush | Hold::Cancel, _) => Duration::ZERO,
         }
     }
@@ -459,9 +470,14 @@ impl Runner {
         Ok(input.is_some() && descriptors.last().and_then(PollFd::any) == Some(true))
     }
 
+    /// How the command ended, if it has.
+    fn status(&self) -> Option<Status> {
+        self.group.as_ref().and_then(Group::status)
+    }
+
     /// An end of which nothing but its cause is known.
     fn end(&self, cause: Cause) -> report::End<'_> {
-        report::End::of(self.me.side, self.round, cause, self.detail.as_deref())
+        report::End::of(self.part, self.round, cause, self.detail.as_deref())
     }
 
     fn report(&self, end: &report::End<'_>) {

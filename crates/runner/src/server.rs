@@ -1,6 +1,6 @@
-//! The simulator's server as the network shows it: whose sockets have its ports, and whether it still answers. Called by `run`.
+//! A host's server, a simulator's or an evaluator's, as the network shows it: whose sockets have its ports, and whether it still answers. Called by `run`.
 //!
-//! All containers of a Pod share one network, so an agent can take the ports of any simulator. A listener counts only if its socket
+//! All containers of a Pod share one network, so an agent can take the ports of any host. A listener counts only if its socket
 //! belongs to a descendant of this process.
 
 use std::collections::HashSet;
@@ -12,7 +12,7 @@ use std::path::Path;
 use std::time::Duration;
 
 use leaderboard_protocol::files as protocol;
-use leaderboard_protocol::files::{Mark, Pair, Side, StatusFile};
+use leaderboard_protocol::files::{Host, Mark, Pair, Side, StatusFile};
 
 /// CARLA's RPC `get_episode_settings`, in MessagePack: its main loop has to answer it, and it changes nothing.
 const REQUEST: &[u8] = b"\x94\x00\x00\xb4get_episode_settings\x90";
@@ -29,13 +29,15 @@ const PORTS: u16 = 10;
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 pub(crate) enum Listener {
     Nobody,
-    /// A descendant of this process, or nothing speaks against it: the kernel hides its tables, or a descendant's files.
+    /// A descendant of this process, or nothing speaks against it: the kernel hides a descendant's files.
     Own,
     /// A process of another container.
     Foreign,
+    /// The kernel hides its tables.
+    Hidden,
 }
 
-/// All ports that the server on this port may take.
+/// All ports that a simulator's server on this port may take.
 pub(crate) fn ports_of(port: u16) -> RangeInclusive<u16> {
     port..=port.saturating_add(PORTS - 1)
 }
@@ -43,7 +45,7 @@ pub(crate) fn ports_of(port: u16) -> RangeInclusive<u16> {
 /// Finds the listener on the port.
 pub(crate) fn listener(port: u16) -> Listener {
     match sockets() {
-        None => Listener::Own,
+        None => Listener::Hidden,
         Some(sockets) => of_port(port, &listening(sockets, port..=port)),
     }
 }
@@ -167,11 +169,11 @@ fn holds(pid: u32, sockets: &HashSet<&str>) -> bool {
         .any(|link| link.to_str().is_some_and(|link| sockets.contains(link)))
 }
 
-/// True if an agent of this Pod may have begun: not before a simulator was ready. Until then a taken port is no agent's doing.
-pub(crate) fn may_agents_run(status: &Path) -> bool {
+/// True if an agent of this Pod may have begun: not before a host was ready. Until then a taken port is no agent's doing.
+pub(crate) fn may_agents_run(status: &Path, host: Host) -> bool {
     let is_ready =
-        |file: &StatusFile| matches!(file, StatusFile::Of(member, Mark::Start(_)) if member.side == Side::Host);
-    protocol::present(status, Pair::MAX).iter().any(is_ready)
+        |file: &StatusFile| matches!(file, StatusFile::Of(member, Mark::Start(_)) if member.side == Side::Host(host));
+    protocol::present(status, Pair::MAX, host).iter().any(is_ready)
 }
 
 /// True if a server answers on the port.

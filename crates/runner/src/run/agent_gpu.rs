@@ -1,7 +1,7 @@
 //! GPU of an agent that is given one of its node by its number: only its own container shows whether it sees one. For `run`.
 //!
-//! Nothing of the agent's image runs before its simulator has announced its server for the first time, and nobody else can write
-//! into its folder. So the simulator asks for the report of the agent's runner before that, believes it, and asks no more afterwards.
+//! Nothing of the agent's image runs before its host has announced its command for the first time, and nobody else can write
+//! into its folder. So the host asks for the report of the agent's runner before that, believes it, and asks no more afterwards.
 
 use leaderboard_protocol::files::{Mark, StatusFile};
 use leaderboard_runner::args::Role;
@@ -25,13 +25,13 @@ impl Runner {
         self.write(&StatusFile::Gpu(self.me, is_there))
     }
 
-    /// GPU of the agent, as a simulator has read it.
+    /// GPU of the agent, as its host has read it.
     pub(super) fn agent_gpu(&self) -> AgentGpu {
-        let is_asked = matches!(self.job.role, Role::Simulator { agent_gpu: true, .. });
+        let is_asked = matches!(self.job.role, Role::Host { agent_gpu: true, .. });
         if !is_asked || self.phase != Phase::Booting || self.has_announced() {
             return AgentGpu::NotAsked;
         }
-        let reported = |is_there| StatusFile::Gpu(self.me.peer(), is_there).exists(&self.job.status);
+        let reported = |is_there| StatusFile::Gpu(self.peer, is_there).exists(&self.job.status);
         if reported(false) {
             AgentGpu::Missing
         } else if reported(true) {

@@ -1,23 +1,48 @@
-//! Facts about a simulator's server that only the network shows, for `run`: that it is this container's own, that its ports are free, and
-//! whether it hangs.
+//! Facts about a host's command that only the network shows, for `run`: that it listens and is this container's own, that its ports are
+//! free, and whether a simulator's server hangs.
 
+use std::ops::RangeInclusive;
 use std::time::{Duration, Instant};
 
+use leaderboard_runner::args::{Role, Server};
+
 use super::Runner;
-use crate::decide::{Cause, Phase};
+use crate::decide::{Cause, Part, Phase};
+use crate::report;
 use crate::server::{self, Listener, Question};
 
-/// No client of CARLA has so many connections; a process that opens all it may exhausts the server.
+/// No honest client has so many connections; a process that opens all it may exhausts the server.
 const MANY_CONNECTIONS: usize = 256;
 
 impl Runner {
-    /// True if it is this container's server that listens. Another container's listener is no readiness.
-    pub(super) fn is_own_server(&mut self, port: u16) -> bool {
-        let listener = server::listener(port);
-        if listener == Listener::Foreign {
-            self.note_taken(port);
+    /// Ports that a host's command may take, the one that its agent knows first.
+    fn ports(&self) -> Option<RangeInclusive<u16>> {
+        let Role::Host { server, .. } = &self.job.role else {
+            return None;
+        };
+        match server {
+            Server::Simulator { port, .. } => Some(server::ports_of(*port)),
+            Server::Evaluator { port, .. } => port.map(|port| port..=port),
         }
-        listener == Listener::Own
+    }
+
+    /// True if a host's command can be reached. One without a port cannot be late. Another container's listener is no readiness.
+    pub(super) fn is_ready(&mut self) -> bool {
+        let Some(ports) = self.ports() else { return true };
+        let port = *ports.start();
+        // An evaluator may take one connection and no more, and that is its agent's.
+        if self.part == Part::Simulator && !server::answers(port) {
+            return false;
+        }
+        match server::listener(port) {
+            Listener::Own => true,
+            Listener::Hidden => server::answers(port),
+            Listener::Nobody => false,
+            Listener::Foreign => {
+                self.note_taken(port);
+                false
+            }
+        }
     }
 
     fn note_taken(&mut self, port: u16) {
@@ -26,26 +51,24 @@ impl Runner {
         }
     }
 
-    /// Cause of a simulator's end that only the network shows, while its server may live.
+    /// Cause of a host's end that only the network shows, while its command may live.
     pub(super) fn of_the_server(&mut self, cause: Cause) -> Cause {
-        let Some((port, answer)) = self.server() else {
-            return cause;
-        };
+        let Some(ports) = self.ports() else { return cause };
         match (self.phase, cause) {
             (Phase::Booting, Cause::ChildEnded | Cause::NotReady) => {
-                if let Some(port) = server::foreign_listener(server::ports_of(port)) {
+                if let Some(port) = server::foreign_listener(ports) {
                     self.note_taken(port);
                 }
                 cause
             }
             (Phase::Running, Cause::ChildEnded) => {
-                let connections = server::connections(port);
+                let connections = server::connections(*ports.start());
                 if connections >= MANY_CONNECTIONS {
                     self.detail = Some(format!("{connections} connections to its port were open"));
                 }
                 cause
             }
-            (Phase::Running, Cause::PeerCrashed) if self.is_server_silent(port, answer) => Cause::ServerSilent,
+            (Phase::Running, Cause::PeerCrashed) if self.is_server_silent() => Cause::ServerSilent,
             _ => cause,
         }
     }
@@ -53,27 +76,35 @@ impl Runner {
     /// Cause of a server's end where another container has one of its ports. Asked when its processes have ended: a port that
     /// cannot be taken then is another container's, however busy the node is.
     pub(super) fn of_its_ports(&mut self, cause: Cause) -> Cause {
-        let Some((port, _)) = self.server() else { return cause };
+        let Some(ports) = self.ports() else { return cause };
         let has_failed = self.phase == Phase::Booting && matches!(cause, Cause::ChildEnded | Cause::NotReady);
-        if !has_failed || !server::may_agents_run(&self.job.status) {
+        if !has_failed || !server::may_agents_run(&self.job.status, self.job.host()) {
             return cause;
         }
-        if let Some(port) = self.taken_port.or_else(|| server::held(server::ports_of(port))) {
+        if let Some(port) = self.taken_port.or_else(|| server::held(ports)) {
             self.note_taken(port);
             self.detail = Some(format!(
-                "another process of the Pod has port {port}, which the server needs"
+                "another process of the Pod has port {port}, which the {} needs",
+                report::noun(self.part)
             ));
             return Cause::PortTaken;
         }
         cause
     }
 
-    /// True if the server hangs. One that ends while it is asked does not.
-    fn is_server_silent(&mut self, port: u16, answer: Duration) -> bool {
+    /// True if a simulator's server hangs. One that ends while it is asked does not.
+    fn is_server_silent(&mut self) -> bool {
+        let Role::Host {
+            server: Server::Simulator { port, answer },
+            ..
+        } = self.job.role
+        else {
+            return false;
+        };
         let begin = Instant::now();
         let mut question = Question::ask(port);
         loop {
-            let has_ended = self.group.as_ref().is_none_or(|group| group.status().is_some());
+            let has_ended = self.group.is_none() || self.status().is_some();
             if has_ended || self.terminated || question.as_mut().is_ok_and(Question::is_answered) {
                 return false;
             }

@@ -13,7 +13,7 @@ use std::sync::atomic::{AtomicU32, Ordering};
 use std::sync::mpsc::{Receiver, channel};
 use std::time::{Duration, Instant};
 
-use leaderboard_protocol::files::{KEPT_CHECKPOINT, Mark, Member, Pair, Side, StatusFile};
+use leaderboard_protocol::files::{Host, KEPT_CHECKPOINT, Mark, Member, Pair, RESULT, Side, StatusFile};
 use leaderboard_protocol::verdict::Verdict;
 use nix::poll::{PollFd, PollFlags, PollTimeout, poll};
 use nix::sys::inotify::{AddWatchFlags, InitFlags, Inotify};
@@ -65,7 +65,8 @@ pub const fn member(side: Side) -> Member {
     }
 }
 
-pub const SIMULATOR: Member = member(Side::Host);
+pub const SIMULATOR: Member = member(Side::Host(Host::Simulator));
+pub const EVALUATOR: Member = member(Side::Host(Host::Evaluator));
 pub const AGENT: Member = member(Side::Agent);
 
 /// Below what the kernel gives away by itself: a Pod has its ports to itself, and here other programs connect.
@@ -89,7 +90,7 @@ fn free_ports() -> u16 {
 impl Pod {
     pub fn new() -> Self {
         let folder = tempfile::tempdir().unwrap();
-        for name in ["status", "work"] {
+        for name in ["status", "work", "results"] {
             fs::create_dir(folder.path().join(name)).unwrap();
         }
         fs::write(folder.path().join("server.py"), SERVER).unwrap();
@@ -127,6 +128,24 @@ impl Pod {
     pub fn simulator_running(&self, command: &[&str], options: &[&str]) -> Container {
         let port = format!("--port={}", self.port);
         self.start(SIMULATOR, &[&[port.as_str()], options].concat(), command, Stdio::null())
+    }
+
+    /// An evaluator that runs a shell script, which finds the path of its result in `$RESULT`. Without the option of a port it has none.
+    pub fn evaluator(&self, script: &str, options: &[&str]) -> Container {
+        let results = format!("--results={}", self.path("results").display());
+        let options = [&[results.as_str()], options].concat();
+        self.start(EVALUATOR, &options, &["sh", "-c", script], Stdio::null())
+    }
+
+    /// An evaluator's agent that runs a shell script.
+    pub fn plain(&self, script: &str, options: &[&str]) -> Container {
+        let work = format!("--work={}", self.path("work").display());
+        let options = [&["--host=evaluator", work.as_str()], options].concat();
+        self.start(AGENT, &options, &["sh", "-c", script], Stdio::null())
+    }
+
+    pub fn result(&self) -> PathBuf {
+        self.path("results").join(RESULT)
     }
 
     /// An agent that runs a shell script, which finds the path of its checkpoint in `$CHECKPOINT`.
@@ -167,6 +186,7 @@ impl Pod {
             .arg("--")
             .args(command)
             .env("CHECKPOINT", self.checkpoint())
+            .env("RESULT", self.result())
             .env_remove("RESUME")
             .envs(self.environment.iter().map(|(name, value)| (name, value)))
             .stdin(Stdio::null())

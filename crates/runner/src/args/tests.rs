@@ -1,0 +1,235 @@
+//! Command lines, and what each becomes.
+
+use super::*;
+
+const PAIR: Pair = Pair::new(3).unwrap();
+
+fn parse_line(line: &str) -> Result<Request, UsageError> {
+    parse(line.split_whitespace().map(OsString::from))
+}
+
+fn job(line: &str) -> Job {
+    match parse_line(line).unwrap() {
+        Request::Run(job) => *job,
+        other => panic!("{other:?}"),
+    }
+}
+
+#[test]
+fn a_simulator_has_its_defaults() {
+    let job = job("simulator --pair 2 --status /s --port=2100 -- ./server --pair 9 -- x");
+    assert_eq!(job.member().to_string(), "simulator-2");
+    let flush = Duration::from_mins(30);
+    assert_eq!(
+        job.role,
+        Role::Host {
+            server: Server::Simulator {
+                port: 2100,
+                answer: Duration::from_secs(10),
+            },
+            flush,
+            cancel: Duration::from_mins(2),
+            log: None,
+            gpu: None,
+            agent_gpu: false,
+            unset: Vec::new(),
+        }
+    );
+    assert_eq!(job.termination_log, PathBuf::from("/dev/termination-log"));
+    assert_eq!((job.log_limit, job.inotify), (2 << 30, true));
+    assert_eq!(
+        [job.ready, job.grace, job.peer].map(|time| time.as_secs()),
+        [3600, 20, 600]
+    );
+    assert_eq!(job.command, ["./server", "--pair", "9", "--", "x"]);
+}
+
+#[test]
+fn a_simulator_has_a_gpu_and_loses_variables() {
+    let line = "simulator --pair 1 --status /s --port 1 --gpu=vulkan --agent-gpu=true --unset=DISPLAY,XAUTHORITY --root /r -- a";
+    let job = job(line);
+    let Role::Host {
+        gpu, agent_gpu, unset, ..
+    } = job.role
+    else {
+        panic!("a simulator's line");
+    };
+    assert_eq!((gpu, agent_gpu, job.root), (Some(Needs::Vulkan), true, "/r".into()));
+    assert_eq!(unset, ["DISPLAY", "XAUTHORITY"]);
+}
+
+#[test]
+fn an_agent_has_its_defaults_and_options() {
+    let line = "agent --pair 1 --status /s --checkpoint /w/c.json";
+    let role = |job: Job| match job.role {
+        Role::Agent {
+            program:
+                Program::Driver {
+                    python_path,
+                    route_runs,
+                    ..
+                },
+            work,
+            idle,
+            report_gpu,
+        } => (
+            (work, idle.as_secs(), job.log_limit),
+            python_path,
+            (report_gpu, route_runs),
+        ),
+        _ => panic!("a driver's line"),
+    };
+    assert_eq!(
+        role(job(&format!("{line} -- a"))),
+        ((WORK.into(), 800, 2 << 30), None, (false, None))
+    );
+    let more = job(&format!(
+        "{line} --work /w --idle-seconds 3 --log-limit 9 --python-path=/a:/b --report-gpu=true --route-runs 5 -- a"
+    ));
+    assert_eq!(role(more), (("/w".into(), 3, 9), Some("/a:/b".into()), (true, Some(5))));
+}
+
+#[test]
+fn an_evaluator_has_its_defaults_and_options() {
+    let line = "evaluator --pair 3 --status /s --results /r";
+    let first = job(&format!("{line} -- a"));
+    assert_eq!(
+        (first.member(), first.peer()),
+        (PAIR.host(Host::Evaluator), PAIR.agent())
+    );
+    let expected = Server::Evaluator {
+        port: None,
+        results: "/r".into(),
+        answer: Duration::from_mins(10),
+    };
+    assert!(matches!(&first.role, Role::Host { server, .. } if *server == expected));
+    assert_eq!([first.ready, first.grace].map(|time| time.as_secs()), [3600, 30]);
+    let more = job(&format!(
+        "{line} --port=9000 --answer-seconds 7 --log /r/c.log --gpu=any -- a"
+    ));
+    let expected = Server::Evaluator {
+        port: Some(9000),
+        results: "/r".into(),
+        answer: Duration::from_secs(7),
+    };
+    assert!(matches!(more.role, Role::Host { server, log: Some(_), gpu: Some(Needs::Any), .. } if server == expected));
+}
+
+#[test]
+fn an_evaluators_agent_is_a_plain_program() {
+    let job = job("agent --pair 3 --status /s --host=evaluator --idle-seconds 3 -- a");
+    assert_eq!((job.member(), job.peer()), (PAIR.agent(), PAIR.host(Host::Evaluator)));
+    let expected = Role::Agent {
+        program: Program::Plain,
+        work: WORK.into(),
+        idle: Duration::from_secs(3),
+        report_gpu: false,
+    };
+    assert_eq!((job.role, job.grace), (expected, Duration::from_secs(20)));
+}
+
+#[test]
+fn each_mistake_is_named() {
+    let cases = [
+        ("", "no arguments"),
+        (
+            "monitor",
+            "unknown subcommand \"monitor\": simulator, evaluator, agent or keep",
+        ),
+        ("simulator --status /s --port 1 -- a", "--pair is missing"),
+        (
+            "simulator --pair 0 --status /s --port 1 -- a",
+            "--pair: \"0\" is not a number from 1 to 999",
+        ),
+        (
+            "simulator --pair 1 --status /s --port 0 -- a",
+            "--port: \"0\" is not a port from 1 to 65535",
+        ),
+        (
+            "simulator --pair 1 --pair 2 --status /s --port 1 -- a",
+            "--pair is given twice",
+        ),
+        (
+            "simulator --pair 1 --status /s --port 1 --idle-seconds 3 -- a",
+            "unknown option --idle-seconds",
+        ),
+        (
+            "simulator --pair 1 --status /s --port 1 --grace-seconds -1 -- a",
+            "--grace-seconds: \"-1\" is not a number of seconds",
+        ),
+        (
+            "simulator --pair 1 --status= --port 1 -- a",
+            "--status: \"\" is not a path",
+        ),
+        ("simulator --pair 1 --status /s --port", "--port needs a value"),
+        (
+            "simulator --pair 1 --status /s --port 1 --inotify off -- a",
+            "--inotify: \"off\" is not true or false",
+        ),
+        (
+            "simulator --pair 1 --status /s --port 1 --gpu directx -- a",
+            "--gpu: \"directx\" is not any, vulkan or opengl",
+        ),
+        (
+            "simulator --pair 1 --status /s --port 1",
+            "the command after -- is missing",
+        ),
+        (
+            "simulator --pair 1 --status /s --port 1 --",
+            "the command after -- is missing",
+        ),
+        ("simulator run --pair 1", "unknown option run"),
+        ("simulator --pair 1 --status /s -- a", "--port is missing"),
+        ("agent --pair 1 --status /s --work /w -- a", "--checkpoint is missing"),
+        ("evaluator --pair 1 --status /s --port 1 -- a", "--results is missing"),
+        (
+            "evaluator --pair 1 --status /s --results /r --port 0 -- a",
+            "--port: \"0\" is not a port from 1 to 65535",
+        ),
+        (
+            "agent --pair 1 --status /s --host evaluators -- a",
+            "--host: \"evaluators\" is not simulator or evaluator",
+        ),
+        (
+            "agent --pair 1 --status /s --host evaluator --checkpoint /c -- a",
+            "unknown option --checkpoint",
+        ),
+        (
+            "agent --pair 1 --status /s --host evaluator --route-runs 2 -- a",
+            "unknown option --route-runs",
+        ),
+    ];
+    for (line, message) in cases {
+        assert_eq!(parse_line(line).unwrap_err().to_string(), message, "{line}");
+    }
+}
+
+#[test]
+fn a_command_may_be_kept_alone() {
+    let parsed = |line: &str| parse(line.split_whitespace().map(OsString::from));
+    let kept = |log_limit| Kept {
+        log: "/l/c.log".into(),
+        log_limit,
+        command: ["/bin/bash", "-c", "x"].map(OsString::from).to_vec(),
+    };
+    assert_eq!(
+        parsed("keep --log=/l/c.log -- /bin/bash -c x"),
+        Ok(Request::Keep(kept(2 << 30)))
+    );
+    assert_eq!(
+        parsed("keep --log /l/c.log --log-limit 9 -- /bin/bash -c x"),
+        Ok(Request::Keep(kept(9)))
+    );
+    assert_eq!(parsed("keep -- a"), Err(UsageError::Missing("--log")));
+    assert_eq!(parsed("keep --log=/l --"), Err(UsageError::NoCommand));
+    assert_eq!(
+        parsed("keep --log=/l --pair=1 -- a"),
+        Err(UsageError::Unknown("--pair".into()))
+    );
+}
+
+#[test]
+fn version_and_help_are_asked_for() {
+    assert_eq!(parse_line("--version").unwrap(), Request::Version);
+    assert_eq!(parse_line("--help").unwrap(), Request::Help);
+}

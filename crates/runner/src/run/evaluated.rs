@@ -1,0 +1,91 @@
+//! Pairs whose agent a host's evaluator evaluates, and what any container has left at its end. For `run`.
+//!
+//! The evaluator's result alone ends such a pair. An agent can forge its own marks, so that its `.done` does no more than start the time
+//! that the evaluator has for the result.
+
+use std::path::Path;
+use std::time::{Duration, Instant};
+
+use leaderboard_runner::args::{Program, Role, Server};
+
+use super::Runner;
+use crate::decide::{Cause, Part};
+use crate::group::Status;
+use crate::result::{self, REFUSED, State};
+use crate::{checkpoint, report};
+
+/// Time that an evaluator with a complete result has to end by itself: what it has printed last may still be in its own buffers.
+const LAST_WORDS: Duration = Duration::from_secs(5);
+
+impl Runner {
+    /// True if an evaluator's result is complete, or if it has refused the submission by its exit code.
+    pub(super) fn has_result(&mut self) -> bool {
+        let has_refused = self.has_refused();
+        self.result
+            .as_mut()
+            .is_some_and(|result| has_refused || result.is_complete())
+    }
+
+    fn has_refused(&self) -> bool {
+        self.status() == Some(Status::Exited(REFUSED))
+    }
+
+    /// Gives an evaluator the time to end by itself.
+    pub(super) fn let_end(&mut self) {
+        let begin = Instant::now();
+        while self.group.is_some() && self.status().is_none() && !self.terminated {
+            let left = LAST_WORDS.saturating_sub(begin.elapsed());
+            if left.is_zero() {
+                return;
+            }
+            self.wait(left);
+        }
+    }
+
+    /// How long an evaluator may take for its result once its agent is done.
+    pub(super) fn result_limit(&self) -> Option<Duration> {
+        match self.job.role {
+            Role::Host {
+                server: Server::Evaluator { answer, .. },
+                ..
+            } => Some(answer),
+            _ => None,
+        }
+    }
+
+    /// Whether all is complete, and what is left, in words. Asked once every process has ended.
+    pub(super) fn results(&self, cause: Cause) -> (bool, Option<String>) {
+        match (&self.job.role, self.job.result()) {
+            (_, Some(path)) => {
+                let state = self.result(&path, cause);
+                (state.is_complete(), Some(state.to_string()))
+            }
+            (
+                Role::Agent {
+                    program: Program::Driver { checkpoint, .. },
+                    ..
+                },
+                _,
+            ) if self.group.is_some() => {
+                checkpoint::make_readable(checkpoint);
+                let found = checkpoint::read(checkpoint);
+                let complete = matches!(&found, Ok(found) if found.complete || self.is_driven(found));
+                (complete, Some(report::of_checkpoint(&found)))
+            }
+            _ => (
+                self.part == Part::Plain && self.status() == Some(Status::Exited(0)),
+                None,
+            ),
+        }
+    }
+
+    /// An evaluator that refused the submission by its exit code has written no text, so that its runner writes one.
+    fn result(&self, path: &Path, cause: Cause) -> State {
+        let state = result::read(path);
+        let was_asked = matches!(cause, Cause::Terminated | Cause::Cancelled);
+        if state.is_complete() || was_asked || !self.has_refused() {
+            return state;
+        }
+        result::refuse(path).map_or_else(State::Unwritten, |()| result::read(path))
+    }
+}
