@@ -14,7 +14,7 @@ pub const RESULTS: &str = "evalai/results.json";
 pub const STDOUT: &str = "evalai/stdout.txt";
 /// The merged file under EvalAI's name.
 pub const METADATA: &str = "evalai/metadata.json";
-/// Before the key of a refused checkpoint: no agent can put a file of its own there.
+/// Before the key of refused results: no container of a worker can put a file of its own there.
 pub const REFUSED: &str = "logcopy/refused/";
 
 /// The log of logcopy, below the root of the `logs` volume.
@@ -24,6 +24,8 @@ pub const WORKSPACE_LOG: &str = "logcopy/workspace.log";
 /// What the host's contents print; the runner writes it.
 pub const CONTENTS_LOG: &str = "contents/contents.log";
 
+/// Before the keys of the agents' files.
+pub const AGENTS: &str = "agent/";
 /// Before the keys of the simulators' files.
 pub const SIMULATORS: &str = "simulator/";
 /// Before the keys of the evaluators' files; the number of the worker follows.
@@ -33,7 +35,7 @@ pub const RESULT_FILE: &str = "result.json";
 
 /// The folder of an agent, without a slash at its end.
 pub fn agent_folder(pair: Pair) -> String {
-    format!("agent/agent{pair}")
+    format!("{AGENTS}agent{pair}")
 }
 
 /// The checkpoint of a pair.
@@ -65,6 +67,14 @@ pub fn host_log(host: Host, pair: Pair) -> String {
 /// The result that the evaluator of a pair writes.
 pub fn result_path(pair: Pair) -> String {
     format!("{}/{RESULT_FILE}", host_folder(Host::Evaluator, pair))
+}
+
+/// The results of a pair: its agent's checkpoint, or its evaluator's result.
+pub fn results_path(host: Host, pair: Pair) -> String {
+    match host {
+        Host::Simulator => checkpoint_path(pair),
+        Host::Evaluator => result_path(pair),
+    }
 }
 
 /// What the agent of a pair has printed.

@@ -1,8 +1,8 @@
-//! The sidecar that stores a run while it runs: merges the pairs' results, stores what changed, and reports.
+//! The sidecar that stores a run while it runs: merges the workers' results, stores what changed, and reports.
 //!
 //! Called by `leaderboard-operator logcopy`. Knows S3, CloudWatch and the Pod's volumes. It never ends by itself, since the
 //! kubelet would start it again: after its work it waits for SIGTERM. Results are safe before `logcopy.done` is written,
-//! and the simulators hold the Pod until then.
+//! and the host's containers hold the Pod until then.
 
 pub(super) mod describe;
 mod round;
@@ -83,9 +83,10 @@ pub async fn work(
     shutdown: impl Future<Output = ()>,
 ) -> Result<(), LogcopyError> {
     let tree = Arc::new(Tree::open(&setting.places.logs)?);
-    let results = of_plan(&setting.run.plan).results(&setting.run, Arc::clone(&tree))?;
     let plan = &setting.run.plan;
-    let quota = Quota::new(plan.storage.s3.size_limit.bytes(), plan.workers());
+    let kind = of_plan(plan);
+    let results = kind.results(&setting.run, Arc::clone(&tree))?;
+    let quota = Quota::new(plan.storage.s3.size_limit.bytes(), plan.workers(), kind.host());
     let uploader = Uploader::new(archive.clone(), Arc::clone(&tree), quota);
 
     let (end, ending) = shutdown::Stop::new();
@@ -122,9 +123,9 @@ fn ship(
     let task = setting.run.log_group().map(|group| {
         let plan = &setting.run.plan;
         let client = LogClient::of_group(aws, group);
-        let pairs = plan.workers();
+        let workers = (plan.workers(), of_plan(plan).host());
         let memory = uploader.memory();
-        let shipper = Shipper::new(client, Arc::clone(tree), &plan.run_id, pairs, memory, STREAM_A_DAY);
+        let shipper = Shipper::new(client, Arc::clone(tree), &plan.run_id, workers, memory, STREAM_A_DAY);
         tasks.stay("logs to CloudWatch", shipper.run(SHIP_PERIOD, receiver, told))
     });
     (sender, task)
@@ -257,6 +258,7 @@ mod tests {
 
     use aws_config::{BehaviorVersion, Region};
     use aws_credential_types::Credentials;
+    use leaderboard_protocol::files::Host;
 
     use super::*;
     use crate::upload::Haste;
@@ -317,7 +319,11 @@ mod tests {
         // Nothing is stored here, only how the file is read is tested.
         let nowhere = "http://127.0.0.1:9";
         let s3 = aws(nowhere).await.s3(None, Some(nowhere));
-        let mut uploader = Uploader::new(Archive::new(s3, "b", ""), Arc::clone(&tree), Quota::new(1 << 20, 1));
+        let mut uploader = Uploader::new(
+            Archive::new(s3, "b", ""),
+            Arc::clone(&tree),
+            Quota::new(1 << 20, 1, Host::Simulator),
+        );
         let (_end, ending) = shutdown::Stop::new();
         let tasks = Tasks::new(ending);
         let (mut stop, watching) = watch_stop(places.clone(), &tasks);

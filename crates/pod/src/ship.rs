@@ -17,12 +17,10 @@ use super::upload::Memory;
 use leaderboard_api::RunId;
 use leaderboard_aws::logs::{BETWEEN_BATCHES, LogClient, LogEvent, LogsError, Miss, OVERHEAD, cut};
 use leaderboard_base::backoff::Backoff;
-use leaderboard_contract::keys::agent_log;
-use leaderboard_contract::keys::{CONTENTS_LOG, OWN_LOG, WORKSPACE_LOG};
+use leaderboard_contract::keys::{CONTENTS_LOG, OWN_LOG, WORKSPACE_LOG, agent_log, host_log};
 use leaderboard_contract::report::Logs;
-use leaderboard_contract::run::console;
 use leaderboard_evidence::{Tree, TreeError};
-use leaderboard_protocol::files::Pair;
+use leaderboard_protocol::files::{Host, Pair};
 
 /// Bytes read of one file at once.
 const CHUNK: u64 = 256 << 10;
@@ -86,14 +84,14 @@ impl Shipper {
         client: LogClient,
         tree: Arc<Tree>,
         run_id: &RunId,
-        pairs: usize,
+        (pairs, host): (usize, Host),
         restored: &Memory,
         a_day: u64,
     ) -> Self {
         let agents = Pair::first(pairs).map(|pair| (agent_log(pair), format!("{run_id}/{}", pair.agent())));
-        let simulators = Pair::first(pairs).map(|pair| (console(pair), format!("{run_id}/{}", pair.host())));
+        let hosts = Pair::first(pairs).map(|pair| (host_log(host, pair), format!("{run_id}/{}", pair.host(host))));
         let streams: BTreeMap<String, String> = agents
-            .chain(simulators)
+            .chain(hosts)
             .chain([
                 (OWN_LOG.to_owned(), format!("{run_id}/logcopy")),
                 (WORKSPACE_LOG.to_owned(), format!("{run_id}/workspace")),

@@ -22,13 +22,15 @@ use super::places::{Places, Setting};
 use leaderboard_api::names::FAILURE_LOG_KEY;
 use leaderboard_api::{Attempt, Enforcement};
 use leaderboard_aws::archive::{Archive, ArchiveError};
+use leaderboard_contract::keys::host_folder;
 use leaderboard_contract::report::{MAX_BYTES, OWNER_KEY, Owner, REPORT_KEY, Report};
 use leaderboard_contract::run::{Run, STATUS_FOLDER};
 use leaderboard_contract::verdict::{WorkspaceReason, WorkspaceVerdict};
 use leaderboard_evaluation::{Refused, Results, of_plan};
 use leaderboard_evidence::{Tree, TreeError};
+use leaderboard_protocol::files::Pair;
 
-/// Folders that no mount makes. The others are the kubelet's.
+/// Folders that no mount makes, beside those of the host's containers. The others are the kubelet's.
 const FOLDERS: [&str; 4] = ["agent", STATUS_FOLDER, "logcopy", "contents"];
 /// Names the Pod whose volume this is, once it is prepared.
 const PREPARED: &str = "logcopy/.prepared";
@@ -145,7 +147,7 @@ pub async fn prepare(setting: &Setting, archive: &Archive) -> Result<(), Workspa
         path: path.display().to_string(),
         error,
     })?;
-    let tree = folders(&setting.places.logs)?;
+    let tree = folders(setting)?;
     if is_prepared(&tree, &setting.pod_uid) {
         // The node was restarted under the Pod: the volume is newer than what is stored, and the fence may be another's.
         tracing::info!("this Pod's volume is prepared already");
@@ -232,7 +234,7 @@ async fn claim(run: &Run, archive: &Archive) -> Result<Claim, WorkspaceError> {
     )))
 }
 
-/// The report of a run in which nothing has happened, and nothing but it is stored.
+/// The report of a run in which nothing has happened. No other file is stored with it.
 fn first_report(run: &Run, pod_uid: &str, results: &mut dyn Results) -> Report {
     Report {
         files: BTreeMap::new(),
@@ -255,14 +257,17 @@ fn copy_runner(places: &Places) -> Result<(), WorkspaceError> {
     })
 }
 
-fn folders(logs: &Path) -> Result<Arc<Tree>, WorkspaceError> {
+/// Makes the folders, in which a container of any user may write.
+fn folders(setting: &Setting) -> Result<Arc<Tree>, WorkspaceError> {
     let volume = |path: &str, error| WorkspaceError::Volume {
         path: path.to_owned(),
         error,
     };
-    let tree = Tree::open(logs).map_err(|error| volume("/", error.into()))?;
-    for folder in FOLDERS {
-        tree.folder(folder).map_err(|error| volume(folder, error))?;
+    let tree = Tree::open(&setting.places.logs).map_err(|error| volume("/", error.into()))?;
+    let (plan, host) = (&setting.run.plan, of_plan(&setting.run.plan).host());
+    let of_hosts = Pair::first(plan.workers()).map(|worker| host_folder(host, worker));
+    for folder in FOLDERS.map(str::to_owned).into_iter().chain(of_hosts) {
+        tree.folder(&folder).map_err(|error| volume(&folder, error))?;
     }
     Ok(Arc::new(tree))
 }

@@ -9,27 +9,26 @@ use leaderboard_evaluation::Gathered;
 use leaderboard_evaluation::judge::Ending;
 use leaderboard_evaluation::words;
 
-/// Warnings of the results' check that are reported.
+/// Most warnings of the results that are reported.
 const WARNINGS: usize = 50;
 
 /// The report of a round; its number is the caller's.
 pub fn describe(run: &Run, pod_uid: &str, gathered: &Gathered, ending: Option<&Ending>) -> Report {
     let merged = gathered.merged.as_deref();
-    let invalid = match ending {
-        Some(Ending::Invalid(refused)) => Some(refused.clone()),
-        _ => None,
+    let (stopped, invalid, unusable) = match ending {
+        Some(Ending::Stopped(stop)) => (Some(*stop), None, None),
+        Some(Ending::Invalid(refused)) => (None, Some(refused.clone()), None),
+        Some(Ending::Unusable(unusable)) => (None, None, Some(unusable)),
+        Some(Ending::Complete) | None => (None, None, None),
     };
-    let stopped = match ending {
-        Some(Ending::Stopped(stop)) => Some(*stop),
-        _ => None,
-    };
-    let counts = invalid.is_none() && gathered.is_complete();
+    let counts = invalid.is_none() && unusable.is_none() && gathered.is_complete();
     let total = gathered
         .workers
         .iter()
-        .map(|pair| pair.total)
+        .map(|worker| worker.total)
         .fold(0, u32::saturating_add);
-    let warnings = merged.map_or(&[][..], |merged| &merged.warnings);
+    let warnings = merged.map_or(&[][..], |merged| &merged.warnings).iter();
+    let warnings = warnings.chain(gathered.unusable().map(|unusable| &unusable.why));
     Report {
         schema: SCHEMA,
         submission_uid: run.uid.clone(),
@@ -46,13 +45,9 @@ pub fn describe(run: &Run, pod_uid: &str, gathered: &Gathered, ending: Option<&E
         eligible: counts && merged.is_some_and(|merged| merged.eligible),
         outcome: merged.map(|merged| merged.outcome).unwrap_or_default(),
         stopped,
-        refused: invalid
-            .or_else(|| gathered.first_refused())
-            .map(|refused| RefusedResults {
-                why: shorten(&refused.why),
-                ..refused
-            }),
-        warnings: warnings.iter().take(WARNINGS).map(|warning| shorten(warning)).collect(),
+        refused: invalid.or_else(|| gathered.first_refused()).as_ref().map(shown),
+        unusable: unusable.map(shown),
+        warnings: warnings.take(WARNINGS).map(|warning| shorten(warning)).collect(),
         logs: None,
         results: gathered.texts.results.clone(),
         partial_results: gathered.texts.partial_results.clone().filter(|_| ending.is_none()),
@@ -73,6 +68,10 @@ pub(super) fn to_bytes(report: &Report) -> Vec<u8> {
         ..report.clone()
     };
     serde_json::to_vec(&short).unwrap_or_default()
+}
+
+fn shown(results: &RefusedResults) -> RefusedResults {
+    RefusedResults::new(results.worker, shorten(&results.why))
 }
 
 fn shorten(text: &str) -> String {

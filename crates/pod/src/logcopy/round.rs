@@ -25,14 +25,14 @@ use leaderboard_contract::keys::agent_folder;
 use leaderboard_contract::report::{Logs, OWNER_KEY, Owner, REPORT_KEY, Report};
 use leaderboard_contract::run::{STATUS_FOLDER, Stop};
 use leaderboard_evaluation::judge::{Ending, Judge, Outside, Step, decide};
-use leaderboard_evaluation::{Gathered, Object, Results};
+use leaderboard_evaluation::{Gathered, Object, Results, of_plan};
 use leaderboard_evidence::Tree;
 use leaderboard_protocol::files as protocol;
-use leaderboard_protocol::files::{Mark, Pair, StatusFile};
+use leaderboard_protocol::files::{Host, Mark, Pair, StatusFile};
 
 /// Rounds of a container whose status files are stored: far more than retries a host forgives.
 const STATUS_ROUNDS: u32 = 64;
-/// Longest time for the last logs if the node is about to be taken away: with the agents' end before it and the simulators' after it,
+/// Longest time for the last logs if the node is about to be taken away: with the agents' end before it and their hosts' after it,
 /// all is stored before the controller deletes the Pod, 90 s after it has noticed.
 const LAST_LOGS_BEFORE_NODE: Duration = Duration::from_secs(40);
 /// Bytes of the owner that are read.
@@ -189,7 +189,8 @@ impl Rounds {
         let mut folders = vec![status.clone(), self.tree.path().join("agent")];
         for pair in Pair::first(self.pairs()) {
             folders.push(self.tree.path().join(agent_folder(pair)));
-            folders.extend([pair.host(), pair.agent()].map(|member| status.join(member.to_string())));
+            let members = [pair.host(self.host()), pair.agent()];
+            folders.extend(members.map(|member| status.join(member.to_string())));
         }
         // Without a watch the period is all there is.
         let _ = blocking(move || folders.iter().for_each(|folder| _ = watch.add(folder))).await;
@@ -197,6 +198,10 @@ impl Rounds {
 
     fn pairs(&self) -> usize {
         self.setting.run.plan.workers()
+    }
+
+    fn host(&self) -> Host {
+        of_plan(&self.setting.run.plan).host()
     }
 
     /// One round. Returns how long the next one may wait.
@@ -235,14 +240,14 @@ impl Rounds {
     async fn read(&self) -> Result<Found, LogcopyError> {
         let (tree, reader) = (Arc::clone(&self.tree), Arc::clone(&self.results));
         let status = self.setting.places.status();
-        let pairs = self.pairs();
+        let (pairs, host) = (self.pairs(), self.host());
         let read = move || {
             let gathered = lock(&reader).round();
-            let files = Files::find(&tree, pairs);
+            let files = Files::find(&tree, pairs, host);
             Found {
-                logs: files.wanted(&gathered.refused),
+                logs: files.wanted(&gathered.refused, host),
                 gathered,
-                statuses: protocol::present(&status, u16::try_from(pairs).unwrap_or(u16::MAX)),
+                statuses: protocol::present(&status, u16::try_from(pairs).unwrap_or(u16::MAX), host),
                 activity: files.activity,
                 left_out: files.left_out,
                 agents_fill_disk: files.agents_fill_disk,
@@ -310,7 +315,7 @@ impl Rounds {
         self.fenced = true;
         let status = self.setting.places.status();
         create(StatusFile::Cancel, &status).await;
-        // Frees the simulators from waiting for a store that will not come.
+        // Frees the host's containers from waiting for a store that will not come.
         create(StatusFile::Stored, &status).await;
     }
 
@@ -400,8 +405,8 @@ impl Rounds {
         if let Err(error) = self.store_statuses(&[StatusFile::Stored]).await {
             tracing::warn!("logcopy.done is not stored: {error}");
         }
-        if gathered.seen.iter().any(|pair| !pair.agent.done) {
-            // Complete results need no running agent.
+        if gathered.seen.iter().any(|worker| !worker.done) {
+            // Complete results need no running worker.
             create(StatusFile::Cancel, &status).await;
         }
         Ok(())
@@ -426,12 +431,13 @@ fn is_of_first_rounds(file: &StatusFile) -> bool {
     }
 }
 
-/// True for a name that can't wait for the period: a container's new status file, or its new folder. A checkpoint can wait: an agent that
-/// writes all the time must not set the pace.
+/// True for a name that can't wait for the period: a container's new status file, or its new folder. Results can wait: an agent that writes
+/// all the time must not set the pace.
 fn is_news(name: &OsStr) -> bool {
     let Some(name) = name.to_str() else { return false };
     let is_mark = [".start", ".crash", ".done"].iter().any(|mark| name.contains(mark));
-    let is_folder = ["agent", "simulator-"].iter().any(|start| name.starts_with(start)) && !name.contains('.');
+    let starts = ["agent", "simulator-", "evaluator-"];
+    let is_folder = starts.iter().any(|start| name.starts_with(start)) && !name.contains('.');
     is_mark || is_folder
 }
 

@@ -9,8 +9,9 @@ use std::fmt;
 use super::Decision;
 use crate::daily::Spent;
 use leaderboard_aws::archive::PART;
-use leaderboard_contract::keys::{EVALAI, REFUSED, known_logs};
+use leaderboard_contract::keys::{AGENTS, EVALAI, EVALUATORS, REFUSED, RESULT_FILE, SIMULATORS, known_logs};
 use leaderboard_contract::run::STATUS_FOLDER;
+use leaderboard_protocol::files::{Host, Pair};
 
 /// Objects of one run.
 pub const OBJECTS: u64 = 20_000;
@@ -28,7 +29,7 @@ pub enum Kind {
     Result,
     /// A known log; see [`known_logs`].
     Log,
-    /// Another file of the simulators or of logcopy.
+    /// Another file of the host's containers or of logcopy.
     Host,
     /// Another file of an agent, or its refused checkpoint.
     Agent,
@@ -53,7 +54,7 @@ impl fmt::Display for Limit {
             Self::Bytes(limit) => write!(
                 f,
                 "storage.s3.sizeLimit is reached: of it, {limit} bytes are for all but the known logs. Raise it, or have the \
-                 simulators and the agent write less"
+                 host's containers and the agent write less"
             ),
             Self::AgentBytes(limit) => write!(
                 f,
@@ -62,8 +63,8 @@ impl fmt::Display for Limit {
             ),
             Self::Objects(limit) => write!(
                 f,
-                "a run's limit of objects is reached: {limit} for files of simulators and agents. Have them write fewer \
-                 files"
+                "a run's limit of objects is reached: {limit} for files of the host's containers and of agents. Have them \
+                 write fewer files"
             ),
             Self::AgentObjects(limit) => write!(
                 f,
@@ -82,14 +83,14 @@ pub struct Quota {
     pub objects: u64,
     /// Allowance of one known log for a day.
     pub log_a_day: Spent,
-    /// Allowance of the agents' own files together for a day, and of the simulators' other files.
+    /// Allowance of the agents' own files together for a day, and of the other files of the host's containers.
     pub files_a_day: Spent,
     logs: BTreeSet<String>,
 }
 
 impl Quota {
     /// For a run of so many pairs that may store so many bytes.
-    pub fn new(bytes: u64, pairs: usize) -> Self {
+    pub fn new(bytes: u64, pairs: usize, host: Host) -> Self {
         let at_least = |bytes: u64, gibibytes: u64| bytes.max(gibibytes << 30);
         Self {
             bytes,
@@ -103,7 +104,7 @@ impl Quota {
                 requests: 50_000,
                 bytes: at_least(bytes.saturating_mul(4), 16),
             },
-            logs: known_logs(pairs).collect(),
+            logs: known_logs(pairs, host).collect(),
         }
     }
 
@@ -116,11 +117,15 @@ impl Quota {
             || key
                 .strip_prefix(STATUS_FOLDER)
                 .is_some_and(|rest| rest.starts_with('/'))
-            || is_checkpoint(key);
-        match key {
+            || is_checkpoint(key)
+            || is_evaluators_result(key);
+        let is_hosts = [SIMULATORS, EVALUATORS, "logcopy/"]
+            .iter()
+            .any(|folder| key.starts_with(folder));
+        match key.strip_prefix(REFUSED) {
             _ if is_result => Kind::Result,
-            _ if key.starts_with(REFUSED) => Kind::Agent,
-            _ if key.starts_with("simulator/") || key.starts_with("logcopy/") => Kind::Host,
+            Some(refused) if refused.starts_with(EVALUATORS) => Kind::Host,
+            None if is_hosts => Kind::Host,
             _ => Kind::Agent,
         }
     }
@@ -129,7 +134,7 @@ impl Quota {
     pub fn purse<'a>(&self, key: &'a str) -> (&'a str, Spent) {
         match self.kind(key) {
             Kind::Result | Kind::Log => (key, self.log_a_day),
-            Kind::Host => ("simulators", self.files_a_day),
+            Kind::Host => ("hosts", self.files_a_day),
             Kind::Agent => ("agents", self.files_a_day),
         }
     }
@@ -182,7 +187,7 @@ fn quarter(limit: u64) -> u64 {
 /// The merged file, or the checkpoint of a pair.
 fn is_checkpoint(key: &str) -> bool {
     let inner = key
-        .strip_prefix("agent/")
+        .strip_prefix(AGENTS)
         .and_then(|rest| rest.strip_suffix("agent_results.json"));
     inner.is_some_and(|inner| {
         let number = inner.strip_prefix("agent").and_then(|rest| rest.strip_suffix('/'));
@@ -190,9 +195,15 @@ fn is_checkpoint(key: &str) -> bool {
     })
 }
 
+/// The result of a worker's evaluator.
+fn is_evaluators_result(key: &str) -> bool {
+    let worker = key.strip_prefix(EVALUATORS).and_then(|rest| rest.split_once('/'));
+    worker.is_some_and(|(worker, file)| file == RESULT_FILE && worker.parse::<Pair>().is_ok())
+}
+
 /// True if a stranger's container writes it.
 fn is_agents(kind: Kind, key: &str) -> bool {
-    kind == Kind::Agent || (kind == Kind::Log && key.starts_with("agent/"))
+    kind == Kind::Agent || (kind == Kind::Log && key.starts_with(AGENTS))
 }
 
 /// Sums that count at present.
@@ -293,7 +304,7 @@ mod tests {
 
     /// Two pairs and 100 MiB: 25 for the known logs, 5 for each; 75 for the rest, of which the agents have 50.
     fn quota() -> Quota {
-        Quota::new(100 * MIB, 2)
+        Quota::new(100 * MIB, 2, Host::Simulator)
     }
 
     #[test]
@@ -316,6 +327,21 @@ mod tests {
         ];
         for (key, kind) in table {
             assert_eq!(quota().kind(key), kind, "{key}");
+        }
+        let quota = Quota::new(100 * MIB, 2, Host::Evaluator);
+        for (key, kind) in [
+            ("evaluators/2/result.json", Kind::Result),
+            ("evaluators/2/console.log", Kind::Log),
+            ("evaluators/3/console.log", Kind::Host),
+            ("evaluators/2/games.json", Kind::Host),
+            ("evaluators/2/x/result.json", Kind::Host),
+            ("evaluators/02/result.json", Kind::Host),
+            ("evaluators/result.json", Kind::Host),
+            ("logcopy/refused/evaluators/2/result.json", Kind::Host),
+            ("agent/agent2/leaderboard.log", Kind::Log),
+            ("simulator/console-1.log", Kind::Host),
+        ] {
+            assert_eq!(quota.kind(key), kind, "{key}");
         }
     }
 
@@ -346,7 +372,7 @@ mod tests {
         let quota = quota();
         let files = [("agent/agent1/a", 50 * MIB), ("simulator/a", 25 * MIB)];
         let mut ledger = quota.ledger(files.into_iter());
-        for log in known_logs(2) {
+        for log in known_logs(2, Host::Simulator) {
             assert_eq!(ledger.admit(&log, None, 4 << 40), Ok(5 * MIB), "{log}");
             ledger.take(&log, None, 5 * MIB);
         }
@@ -365,7 +391,7 @@ mod tests {
 
     #[test]
     fn empty_files_end_at_a_number_of_objects() {
-        let quota = Quota::new(1 << 40, 16);
+        let quota = Quota::new(1 << 40, 16, Host::Simulator);
         let names: Vec<String> = (0..10_000).map(|number| format!("agent/agent1/{number}")).collect();
         let mut ledger = quota.ledger(names.iter().map(|name| (name.as_str(), 0)));
         let full = Err(Limit::AgentObjects(10_000));
@@ -400,7 +426,7 @@ mod tests {
     fn each_known_log_has_a_purse_of_its_own() {
         let quota = quota();
         assert_eq!(quota.purse("simulator/console-1.log").0, "simulator/console-1.log");
-        assert_eq!(quota.purse("simulator/x").0, "simulators");
+        assert_eq!(quota.purse("simulator/x").0, "hosts");
         assert_eq!(quota.purse("agent/agent2/x").0, "agents");
         assert_eq!(quota.purse("agent/agent2/x").1.requests, 50_000);
     }

@@ -1,18 +1,21 @@
-//! Which files there are to store: those of the agents' and simulators' folders, as far as they are looked at, and the known
-//! logs in any case. Reads names and stamps only.
+//! Which files there are to store: those of the workers' folders, as far as they are looked at, and the known logs in any case. Reads
+//! names and stamps only.
 
 use std::collections::BTreeMap;
 use std::collections::hash_map::DefaultHasher;
 use std::hash::{Hash, Hasher};
 
 use super::Haste;
-use leaderboard_contract::keys::{REFUSED, agent_folder, checkpoint_path, known_logs};
+use leaderboard_contract::keys::{
+    AGENTS, EVALUATORS, REFUSED, SIMULATORS, agent_folder, host_folder, known_logs, results_path,
+};
+use leaderboard_evaluation::judge::Ending;
 use leaderboard_evidence::{Stamp, Tree};
-use leaderboard_protocol::files::Pair;
+use leaderboard_protocol::files::{Host, Pair};
 
-/// Entries read in one agent's folder.
-const AGENT_ENTRIES: usize = 5_000;
-/// Entries read in all agents' folders, and in the simulators': what is listed is in memory.
+/// Entries read in one agent's folder, and in one evaluator's.
+const WORKER_ENTRIES: usize = 5_000;
+/// Entries read in all agents' folders, and in those of the host's containers: what is listed is in memory.
 const ENTRIES: usize = 20_000;
 /// Less than that fills no volume.
 const FILLING: u64 = 512 << 20;
@@ -47,7 +50,7 @@ impl Wanted {
 pub struct Files {
     /// By path below the volume's root.
     pub files: BTreeMap<String, Stamp>,
-    /// A digest that changes when an agent writes something.
+    /// A digest that changes when an agent or an evaluator writes something.
     pub activity: u64,
     /// Entries that are no files, or beyond the limits.
     pub left_out: usize,
@@ -57,35 +60,44 @@ pub struct Files {
 
 impl Files {
     /// Finds the files that are there now.
-    pub fn find(tree: &Tree, pairs: usize) -> Self {
+    pub fn find(tree: &Tree, pairs: usize, host: Host) -> Self {
         let mut found = Self::default();
-        let each = ENTRIES.checked_div(pairs).unwrap_or(ENTRIES).min(AGENT_ENTRIES);
+        let each = ENTRIES.checked_div(pairs).unwrap_or(ENTRIES).min(WORKER_ENTRIES);
         for pair in Pair::first(pairs) {
             found.walk(tree, &agent_folder(pair), each);
         }
+        let hosts = match host {
+            // All have one folder.
+            Host::Simulator => (1, ENTRIES),
+            Host::Evaluator => (pairs, each),
+        };
+        for pair in Pair::first(hosts.0) {
+            found.walk(tree, &host_folder(host, pair), hosts.1);
+        }
         // A flood of other names must not hide them.
-        let logs = known_logs(pairs).filter_map(|path| Some((tree.file(&path).ok()??.1, path)));
-        let logs: BTreeMap<String, Stamp> = logs.map(|(stamp, path)| (path, stamp)).collect();
-        let of_agents = |(path, _): &(&String, &Stamp)| path.starts_with("agent/");
-        found.files.extend(
-            logs.iter()
-                .filter(of_agents)
-                .map(|(path, stamp)| (path.clone(), *stamp)),
-        );
+        let logs = known_logs(pairs, host).filter_map(|path| Some((tree.file(&path).ok()??.1, path)));
+        found.files.extend(logs.map(|(stamp, path)| (path, stamp)));
         let mut activity = DefaultHasher::new();
-        found.files.hash(&mut activity);
+        found
+            .below(&[AGENTS, EVALUATORS])
+            .for_each(|file| file.hash(&mut activity));
         found.activity = activity.finish();
-        found.walk(tree, "simulator", ENTRIES);
-        found.files.extend(logs);
-        let agents = found.bytes_below("agent/");
-        found.agents_fill_disk = agents >= FILLING && agents > found.bytes_below("simulator/");
+        let bytes = |folder| {
+            found
+                .below(&[folder])
+                .map(|(_, stamp)| stamp.size)
+                .fold(0, u64::saturating_add)
+        };
+        // A file with holes counts whole: an agent that makes one speaks against itself alone.
+        let agents = bytes(AGENTS);
+        let is_most = agents > bytes(SIMULATORS).max(bytes(EVALUATORS));
+        found.agents_fill_disk = agents >= FILLING && is_most;
         found
     }
 
-    /// A file with holes counts whole: an agent that makes one speaks against itself alone.
-    fn bytes_below(&self, folder: &str) -> u64 {
-        let sizes = self.files.iter().filter(|(path, _)| path.starts_with(folder));
-        sizes.map(|(_, stamp)| stamp.size).fold(0, u64::saturating_add)
+    fn below<'a>(&'a self, folders: &'a [&str]) -> impl Iterator<Item = (&'a String, &'a Stamp)> {
+        let is_below = |path: &str| folders.iter().any(|folder| path.starts_with(folder));
+        self.files.iter().filter(move |(path, _)| is_below(path))
     }
 
     fn walk(&mut self, tree: &Tree, folder: &str, limit: usize) {
@@ -94,12 +106,12 @@ impl Files {
         self.left_out = self.left_out.saturating_add(walk.left_out);
     }
 
-    /// Files to store, given why each pair's checkpoint is refused. A checkpoint is stored from memory, whole. One that
-    /// is refused is kept as evidence under another name, so that nothing is resumed from it.
-    pub fn wanted(&self, refused: &[Option<String>]) -> Vec<Wanted> {
+    /// Files to store, given why each worker's results are refused. Results are stored from memory, whole. Those that are
+    /// refused are kept as evidence under another name, so that nothing is resumed from them.
+    pub fn wanted(&self, refused: &[Option<Ending>], host: Host) -> Vec<Wanted> {
         let of_pair: BTreeMap<String, bool> = Pair::first(refused.len())
             .zip(refused)
-            .map(|(pair, refused)| (checkpoint_path(pair), refused.is_some()))
+            .map(|(pair, refused)| (results_path(host, pair), refused.is_some()))
             .collect();
         let wanted = self.files.iter().filter_map(|(path, stamp)| {
             let wanted = Wanted::new(path, *stamp, Haste::Soon);
@@ -120,6 +132,8 @@ impl Files {
 mod tests {
     use std::fs;
 
+    use leaderboard_contract::report::RefusedResults;
+
     use super::*;
 
     #[test]
@@ -129,51 +143,95 @@ mod tests {
         for made in ["agent/agent1", "simulator", "logcopy"] {
             fs::create_dir_all(at(made)).unwrap();
         }
-        for number in 0..AGENT_ENTRIES {
+        for number in 0..WORKER_ENTRIES {
             fs::write(at(&format!("agent/agent1/{number}")), "").unwrap();
         }
-        let logs: Vec<String> = known_logs(1).collect();
+        let logs: Vec<String> = known_logs(1, Host::Simulator).collect();
         for log in &logs {
             fs::write(at(log), "a line\n").unwrap();
         }
         let tree = Tree::open(folder.path()).unwrap();
-        let found = Files::find(&tree, 1);
+        let found = Files::find(&tree, 1, Host::Simulator);
         assert!(logs.iter().all(|log| found.files.contains_key(log)));
         assert!(found.left_out > 0);
         let before = found.activity;
         fs::write(at(&logs[1]), "the server's line is no activity of an agent\n").unwrap();
-        assert_eq!(Files::find(&tree, 1).activity, before);
+        assert_eq!(Files::find(&tree, 1, Host::Simulator).activity, before);
         fs::write(at(&logs[0]), "another line\n").unwrap();
-        assert_ne!(Files::find(&tree, 1).activity, before);
+        assert_ne!(Files::find(&tree, 1, Host::Simulator).activity, before);
     }
 
     #[test]
-    fn what_fills_the_volume_is_the_agents_only_if_their_folders_hold_more_than_the_simulators() {
-        let holds = |agent: u64, simulator: u64| {
+    fn each_evaluators_folder_is_looked_at_and_its_writing_is_activity() {
+        let folder = tempfile::tempdir().unwrap();
+        let put = |path: &str, text: &str| {
+            let path = folder.path().join(path);
+            fs::create_dir_all(path.parent().unwrap()).unwrap();
+            fs::write(path, text).unwrap();
+        };
+        for path in [
+            "evaluators/1/result.json",
+            "evaluators/2/a/b",
+            "evaluators/3/x",
+            "simulator/x",
+        ] {
+            put(path, "{}");
+        }
+        let tree = Tree::open(folder.path()).unwrap();
+        let found = Files::find(&tree, 2, Host::Evaluator);
+        let paths: Vec<&String> = found.files.keys().collect();
+        assert_eq!(
+            paths,
+            ["evaluators/1/result.json", "evaluators/2/a/b"],
+            "and of no other run"
+        );
+        put("evaluators/2/a/b", "more");
+        assert_ne!(Files::find(&tree, 2, Host::Evaluator).activity, found.activity);
+        for number in 0..WORKER_ENTRIES {
+            put(&format!("evaluators/1/{number}"), "");
+        }
+        put("evaluators/1/console.log", "a line\n");
+        let flooded = Files::find(&tree, 2, Host::Evaluator);
+        assert!(flooded.left_out > 0 && flooded.files.contains_key("evaluators/1/console.log"));
+        assert!(flooded.files.contains_key("evaluators/2/a/b"));
+    }
+
+    #[test]
+    fn what_fills_the_volume_is_the_agents_only_if_their_folders_hold_more_than_the_hosts() {
+        let holds = |agent: u64, of_host: u64, host: Host| {
             let dir = tempfile::tempdir().unwrap();
-            for (path, size) in [("agent/agent1/junk", agent), ("simulator/Saved.log", simulator)] {
+            let saved = host_folder(host, Pair::new(1).unwrap()) + "/saved";
+            for (path, size) in [("agent/agent1/junk", agent), (&saved, of_host)] {
                 let path = dir.path().join(path);
                 fs::create_dir_all(path.parent().unwrap()).unwrap();
                 fs::File::create(path).unwrap().set_len(size).unwrap();
             }
-            Files::find(&Tree::open(dir.path()).unwrap(), 1).agents_fill_disk
+            Files::find(&Tree::open(dir.path()).unwrap(), 1, host).agents_fill_disk
         };
-        assert!(holds(FILLING, FILLING - 1));
-        assert!(!holds(FILLING - 1, 0) && !holds(FILLING, FILLING) && !holds(FILLING, 2 * FILLING));
+        for host in [Host::Simulator, Host::Evaluator] {
+            assert!(holds(FILLING, FILLING - 1, host));
+            assert!(
+                !holds(FILLING - 1, 0, host) && !holds(FILLING, FILLING, host) && !holds(FILLING, 2 * FILLING, host)
+            );
+        }
     }
 
     #[test]
-    fn a_checkpoint_is_wanted_as_evidence_only() {
-        let files = Pair::first(2).map(checkpoint_path).chain(["agent/agent1/x".to_owned()]);
-        let found = Files {
-            files: files.map(|path| (path, Stamp::default())).collect(),
-            ..Files::default()
-        };
-        let wanted = found.wanted(&[None, Some("torn".to_owned())]);
-        let keys: Vec<&str> = wanted.iter().map(|wanted| wanted.key.as_str()).collect();
-        assert_eq!(
-            keys,
-            ["agent/agent1/x", "logcopy/refused/agent/agent2/agent_results.json"]
-        );
+    fn results_are_wanted_as_evidence_only() {
+        for (host, evidence) in [
+            (Host::Simulator, "logcopy/refused/agent/agent2/agent_results.json"),
+            (Host::Evaluator, "logcopy/refused/evaluators/2/result.json"),
+        ] {
+            let files = Pair::first(2).map(|pair| results_path(host, pair));
+            let files = files.chain(["agent/agent1/x".to_owned()]);
+            let found = Files {
+                files: files.map(|path| (path, Stamp::default())).collect(),
+                ..Files::default()
+            };
+            let refused = Ending::Invalid(RefusedResults::new(Some(2), "torn"));
+            let wanted = found.wanted(&[None, Some(refused)], host);
+            let keys: Vec<&str> = wanted.iter().map(|wanted| wanted.key.as_str()).collect();
+            assert_eq!(keys, ["agent/agent1/x", evidence]);
+        }
     }
 }

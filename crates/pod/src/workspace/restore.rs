@@ -1,4 +1,4 @@
-//! Brings back what earlier Pods of a run have stored, so that the agents go on where they were.
+//! Brings back what earlier Pods of a run have stored, so that the workers go on where they were.
 //!
 //! Called by `workspace`. What is stored came from strangers' containers: keys are checked like paths, sizes against the
 //! run's limit. Status files speak of containers that are gone; they are dropped on both sides.
@@ -18,10 +18,10 @@ use crate::upload::quota::{LEAST, Quota};
 use crate::upload::{Memory, Stored, fingerprint};
 use leaderboard_api::names::FAILURE_LOG_KEY;
 use leaderboard_aws::archive::{Archive, Listed};
-use leaderboard_contract::keys::{EVALAI, MERGED, REFUSED, checkpoint_path};
+use leaderboard_contract::keys::{EVALAI, EVALUATORS, MERGED, REFUSED, checkpoint_path};
 use leaderboard_contract::report::{OWNER_KEY, REPORT_KEY};
 use leaderboard_contract::run::{Run, STATUS_FOLDER};
-use leaderboard_evaluation::Results;
+use leaderboard_evaluation::{Results, of_plan};
 use leaderboard_evidence::{Stamp, Tree, TreeError, is_plain};
 use leaderboard_protocol::files::Pair;
 
@@ -58,7 +58,8 @@ pub async fn restore(
     }
     let limit = run.plan.storage.s3.size_limit.bytes();
     let workers = run.plan.workers();
-    let chosen = choose(listing.objects, &Quota::new(limit, workers), workers);
+    let quota = Quota::new(limit, workers, of_plan(&run.plan).host());
+    let chosen = choose(listing.objects, &quota, workers);
     let others = chosen.unknown();
     let of_workers = chosen.of_workers.len();
     for object in chosen.of_workers {
@@ -116,10 +117,16 @@ impl Chosen {
 fn choose(objects: Vec<Listed>, quota: &Quota, pairs: usize) -> Chosen {
     let not_counted = [OWNER_KEY, REPORT_KEY, FAILURE_LOG_KEY];
     let (of_workers, objects) = checkpoints_of_workers(objects, quota, pairs);
+    // With another number of evaluators each had another share, and the run begins anew. Each has a log.
+    let evaluators = objects.iter().filter_map(|object| evaluator_of(&object.key)).max();
+    let are_ours = evaluators == Pair::first(pairs).last();
+    let is_evaluators = |key: &str| key.starts_with(EVALUATORS);
     let (mut objects, mut others): (Vec<_>, Vec<_>) = objects
         .into_iter()
         .filter(|object| !not_counted.contains(&object.key.as_str()))
-        .partition(|object| is_restored(&object.key, pairs));
+        .partition(|Listed { key, .. }| {
+            is_restored(key, pairs) && (!is_evaluators(key) || (are_ours && evaluator_of(key).is_some()))
+        });
     let all = objects.len();
     let shadowed = shadowed(&objects);
     let mut keep = |objects: &mut Vec<Listed>, is_kept: &mut dyn FnMut(&Listed) -> bool| {
@@ -174,6 +181,11 @@ fn log_of_worker(key: &str) -> Option<Pair> {
     ["agent", "simulator", "uploader"]
         .contains(&container)
         .then(|| worker.parse().ok())?
+}
+
+/// The number of the evaluator whose file a key is.
+fn evaluator_of(key: &str) -> Option<Pair> {
+    key.strip_prefix(EVALUATORS)?.split_once('/')?.0.parse().ok()
 }
 
 /// True if a key is one that the run goes on with.
@@ -262,6 +274,8 @@ fn volume(path: &str, error: TreeError) -> WorkspaceError {
 
 #[cfg(test)]
 mod tests {
+    use leaderboard_protocol::files::Host;
+
     use super::*;
 
     const MIB: u64 = 1 << 20;
@@ -297,7 +311,7 @@ mod tests {
             listed("logcopy/.stored.json", 5),
             listed("logcopy/logcopy.log", 40),
         ];
-        let chosen = choose(objects, &Quota::new(MIB, 2), 2);
+        let chosen = choose(objects, &Quota::new(MIB, 2, Host::Simulator), 2);
         let expected = [
             "agent/agent1/agent_results.json",
             "agent/agent2/leaderboard.log",
@@ -328,7 +342,7 @@ mod tests {
             ),
         ] {
             let objects = keys.iter().map(|key| listed(key, 10)).collect();
-            let chosen = choose(objects, &Quota::new(MIB, 2), 2);
+            let chosen = choose(objects, &Quota::new(MIB, 2, Host::Simulator), 2);
             let found: Vec<_> = chosen.of_workers.iter().map(|object| object.key.clone()).collect();
             assert_eq!(found, taken, "{keys:?}");
             assert!(
@@ -337,8 +351,33 @@ mod tests {
             );
         }
         let large = vec![listed(&partial("1"), 2 * MIB), listed(&partial("2"), 10)];
-        let chosen = choose(large, &Quota::new(MIB, 2), 2);
+        let chosen = choose(large, &Quota::new(MIB, 2, Host::Simulator), 2);
         assert_eq!(chosen.of_workers.len(), 1, "within the limit of the run");
+    }
+
+    #[test]
+    fn evaluators_go_on_where_as_many_have_been() {
+        let results = |workers: &[&str]| -> Vec<Listed> {
+            let keys = workers.iter().flat_map(|worker| {
+                ["console.log", "result.json", "games.json"].map(|file| format!("evaluators/{worker}/{file}"))
+            });
+            keys.map(|key| listed(&key, 10)).collect()
+        };
+        for (stored, restored) in [
+            (vec!["1", "2"], 6),
+            // The first has no result yet.
+            (vec!["2"], 3),
+            (vec!["1"], 0),
+            (vec!["1", "2", "3"], 0),
+            (vec!["1", "2", "02", "x", "0", "1000"], 6),
+        ] {
+            let quota = Quota::new(MIB, 2, Host::Evaluator);
+            let chosen = choose(results(&stored), &quota, 2);
+            assert_eq!(chosen.objects.len(), restored, "{stored:?}: {:?}", keys(&chosen));
+            assert_eq!(chosen.left_out, 0, "{stored:?}");
+            let first = chosen.objects.first().map_or("result.json", |object| &object.key);
+            assert!(first.ends_with("result.json"), "{stored:?}");
+        }
     }
 
     #[test]
@@ -353,7 +392,7 @@ mod tests {
             "simulator/x",
         ];
         let objects = objects.iter().map(|key| listed(key, 1)).collect();
-        let chosen = choose(objects, &Quota::new(MIB, 2), 2);
+        let chosen = choose(objects, &Quota::new(MIB, 2, Host::Simulator), 2);
         assert_eq!((keys(&chosen), chosen.left_out), (vec!["simulator/x"], 6));
     }
 
@@ -365,7 +404,7 @@ mod tests {
             listed("simulator/a-b", 1),
         ];
         assert_eq!(
-            keys(&choose(objects, &Quota::new(MIB, 1), 1)),
+            keys(&choose(objects, &Quota::new(MIB, 1, Host::Simulator), 1)),
             ["simulator/a-b", "simulator/a/b"]
         );
     }
@@ -379,7 +418,7 @@ mod tests {
             listed("logcopy/report.json", 5),
             listed("plain", 6),
         ];
-        let chosen = choose(objects, &Quota::new(MIB, 2), 2);
+        let chosen = choose(objects, &Quota::new(MIB, 2, Host::Simulator), 2);
         assert_eq!(keys(&chosen), Vec::<&str>::new());
         let others: Vec<&str> = chosen.others.iter().map(|object| object.key.as_str()).collect();
         let expected = [
@@ -400,7 +439,7 @@ mod tests {
             listed("agent/agent1/b", 9),
             listed("agent/agent1/c", 10),
         ];
-        let chosen = choose(objects, &Quota::new(MIB, 1), 1);
+        let chosen = choose(objects, &Quota::new(MIB, 1, Host::Simulator), 1);
         let expected = [
             "agent/agent1/agent_results.json",
             "agent/agent1/leaderboard.log",
