@@ -14,6 +14,7 @@ pub mod effective;
 mod evalai_mode;
 mod evalai_queue;
 pub mod evalai_status;
+pub mod evaluator_result;
 mod failed_node;
 pub mod gpu;
 pub mod image;

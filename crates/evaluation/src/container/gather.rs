@@ -7,6 +7,7 @@ use std::path::PathBuf;
 use std::sync::Arc;
 
 use leaderboard_api::ContainerPlan;
+use leaderboard_api::evaluator_result::{MAX_BYTES, ResultError, ResultFile, parse};
 use leaderboard_contract::keys::{RESULT_FILE, RESULTS, STDOUT, result_path};
 use leaderboard_contract::report::{RefusedResults, ReportWorker};
 use leaderboard_contract::run::{Run, STATUS_FOLDER};
@@ -15,7 +16,6 @@ use leaderboard_protocol::files::Pair;
 
 use super::HOST;
 use super::merge::{MergeError, Merged, NO_RESULTS, NOTHING_YET, merge};
-use super::result::{MAX_BYTES, ResultError, ResultFile, parse};
 use crate::judge::Ending;
 use crate::{Gathered, Object, Objects, Refused, Results, Summary, Texts, WorkerSeen};
 

@@ -3,11 +3,11 @@
 use std::collections::BTreeSet;
 use std::fmt::Write as _;
 
+use leaderboard_api::evaluator_result::{MAX_SPLITS, Number, ResultFile, Split};
 use leaderboard_api::{MAX_METRICS, MergeMethod, Metric, ScoreMetric};
 use leaderboard_contract::report::Outcome;
 use serde_json::Value;
 
-use super::result::{MAX_SPLITS, Number, ResultFile, Split};
 use crate::{Summary, Texts};
 
 /// The results so far as one.
@@ -258,10 +258,10 @@ pub(super) fn clamp(units: u64) -> u32 {
 #[cfg(test)]
 mod tests {
     use leaderboard_api::Order;
+    use leaderboard_api::evaluator_result::parse;
     use serde_json::json;
 
     use super::*;
-    use crate::container::parse;
 
     fn result(done: u32, is_final: bool, splits: &Value) -> ResultFile {
         let total = if is_final { done } else { 100 };
@@ -331,7 +331,7 @@ mod tests {
             one(1, true, &json!({"n": i64::MAX})),
             one(1, true, &json!({"n": i64::MAX})),
         ];
-        assert_eq!(numbers(&merged(Sum, &most).unwrap()), [("n", "1.8446744073709552e+19")]);
+        assert_eq!(numbers(&merged(Sum, &most).unwrap()), [("n", "1.8446744073709552e19")]);
     }
 
     #[test]

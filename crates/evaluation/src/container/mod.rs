@@ -2,7 +2,6 @@
 
 mod gather;
 mod merge;
-mod result;
 mod workload;
 
 use std::sync::Arc;
@@ -15,7 +14,6 @@ use leaderboard_protocol::files::{Host, Pair};
 use crate::workload::{Asked, Contents, Reserved, Workload};
 use crate::{Column, Evaluation, Refused, Results, Words};
 use gather::Gatherer;
-pub use result::{Number, ResultError, ResultFile, Split, parse};
 
 const HOST: Host = Host::Evaluator;
 const WORDS: Words = Words {

@@ -1,25 +1,28 @@
-//! `result.json`: read as hostile text, into a type that holds no nonsense. Pure.
+//! `result.json` of a host's evaluator: read as hostile text, into a type that holds no nonsense. Pure.
 //!
-//! The evaluator is the host's, and it talks to a stranger's program. `docs/evaluator-result.schema.json` has the same rules for hosts.
+//! `logcopy` reads it in the Pod, and the plugin on a host's machine. The evaluator is the host's, and it talks to a stranger's program.
+//! `docs/evaluator-result.schema.json` has the same rules for hosts.
 
 use std::collections::BTreeSet;
 
-use leaderboard_api::text::one_line;
-use leaderboard_api::{MAX_METRICS, MAX_NAME, ScoreMetric};
 use serde::Deserialize;
 use serde::de::{Deserializer, MapAccess, Visitor};
 use serde_json::value::RawValue;
 
+use super::container::ScoreMetric;
+use super::progress::{MAX_METRICS, MAX_NAME};
+use super::text::one_line;
+
 /// Version of the document.
-pub(super) const SCHEMA: u64 = 1;
+pub const SCHEMA: u64 = 1;
 /// Largest document that is read, in bytes.
-pub(super) const MAX_BYTES: usize = 1 << 20;
+pub const MAX_BYTES: usize = 1 << 20;
 /// Most units of one worker.
-pub(super) const MAX_UNITS: u32 = 1_000_000_000;
+pub const MAX_UNITS: u32 = 1_000_000_000;
 /// Most splits.
-pub(super) const MAX_SPLITS: usize = 16;
+pub const MAX_SPLITS: usize = 16;
 /// Longest text that is shown, in characters.
-pub(super) const MAX_TEXT: usize = 1024;
+pub const MAX_TEXT: usize = 1024;
 /// Longest number that is shown as it was written, in characters.
 const MAX_NUMBER: usize = 32;
 /// Stands for a refusal without a text.
@@ -258,13 +261,15 @@ fn named(name: String) -> Result<String, ResultError> {
 
 impl Number {
     /// A number as it is written here; `None` for one that is not finite.
-    pub(super) fn new(value: f64) -> Option<Self> {
-        let text = crate::number_text(value);
-        value.is_finite().then_some(Self { value, text })
+    pub fn new(value: f64) -> Option<Self> {
+        value.is_finite().then(|| Self {
+            value,
+            text: format!("{value:?}"),
+        })
     }
 
     /// A number of JSON.
-    pub(super) fn read(text: &str) -> Option<Self> {
+    pub fn read(text: &str) -> Option<Self> {
         // Rust reads `inf` and `nan` as numbers, too; neither these nor a text in quotes begin so.
         let is_number = text.starts_with(|first: char| first == '-' || first.is_ascii_digit());
         let value: f64 = text.parse().ok().filter(|_| is_number)?;
