@@ -8,7 +8,7 @@ use jiff::Timestamp;
 
 use super::row::{Phase, Split};
 use super::types::{Metrics, Target};
-use leaderboard_api::{Order, Ranking, ScoreMetric};
+use leaderboard_api::{Order, Ranking};
 
 /// A challenge as EvalAI shows it.
 #[derive(Clone, Debug, PartialEq)]
@@ -84,31 +84,22 @@ pub fn compare(target: &Target, catalog: &Catalog) -> Labels {
         rankings: target
             .phases
             .iter()
-            .filter_map(|phase| Some((*phase, phase_ranking(target, catalog, *phase)?)))
+            .filter_map(|phase| Some((*phase, ranking(catalog, ranked(target, catalog, *phase)?)?)))
             .collect(),
     }
 }
 
-/// How a phase ranks, under the names that its results have here.
-fn phase_ranking(target: &Target, catalog: &Catalog, phase: i64) -> Option<Ranking> {
-    let scores = match &target.metrics {
-        Metrics::Fixed(_) => return ranking(catalog, split_of(target, catalog, phase)?),
-        Metrics::Listed(scores) => scores,
+/// The leaderboard that ranks a phase.
+fn ranked<'a>(target: &'a Target, catalog: &'a Catalog, phase: i64) -> Option<&'a Split> {
+    let split = match &target.metrics {
+        Metrics::Fixed(_) => Some(&target.split),
+        Metrics::Listed(scores) => scores.get(&phase)?.as_ref(),
     };
-    let score = scores.get(&phase)?;
-    let (name, split) = scored(score, listed(target, catalog, phase)?)?;
-    let ranking = ranking(catalog, split)?;
-    Some(Ranking {
-        metric: score.name_of(name, &ranking.metric),
-        ..ranking
-    })
-}
-
-/// The split that has the score: the one that it names, else the only one.
-fn scored<'a>(score: &ScoreMetric, listed: Vec<(&'a str, &'a Split)>) -> Option<(&'a str, &'a Split)> {
-    let is_only = listed.len() == 1;
-    let is_its = |name: &str| score.split.as_deref().map_or(is_only, |split| split == name);
-    listed.into_iter().find(|one| is_its(one.0))
+    match (split, named(target, catalog, phase).as_slice()) {
+        (Some(split), _) => split_of(target, catalog, phase, split),
+        (None, [(_, only)]) => Some(*only),
+        (None, _) => None,
+    }
 }
 
 /// How a leaderboard ranks. EvalAI's own default is that the highest value leads.
@@ -139,7 +130,7 @@ fn compare_phase(target: &Target, catalog: &Catalog, phase: i64) -> Vec<Misfit> 
         Metrics::Listed(_) => return Vec::new(),
         Metrics::Fixed(labels) => labels,
     };
-    let Some(split) = split_of(target, catalog, phase) else {
+    let Some(split) = split_of(target, catalog, phase, &target.split) else {
         let split = target.split.clone();
         return vec![Misfit::Split { phase, split }];
     };
@@ -151,10 +142,10 @@ fn compare_phase(target: &Target, catalog: &Catalog, phase: i64) -> Vec<Misfit> 
     unknown.into_iter().chain(unsent).collect()
 }
 
-/// The phase's leaderboard of the target's split.
-fn split_of<'a>(target: &'a Target, catalog: &'a Catalog, phase: i64) -> Option<&'a Split> {
+/// The phase's leaderboard of a split.
+fn split_of<'a>(target: &'a Target, catalog: &'a Catalog, phase: i64, codename: &str) -> Option<&'a Split> {
     let mut all = named(target, catalog, phase).into_iter();
-    all.find_map(|(name, split)| (name == Some(target.split.as_str())).then_some(split))
+    all.find_map(|(name, split)| (name == Some(codename)).then_some(split))
 }
 
 /// Each split of a phase with its codename. None where the phase has none, or a split has no codename.
@@ -276,10 +267,9 @@ mod tests {
     }
 
     fn takes_what_is_listed(split: Option<&str>) -> Target {
-        let score = json!({"split": split, "metric": "B", "order": "Descending"});
-        let score: ScoreMetric = serde_json::from_value(score).unwrap();
+        let scores = [1, 3].map(|phase| (phase, split.map(str::to_owned)));
         Target {
-            metrics: Metrics::Listed(Arc::new([(1, score.clone()), (2, score)].into())),
+            metrics: Metrics::Listed(Arc::new(scores.into())),
             ..target(&[1], &[])
         }
     }
@@ -311,27 +301,20 @@ mod tests {
     }
 
     #[test]
-    fn where_the_labels_are_evalais_the_split_with_the_score_ranks_under_its_name_here() {
+    fn where_the_labels_are_evalais_the_split_with_the_score_ranks() {
         let both = || of_two_splits([Some("dev"), Some("test")]);
-        let ranking = |metric: &str, order| {
-            let metric = metric.to_owned();
-            Some(Ranking { metric, order })
-        };
         for (split, catalog, expected) in [
-            (Some("dev"), both(), ranking("dev_A", Order::Descending)),
-            (Some("test"), both(), ranking("test_A", Order::Ascending)),
+            (Some("dev"), both(), Some(Order::Descending)),
+            (Some("test"), both(), Some(Order::Ascending)),
             (Some("val"), both(), None),
             // Which of them has the score is not known.
             (None, both(), None),
-            (None, catalog(Some("test")), ranking("A", Order::Descending)),
-            (
-                Some("test"),
-                catalog(Some("test")),
-                ranking("test_A", Order::Descending),
-            ),
+            (None, catalog(Some("test")), Some(Order::Descending)),
+            (Some("test"), catalog(Some("test")), Some(Order::Descending)),
         ] {
             let found = compare(&takes_what_is_listed(split), &catalog).rankings.remove(&1);
-            assert_eq!(found, expected, "{split:?}");
+            let metric = "A".to_owned();
+            assert_eq!(found, expected.map(|order| Ranking { metric, order }), "{split:?}");
         }
     }
 

@@ -12,7 +12,7 @@ use jiff::Timestamp;
 use super::row::Row;
 use crate::token::Token;
 use leaderboard_api::evalai_status::{Outcome, Progress, Status};
-use leaderboard_api::{Attempt, S3Bucket, ScoreMetric};
+use leaderboard_api::{Attempt, S3Bucket};
 pub use leaderboard_base::object_key::ObjectKey as Key;
 use leaderboard_base::spans::LogSpan;
 use leaderboard_contract::report::ContentId;
@@ -54,9 +54,8 @@ pub struct Target {
 pub enum Metrics {
     /// These, for the split of the target.
     Fixed(Arc<[String]>),
-    /// Of each split that EvalAI lists for a phase, those that it lists there. With the score of each phase, which names the split that
-    /// ranks it.
-    Listed(Arc<BTreeMap<i64, ScoreMetric>>),
+    /// Of each split that EvalAI lists for a phase, those that it lists there. By phase, the split that has the score; none: its only one.
+    Listed(Arc<BTreeMap<i64, Option<String>>>),
 }
 
 /// Answers, right before each write, whether this process still leads.

@@ -17,6 +17,8 @@ use leaderboard_api::evalai_status::Outcome;
 
 /// Payloads that are held at once: with a second one, a write that EvalAI does not answer holds no other up.
 pub const PAYLOADS: usize = 2;
+/// A list of results without one.
+const NO_RESULTS: &str = "[]";
 /// A payload whose write does not begin gives its place to others after so long.
 const KEPT: Duration = Duration::from_secs(15);
 
@@ -122,7 +124,7 @@ impl Queue {
         let catalog = challenge.and_then(|challenge| challenge.check.catalog.as_ref());
         let fit = |payload| {
             if has_results {
-                fitted(payload, &held, catalog)
+                fitted(payload, &held, catalog, is_partial)
             } else {
                 Some((payload, None))
             }
@@ -169,12 +171,21 @@ impl Queue {
 }
 
 /// Results as their Leaderboard publishes them, and why they are not sent. None while it is not known what EvalAI lists.
-fn fitted(payload: Payload, held: &Held, catalog: Option<&Catalog>) -> Option<(Payload, Option<String>)> {
+fn fitted(
+    payload: Payload,
+    held: &Held,
+    catalog: Option<&Catalog>,
+    is_partial: bool,
+) -> Option<(Payload, Option<String>)> {
     let (target, phase) = (held.target.as_ref(), held.of.phase);
     if let Metrics::Fixed(labels) = &target.metrics {
         let payload = for_split(payload, &target.split);
         let misfit = check(&payload, &target.split, labels).err();
         return Some((payload, misfit));
+    }
+    // Where a phase does not show results so far, EvalAI gets the texts alone.
+    if is_partial && payload.result == NO_RESULTS {
+        return Some((payload, None));
     }
     let listed = listed(target, catalog?, phase).ok_or_else(|| Misfit::Unnamed { phase }.to_string());
     Some(match listed.and_then(|listed| for_listed(&payload.result, &listed)) {

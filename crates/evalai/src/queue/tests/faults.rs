@@ -267,9 +267,8 @@ fn a_result_without_a_metric_is_sent_once_its_leaderboard_wants_it_no_more() {
 
 /// A Leaderboard whose labels are those that EvalAI lists, and which has the score in this split.
 fn takes_what_is_listed(split: Option<&str>) -> Target {
-    let score = serde_json::json!({"split": split, "metric": "Driving score"});
     Target {
-        metrics: Metrics::Listed(Arc::new([(1, serde_json::from_value(score).unwrap())].into())),
+        metrics: Metrics::Listed(Arc::new([(1, split.map(str::to_owned))].into())),
         ..target()
     }
 }
@@ -331,6 +330,34 @@ fn a_result_for_what_evalai_lists_waits_until_that_is_known_and_is_refused_if_it
     let expected = r#"[{"split":"leaderboard","show_to_participant":true,"accuracies":{"Driving score":43}}]"#;
     assert_eq!(results_of(&sent), expected);
     assert!(matches!(bench.view(7).end, Some(Ended::Published { .. })));
+}
+
+#[test]
+fn results_so_far_without_a_split_are_sent_as_they_are_and_others_need_all_that_evalai_lists() {
+    let (mut bench, board) = (Bench::new(), takes_what_is_listed(None));
+    bench.running(7);
+    bench.becomes(&key(100), &board);
+    for list in ["sweep of submitted", "sweep of resuming"] {
+        bench.list(list, vec![]);
+    }
+    bench.checked("leaderboard", &["Driving score"]);
+    bench.update_of(&board, DesiredUpdate::Partial(results(41.0)));
+    let outline = bench.reads(7);
+    bench.found(7, Ok(Payload::bare(&outline)));
+    let sent = bench.read_and_write(7, "partial");
+    assert_eq!(results_of(&sent), "[]");
+    bench.wait(5.0);
+    bench.update_of(&board, DesiredUpdate::Partial(results(42.0)));
+    let outline = bench.reads(7);
+    let result = r#"[{"split":"other","show_to_participant":true,"accuracies":{}}]"#.to_owned();
+    let other = Payload {
+        result,
+        ..Payload::bare(&outline)
+    };
+    bench.found(7, Ok(other));
+    let why = bench.view(7).last_error.unwrap();
+    assert!(why.contains("lack the split leaderboard"), "{why}");
+    assert_eq!(bench.view(7).partial_done, Some(42), "newer ones come");
 }
 
 #[test]

@@ -12,7 +12,7 @@ fn hangs() -> PayloadProblem {
 
 impl Bench {
     /// Next read, which has to be of this submission.
-    fn reads(&mut self, pk: i64) -> Arc<Outline> {
+    pub(super) fn reads(&mut self, pk: i64) -> Arc<Outline> {
         let now = self.now();
         match self.queue.next(now, true) {
             Next::Read(found, outline) => {
@@ -29,7 +29,7 @@ impl Bench {
         assert!(matches!(next, Next::Wait(_)), "{next:?}");
     }
 
-    fn found(&mut self, pk: i64, answer: Result<Payload, PayloadProblem>) {
+    pub(super) fn found(&mut self, pk: i64, answer: Result<Payload, PayloadProblem>) {
         let now = self.now();
         self.queue
             .took_payload(&key(pk), answer.map(|payload| (payload, None)), now);
