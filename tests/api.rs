@@ -15,6 +15,7 @@ mod api {
     mod bridge;
     mod claims;
     mod columns;
+    mod containers;
     mod counts;
     mod definitions;
     mod endpoints;

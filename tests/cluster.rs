@@ -40,6 +40,7 @@ mod cluster {
     mod bridge;
     mod bucket;
     mod checks;
+    mod containers;
     mod crashes;
     mod cutover;
     mod edits;
@@ -47,6 +48,7 @@ mod cluster {
     mod failures;
     mod gpus;
     mod helm;
+    mod hostile_containers;
     mod import;
     mod isolation;
     mod losses;

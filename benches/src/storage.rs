@@ -195,6 +195,7 @@ fn report(is_final: bool) -> Report {
         },
         stopped: None,
         refused: None,
+        unusable: None,
         warnings: Vec::new(),
         logs: None,
         results: RESULTS.into(),

@@ -123,7 +123,7 @@ def shows(tab: Tab, page: Page) -> str:
     found = [row for name in ("running", "waiting", "ended", "failures") for row in page.view[name]["rows"]]
     for row in [*found, *page.view["leaderboards"]["rows"]]:
         need(row["name"] in text, f"{row['name']} is not shown")
-    parts = ("41 of 60 requests per minute", "Pair 2: 2 crashes", "All four slots", "until it starts", "Typical run")
+    parts = ("41 of 60 requests per minute", "Worker 2: 2 crashes", "All four slots", "until it starts", "Typical run")
     for part in parts:
         need(part in text, f"`{part}` is not shown")
     need(text.count("All four slots") == 1, "a reason is shown once for each that waits for it")
@@ -156,7 +156,7 @@ def details(tab: Tab, page: Page) -> str:
     text = str(tab.run("document.querySelector('#detail').innerText"))
     for part in ("submission-4200", "Driving score so far", "kubectl leaderboard logs submission-4200 -n leaderboard"):
         need(part in text, f"`{part}` is not shown")
-    for part in ("s3://results-20/v2/submission-4200", "Submission 4200 in the hosts' list", "Conditions", "Pair 4"):
+    for part in ("s3://results-20/v2/submission-4200", "Submission 4200 in the hosts' list", "Conditions", "Worker 4"):
         need(part in text, f"`{part}` is not shown")
     tab.run("history.back()")
     tab.wait(f"!{IS_OPEN} && location.hash === ''")

@@ -1,4 +1,4 @@
-//! `leaderboard-operator labels`: the metrics of a Leaderboard as the schema of a leaderboard in EvalAI.
+//! `leaderboard-operator labels`: the metrics of the CARLA Leaderboard as the schema of a leaderboard in EvalAI.
 //!
 //! The names are those of `crates/results`, which every result is made with.
 
@@ -12,7 +12,7 @@ use serde::Serialize;
 
 use super::offline::FormatName;
 
-/// Print the metric labels that a phase needs, as the schema of its leaderboard in EvalAI.
+/// Print the metric labels that a phase of the CARLA Leaderboard needs, as the schema of its leaderboard in EvalAI.
 #[derive(Args, Debug)]
 pub(super) struct Labels {
     /// Leaderboard 1.0 (v1) or 2.0 (v2).

@@ -52,10 +52,10 @@ enum Command {
     Logcopy(InPod),
     /// Print the custom resource definitions.
     Crd,
-    /// Merge and render checkpoint files without a cluster.
+    /// Merge and render the checkpoint files of a CARLA run without a cluster; no other kind of evaluation has such files.
     #[command(after_help = offline::EXIT_CODES)]
     Results(offline::Results),
-    /// Print the schema of a phase's leaderboard in EvalAI.
+    /// Print the schema of a phase's leaderboard in EvalAI for CARLA's metrics; those of another evaluation are its host's.
     Labels(labels::Labels),
 }
 

@@ -59,7 +59,7 @@ enum VerifyName {
 pub(super) const EXIT_CODES: &str = "Exit code 0: the four files are written. 2: the files or the arguments are refused. 1: \
     something can't be read or written. Unless it is 0, what had been in the folder is still there.";
 
-/// Merges the checkpoint files of the workers and renders what EvalAI gets.
+/// Merges the checkpoint files of the workers of a CARLA run and renders what EvalAI gets.
 #[derive(Args, Debug)]
 pub(super) struct Results {
     /// Format of the checkpoints.

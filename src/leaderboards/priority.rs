@@ -76,7 +76,7 @@ fn judge(class: &str, asked: &Asked, seen: ObservedClass, problems: &mut Problem
         ObservedClass::Unreadable | ObservedClass::Waits => return,
         ObservedClass::Missing => format!("{what} does not exist. Create it, or correct its name."),
         ObservedClass::Preempts => format!(
-            "{what} preempts: one run would end another, which then repeats a route of each pair. Set preemptionPolicy: Never \
+            "{what} preempts: one run would end another, which then repeats some work of each worker. Set preemptionPolicy: Never \
              in the class."
         ),
     };

@@ -18,12 +18,12 @@ use crate::kubernetes::call;
 use crate::metrics::leader::{self, Gauge};
 use crate::runtime::objects::key_of;
 use crate::runtime::settings::Settings;
-use leaderboard_api::{EvalaiMode, Leaderboard, Token as TokenPlace};
+use leaderboard_api::{EvalaiMode, Leaderboard, LeaderboardSpec, Token as TokenPlace, Track};
 use leaderboard_aws::clients::Aws;
 use leaderboard_base::spans::LogSpan;
 use leaderboard_base::tasks::Tasks;
-use leaderboard_evalai::Target;
 use leaderboard_evalai::token::Token;
+use leaderboard_evalai::{Metrics, Target};
 use leaderboard_policy::ask::{Ask, Failure, Lookup, Service};
 
 /// A token is looked at again after this long.
@@ -188,11 +188,7 @@ impl Looked {
             sweep: Duration::from_secs(evalai.sweep_seconds.unsigned_abs()),
             period: Duration::from_secs(spec.sync_period_seconds.unsigned_abs()),
             phases: spec.tracks.iter().filter_map(|t| t.phase).collect(),
-            labels: leaderboard_evaluation::of(spec)
-                .columns()
-                .into_iter()
-                .map(|column| column.label.to_owned())
-                .collect(),
+            metrics: metrics(spec),
             inbox: spec.evalai_queue().map(|queue| queue.name.clone()),
             is_observed: evalai.mode == EvalaiMode::Observe,
             since: created.map(|time| time.0).unwrap_or_default(),
@@ -215,6 +211,17 @@ impl Looked {
         let found = self.pods.known().and_then(|found| found.result.as_ref().as_ref().ok());
         found.cloned().unwrap_or_default()
     }
+}
+
+/// What of its results a Leaderboard publishes: where its kind of evaluation knows no metrics, those that EvalAI lists.
+fn metrics(spec: &LeaderboardSpec) -> Metrics {
+    let columns = leaderboard_evaluation::of(spec).columns();
+    if columns.is_empty() {
+        let split = |track: &Track| Some((track.phase?, track.container.as_ref()?.score.split.clone()));
+        let splits: BTreeMap<_, _> = spec.tracks.iter().filter_map(split).collect();
+        return Metrics::Listed(Arc::new(splits));
+    }
+    Metrics::Fixed(columns.into_iter().map(|column| column.label.to_owned()).collect())
 }
 
 /// Time that a question has waited for its first answer.

@@ -160,7 +160,7 @@ fn sample_job(settings: &Settings, leaderboard: &Leaderboard, track: &Track) -> 
         sample.run_id(),
         "example/agent:1".into(),
         false,
-    );
+    )?;
     Some(job_spec::build_object(&JobInput {
         submission: &sample,
         leaderboard,

@@ -3,12 +3,15 @@
 use serde_json::Value;
 
 use super::failure_log::Tail;
-use leaderboard_api::{FailureClass, LogTail, State, SubmissionStatus, effective};
+use leaderboard_api::{FailureClass, LogTail, RunPlan, State, SubmissionStatus, effective};
 use leaderboard_aws::table::Row;
 use leaderboard_evalai::{Outline, Patience, StoredResult};
-use leaderboard_evaluation::{Evaluation, number_text, of_plan};
-use leaderboard_policy::report_digest::ReportDigest;
+use leaderboard_evaluation::{number_text, of_plan};
+use leaderboard_policy::report_digest::{ReportDigest, Split};
 use leaderboard_policy::view::View;
+
+/// Most columns of a result whose metrics its host names: DynamoDB takes an expression of 4 KB.
+const MAX_COLUMNS: usize = 128;
 
 /// What the result in the view is sent with: nothing of a bucket where none is stored. `so_far`: with the metrics over what is done so
 /// far, else with the original's zeros.
@@ -82,7 +85,7 @@ pub(super) fn row(report: Option<&ReportDigest>, status: &SubmissionStatus) -> O
         team_name: team.name.clone().unwrap_or_default(),
         submission_status: table_status(status.state_of_conditions()).to_owned(),
         track_id: plan.phase.map(|p| p.to_string()).unwrap_or_default(),
-        track_name: plan.carla.codename.to_string(),
+        track_name: plan.carla().map_or(&plan.track, |carla| &carla.codename).to_string(),
         submitted_image_uri: plan.image.clone(),
         submitted_time: text(status.times.submitted.as_ref()),
         start_time: text(status.times.started.as_ref()),
@@ -90,7 +93,7 @@ pub(super) fn row(report: Option<&ReportDigest>, status: &SubmissionStatus) -> O
         results: status.results_url.clone().unwrap_or_default(),
         progress: status.progress.as_ref().map(|p| p.text.clone()).unwrap_or_default(),
         gpu_seconds: gpu_seconds(status),
-        metrics: columns(report.filter(|_| is_finished(status)), of_plan(plan)),
+        metrics: columns(report, plan, is_finished(status)),
     })
 }
 
@@ -125,16 +128,26 @@ fn table_status(state: State) -> &'static str {
     }
 }
 
-/// The metric columns, as text with the digits of results.json; those without a value are to be removed.
-fn columns(report: Option<&ReportDigest>, kind: &dyn Evaluation) -> Vec<(String, Option<String>)> {
-    let accuracies = report.and_then(|report| report.accuracies.as_ref());
+/// The metric columns, as text with the digits of results.json; those without a value, as all of a result that does not count, are to be
+/// removed.
+fn columns(report: Option<&ReportDigest>, plan: &RunPlan, counts: bool) -> Vec<(String, Option<String>)> {
+    let splits = report.map_or(&[][..], |report| &report.splits);
     let text = |value: &Value| match value.as_f64().filter(|_| value.is_f64()) {
         Some(number) => number_text(number),
         None => value.to_string(),
     };
-    let all = kind.columns().into_iter().map(|column| {
-        let value = accuracies.and_then(|all| all.get(column.label));
-        (column.name.to_owned(), value.map(text))
+    let text = |value: &Value| counts.then(|| text(value));
+    if let Some(container) = plan.container() {
+        let of_split = |split: &Split| {
+            let all = split.accuracies.iter();
+            let named = all.map(|(label, value)| (container.score.name_of(&split.name, label), text(value)));
+            named.collect::<Vec<_>>()
+        };
+        return splits.iter().flat_map(of_split).take(MAX_COLUMNS).collect();
+    }
+    let all = of_plan(plan).columns().into_iter().map(|column| {
+        let value = splits.first().and_then(|split| split.accuracies.get(column.label));
+        (column.name.to_owned(), value.and_then(text))
     });
     all.collect()
 }
@@ -142,8 +155,7 @@ fn columns(report: Option<&ReportDigest>, kind: &dyn Evaluation) -> Vec<(String,
 #[cfg(test)]
 mod tests {
     use super::*;
-    use leaderboard_api::{Attempt, LeaderboardVersion};
-    use leaderboard_evaluation::carla;
+    use leaderboard_api::Attempt;
     use serde_json::json;
 
     fn report(results: &str) -> ReportDigest {
@@ -164,15 +176,63 @@ mod tests {
         })
     }
 
+    /// Columns of a result that counts.
+    fn columns_of(results: &str, plan: Value) -> Vec<(String, Option<String>)> {
+        columns(Some(&report(results)), &serde_json::from_value(plan).unwrap(), true)
+    }
+
     #[test]
     fn columns_keep_the_digits_and_the_names_of_the_original() {
         let results = r#"[{"split": "leaderboard", "accuracies": {"Driving score": 43.125, "Off-road infractions": 0.0, "Agent blocked": 0}}]"#;
-        let found = columns(Some(&report(results)), carla::of(LeaderboardVersion::V2));
+        let found = columns_of(results, plan());
         let get = |name: &str| found.iter().find(|(n, _)| n == name).and_then(|(_, v)| v.as_deref());
         assert_eq!(get("driving_score"), Some("43.125"));
         assert_eq!(get("off_road_infractions"), Some("0.0"));
         assert_eq!(get("agent_blocked"), Some("0"));
         assert_eq!(found.len(), 15);
+    }
+
+    fn of_container(split: Option<&str>) -> Value {
+        let score = json!({"split": split, "metric": "accuracy", "order": "Descending"});
+        json!({
+            "runId": "7", "track": "sensors", "storage": {"s3": {"bucket": "b"}}, "image": "i",
+            "container": {"mode": "Interactive", "workers": 1, "merge": "Mean", "score": score, "image": "e"},
+        })
+    }
+
+    #[test]
+    fn the_columns_of_a_hosts_evaluator_are_its_own_metrics_behind_the_split_where_the_score_names_one() {
+        let one = r#"[{"split": "test", "show_to_participant": true, "accuracies": {"accuracy": 0.50, "games": 3}}]"#;
+        let two = r#"[{"split": "dev", "accuracies": {"accuracy": 1e22}}, {"split": "test", "accuracies": {"accuracy": 0.1}}]"#;
+        for (results, split, expected) in [
+            (one, None, &[("accuracy", "0.5"), ("games", "3")][..]),
+            (one, Some("test"), &[("test_accuracy", "0.5"), ("test_games", "3")]),
+            (
+                two,
+                Some("test"),
+                &[("dev_accuracy", "1e+22"), ("test_accuracy", "0.1")],
+            ),
+        ] {
+            let found = columns_of(results, of_container(split));
+            let found: Vec<_> = found
+                .iter()
+                .map(|(name, value)| (name.as_str(), value.as_deref().unwrap()))
+                .collect();
+            assert_eq!(found, expected);
+        }
+    }
+
+    #[test]
+    fn the_metrics_of_a_hosts_evaluator_are_removed_again_where_the_result_does_not_count() {
+        let report = report(r#"[{"split": "test", "accuracies": {"accuracy": 0.5}}]"#);
+        let condition = json!({"type": "Finished", "status": "True", "reason": "Cancelled", "message": "",
+                               "lastTransitionTime": "2026-01-01T00:00:00Z"});
+        let status = json!({"conditions": [condition], "team": {"id": "3"}, "plan": of_container(None)});
+        let row = row(Some(&report), &serde_json::from_value(status).unwrap()).unwrap();
+        assert_eq!(
+            (row.track_name.as_str(), row.metrics),
+            ("sensors", vec![("accuracy".to_owned(), None)])
+        );
     }
 
     #[test]
@@ -262,7 +322,7 @@ mod tests {
 
     #[test]
     fn a_broken_report_has_no_columns() {
-        let found = columns(Some(&report("not json")), carla::of(LeaderboardVersion::V2));
+        let found = columns_of("not json", plan());
         assert!(found.iter().all(|(_, value)| value.is_none()));
     }
 }

@@ -18,7 +18,7 @@ const UID: &str = "1b4e28ba-2fa1-11d2-883f-0016d3cca427";
 /// A Leaderboard with four pairs.
 fn board() -> Leaderboard {
     let mut board = leaderboard("carla-2", "http://127.0.0.1:9");
-    board.spec.evaluation.carla.pairs = 4;
+    board.spec.evaluation.carla_mut().unwrap().pairs = 4;
     board
 }
 

@@ -8,7 +8,7 @@ pub mod lifecycle;
 pub mod rest;
 
 use std::collections::BTreeMap;
-use std::path::Path;
+use std::path::{Path, PathBuf};
 use std::{env, fs};
 
 use futures::future::{join_all, join3};
@@ -51,13 +51,27 @@ struct Table {
     minutes_at_rest: BTreeMap<String, Rest>,
 }
 
+fn path() -> PathBuf {
+    Path::new(env!("CARGO_MANIFEST_DIR")).join(TABLE)
+}
+
+fn expected() -> Table {
+    serde_json::from_str(&fs::read_to_string(path()).unwrap()).unwrap()
+}
+
+#[test]
+fn a_hosts_own_evaluator_costs_the_same_writes_as_carla() {
+    let table = expected();
+    let [carla, evaluated] = [Scenario::PUBLISHED, Scenario::EVALUATED].map(|of| &table.lifecycles[of.name].writes);
+    assert_eq!(evaluated, carla);
+}
+
 #[tokio::test(flavor = "multi_thread")]
 async fn a_submission_costs_what_the_table_expects() {
-    let path = Path::new(env!("CARGO_MANIFEST_DIR")).join(TABLE);
     if env::var_os(UPDATE).is_some() {
-        return fs::write(path, text(&measured().await)).unwrap();
+        return fs::write(path(), text(&measured().await)).unwrap();
     }
-    let expected: Table = serde_json::from_str(&fs::read_to_string(path).unwrap()).unwrap();
+    let expected = expected();
     let mut found = Vec::new();
     for _ in 0..TRIES {
         found = differences(&expected, &measured().await);

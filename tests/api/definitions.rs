@@ -8,6 +8,7 @@ use leaderboard_operator::crds;
 use serde_json::{Value, json};
 
 use super::objects::{Kind, causes, create, merge};
+use super::rule_cases::container::by_container;
 use crate::support::apiserver::server;
 
 #[tokio::test]
@@ -93,6 +94,44 @@ async fn a_minimal_leaderboard_reads_back_whole() {
         "retention": {},
                 })
     );
+}
+
+#[tokio::test]
+async fn a_minimal_leaderboard_of_a_hosts_container_reads_back_whole() {
+    let server = server().await;
+    let api = Kind::Leaderboard.api(&server.client(), &server.namespace("container").await);
+    let patch = json!({"spec": by_container(&json!({}))});
+    let read = create(&api, Kind::Leaderboard.object("a", &[&patch]), false)
+        .await
+        .unwrap();
+    assert_eq!(
+        read.data["spec"]["evaluation"],
+        json!({"container": {
+            "mode": "Interactive", "image": "evaluator:1", "command": ["evaluate"], "workers": 1, "shmSize": "64Mi",
+            "answerSeconds": 600, "merge": "Mean",
+        }})
+    );
+    assert_eq!(
+        read.data["spec"]["tracks"],
+        json!([{"name": "sensors", "container": {"score": {"metric": "accuracy", "order": "Descending"}}}])
+    );
+}
+
+#[tokio::test]
+async fn a_leaderboard_has_exactly_one_kind_of_evaluation() {
+    let server = server().await;
+    let api = Kind::Leaderboard.api(&server.client(), &server.namespace("kinds").await);
+    let carla = Kind::Leaderboard.object("a", &[]);
+    let both = json!({"spec": by_container(&json!({"evaluation": {"carla": carla["spec"]["evaluation"]["carla"]}}))});
+    let none = json!({"spec": {"evaluation": {"carla": null}}});
+    for patch in [both, none] {
+        let refused = create(&api, Kind::Leaderboard.object("a", &[&patch]), true).await;
+        let causes = causes(&refused.unwrap_err());
+        assert!(
+            causes.iter().any(|cause| cause.starts_with("spec.evaluation")),
+            "{causes:?}"
+        );
+    }
 }
 
 #[tokio::test]

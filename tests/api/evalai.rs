@@ -33,7 +33,7 @@ use leaderboard_base::tasks::Tasks;
 use leaderboard_contract::report::ContentId;
 use leaderboard_evalai::token::Token;
 use leaderboard_evalai::{
-    Changed, DesiredUpdate, Ended, Hub, ImageAnswer, Key, Misfit, Options, Outcome, Outline, Patience, Payload,
+    Changed, DesiredUpdate, Ended, Hub, ImageAnswer, Key, Metrics, Misfit, Options, Outcome, Outline, Patience, Payload,
     Progress, Publisher, Run, Status, StoredResult, Subject, SubmissionState, SweepRow, Target, Timeouts, Timing,
 };
 
@@ -76,7 +76,7 @@ fn target(api_server: &str, token: &str) -> Target {
         sweep: Duration::from_millis(200),
         period: Duration::from_millis(200),
         phases: [1, 2].into(),
-        labels: seed.challenges[0].phases[0].splits[0].schema.labels.clone().into(),
+        metrics: Metrics::Fixed(seed.challenges[0].phases[0].splits[0].schema.labels.clone().into()),
         inbox: None,
         is_observed: false,
         since: Timestamp::now() - SignedDuration::from_hours(1),

@@ -106,7 +106,7 @@ fn examples_run_what_their_comments_describe() {
     ] {
         let spec = leaderboard(name).spec;
         for track in &spec.tracks {
-            let shape = effective::shape(&spec, track);
+            let shape = effective::shape(spec.evaluation.carla().unwrap(), track);
             assert_eq!(
                 (shape.pairs, shape.routes, shape.repetitions),
                 (pairs, 20, repetitions),
@@ -151,17 +151,17 @@ fn a_run_of_the_examples_takes_the_gpus_of_one_node_and_fits_it() {
     ] {
         let text = std::fs::read_to_string(folder("examples").join(name)).unwrap();
         let spec = serde_saphyr::from_str::<Leaderboard>(&text).unwrap().spec;
-        let sides =
-            [&spec.evaluation.carla.simulator.resources, &spec.agent.resources].map(|side| side.as_ref().unwrap());
+        let carla = spec.evaluation.carla().unwrap();
+        let sides = [&carla.simulator.resources, &spec.agent.resources].map(|side| side.as_ref().unwrap());
         let sum = |what: &str| -> f64 { sides.iter().map(|side| number(side.requests.as_ref(), what)).sum() };
         let limit: f64 = sides.iter().map(|side| number(side.limits.as_ref(), "memory")).sum();
-        let pairs = f64::from(spec.evaluation.carla.pairs);
+        let pairs = f64::from(carla.pairs);
         assert!(pairs * sum("cpu") + 1.0 <= 47.8, "{name}");
         assert!(pairs * sum("memory") < 170.0 && pairs * limit < 170.0, "{name}");
         assert!(pairs * sum("ephemeral-storage") < 100.0, "{name}");
         let gpu = spec.gpu.as_ref().unwrap();
         assert_eq!(
-            (gpu.source(), 2 * spec.evaluation.carla.pairs),
+            (gpu.source(), 2 * carla.pairs),
             (GpuSource::PerContainer("nvidia.com/gpu"), 8)
         );
         for track in &spec.tracks {

@@ -30,7 +30,7 @@ use tokio::task::JoinHandle;
 use crate::support::files::until_there;
 use crate::support::ministack::{self, server};
 use leaderboard_api::names::FAILURE_LOG_KEY;
-use leaderboard_api::{Attempt, StorageClass};
+use leaderboard_api::{Attempt, CarlaPlan, PlannedEvaluation, StorageClass};
 use leaderboard_aws::archive::{Archive, Cause, Fetched, Kept};
 use leaderboard_aws::clients::Aws;
 use leaderboard_aws::logs::LogClient;
@@ -49,11 +49,12 @@ use leaderboard_pod::upload::send::{Sent, Uploader, Window};
 use leaderboard_pod::upload::wanted::Wanted;
 use leaderboard_pod::workspace::{self, WorkspaceError};
 use leaderboard_pod::{identity, ship};
-use leaderboard_protocol::files::{Mark, Member, Pair, Side, StatusFile};
+use leaderboard_protocol::files::{Host, Mark, Member, Pair, Side, StatusFile};
 
 const LIMIT: u64 = 1 << 30;
 const MIB: usize = 1 << 20;
 const PATIENCE: Duration = Duration::from_mins(2);
+const SIMULATOR: Side = Side::Host(Host::Simulator);
 
 /// A Pod's volumes in a temporary folder, and its prefix in a bucket of its own.
 struct Pod {
@@ -252,6 +253,14 @@ fn run(bucket: &str) -> Run {
     s3.prefix = Some("runs/".to_owned());
     s3.size_limit = LIMIT.to_string().parse().unwrap();
     run
+}
+
+/// The plan of CARLA's evaluation.
+fn carla(run: &mut Run) -> &mut CarlaPlan {
+    match &mut run.plan.evaluation {
+        PlannedEvaluation::Carla(carla) => carla,
+        PlannedEvaluation::Container(_) => panic!("it is not CARLA's"),
+    }
 }
 
 /// Text that compresses to nothing and repeats nowhere.

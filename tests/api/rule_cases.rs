@@ -1,5 +1,6 @@
 //! For each rule of the API a mistake that a person can make, and its neighbor that is no mistake.
 
+pub mod container;
 mod gpu;
 mod services;
 mod submissions;
@@ -65,6 +66,7 @@ pub fn all() -> Vec<Case> {
         containers(),
         times(),
         sizes_and_images(),
+        container::all(),
         gpu::all(),
         services::all(),
         submissions::all(),

@@ -128,7 +128,8 @@ async fn a_check_starts_while_the_leaderboard_is_paused_and_others_wait() {
     let api: Api<Submission> = Api::namespaced(server().await.client(), &world.namespace);
     let status = api.get("check-one").await.unwrap().status.unwrap();
     let plan = status.plan.unwrap();
-    assert_eq!((plan.workers(), plan.carla.routes, plan.carla.repetitions), (1, 1, 1));
+    let carla = plan.carla().unwrap();
+    assert_eq!((plan.workers(), carla.routes, carla.repetitions), (1, 1, 1));
     assert_eq!(api.get("check-one").await.unwrap().finalizers().len(), 0);
 
     // One without a Job ends at once.

@@ -16,13 +16,13 @@ use super::world::World;
 use crate::support::player::ROUTES;
 
 /// Changes what EvalAI's stand-in has of the leaderboard of a phase.
-fn change_board(world: &World, phase: usize, change: impl FnOnce(&mut Split)) {
+pub(super) fn change_board(world: &World, phase: usize, change: impl FnOnce(&mut Split)) {
     world
         .evalai
         .with_state(|state| change(&mut state.seed.challenges[0].phases[phase - 1].splits[0]));
 }
 
-fn tracks(board: Option<&Leaderboard>) -> &[TrackStatus] {
+pub(super) fn tracks(board: Option<&Leaderboard>) -> &[TrackStatus] {
     let status = board.and_then(|board| board.status.as_ref());
     status.map_or(&[], |status| &status.tracks)
 }
@@ -36,7 +36,7 @@ fn is_ready(board: Option<&Leaderboard>) -> bool {
 }
 
 /// Waits until the Leaderboard `lb` shows this.
-async fn until(world: &World, what: &str, holds: impl Fn(Option<&Leaderboard>) -> bool) -> Leaderboard {
+pub(super) async fn until(world: &World, what: &str, holds: impl Fn(Option<&Leaderboard>) -> bool) -> Leaderboard {
     let api = world.api::<Leaderboard>();
     let Ok(board) = timeout(LIMIT, await_condition(api.clone(), "lb", holds)).await else {
         panic!("{what}: {:?}", tracks(Some(&api.get("lb").await.unwrap())));

@@ -60,7 +60,7 @@ async fn usual(stand_in: &StandIn) -> (api::DynamoTable, Table) {
 }
 
 /// All rows of a table as text.
-async fn rows(stand_in: &StandIn, name: &str) -> Vec<BTreeMap<String, String>> {
+pub(super) async fn rows(stand_in: &StandIn, name: &str) -> Vec<BTreeMap<String, String>> {
     let items = client(stand_in)
         .scan()
         .table_name(name)

@@ -20,6 +20,7 @@ use leaderboard_api::{
 };
 use leaderboard_aws::archive::Archive;
 use leaderboard_base::shutdown::Stop;
+use leaderboard_contract::report::Report;
 use leaderboard_operator::kubernetes::Namespaces;
 use leaderboard_operator::observability::Observability;
 use leaderboard_operator::page::Page;
@@ -37,7 +38,7 @@ use tokio::time::timeout;
 
 use super::bridge::{LIMIT, StandIn};
 use super::objects::merge;
-use crate::support::player::{Cluster, Player, reports, running};
+use crate::support::player::{Cluster, Player, reports_as, running};
 use crate::support::{apiserver, played};
 
 /// A line of the routes file.
@@ -119,8 +120,13 @@ impl World {
 
     /// Plays runs that go well, with so long between two reports.
     pub(super) fn play(&self, period: Duration) -> Player {
+        self.play_as(period, |report| report)
+    }
+
+    /// The same with each report changed.
+    pub(super) fn play_as(&self, period: Duration, change: fn(Report) -> Report) -> Player {
         let s3 = self.aws.aws.s3(None, Some(&self.aws.endpoint));
-        Player::start(self.cluster(), reports(period, s3, &self.bucket))
+        Player::start(self.cluster(), reports_as(period, s3, &self.bucket, change))
     }
 
     /// Starts a controller that stops when the sender goes.

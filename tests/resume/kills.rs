@@ -12,7 +12,7 @@ use leaderboard_aws::archive::Archive;
 use leaderboard_pod::watch::Watch;
 use leaderboard_protocol::files::{KEPT_CHECKPOINT, Member, Pair, Side, StatusFile};
 
-use super::kubelet::{Kubelet, Name, all_done, members};
+use super::kubelet::{Kubelet, Name, SIMULATOR, all_done, members};
 use super::process::say;
 use super::results::{Results, next_route, of_the_drive, report, results};
 use super::submission::{PAIRS, ROUTES_OF_PAIR, Submission};
@@ -176,8 +176,8 @@ impl Run<'_> {
         let hit = match kill.kind {
             Kind::Agent => self.kubelet.kill_command(kill.of(Side::Agent)),
             Kind::AgentContainer => self.kubelet.kill(Name::Of(kill.of(Side::Agent))).await,
-            Kind::Simulator => self.kubelet.kill_command(kill.of(Side::Host)),
-            Kind::SimulatorContainer => self.kubelet.kill(Name::Of(kill.of(Side::Host))).await,
+            Kind::Simulator => self.kubelet.kill_command(kill.of(SIMULATOR)),
+            Kind::SimulatorContainer => self.kubelet.kill(Name::Of(kill.of(SIMULATOR))).await,
             Kind::Logcopy => self.kubelet.kill(Name::Logcopy).await,
             Kind::PodLost | Kind::PodEvicted => {
                 self.lose_pod(kill).await?;

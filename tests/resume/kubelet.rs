@@ -7,7 +7,7 @@ use std::path::{Path, PathBuf};
 use std::process::{ExitStatus, Stdio};
 
 use leaderboard_pod::places::Places;
-use leaderboard_protocol::files::{Mark, Member, Pair, Side, StatusFile};
+use leaderboard_protocol::files::{Host, Mark, Member, Pair, Side, StatusFile};
 use nix::sys::signal::{Signal, kill};
 use nix::unistd::Pid;
 use tokio::sync::mpsc;
@@ -34,11 +34,14 @@ impl std::fmt::Display for Name {
     }
 }
 
+/// The host's container of a pair.
+pub const SIMULATOR: Side = Side::Host(Host::Simulator);
+
 /// Both members of every pair.
 pub fn members() -> impl Iterator<Item = Member> {
     (1..=PAIRS)
         .filter_map(Pair::new)
-        .flat_map(|pair| [Side::Host, Side::Agent].map(|side| Member { side, pair }))
+        .flat_map(|pair| [SIMULATOR, Side::Agent].map(|side| Member { side, pair }))
 }
 
 /// Whether all agents report that they are done.
@@ -160,7 +163,7 @@ impl<'a> Kubelet<'a> {
     fn mount(&self, member: Member) {
         let status = self.places().status().join(member.to_string());
         let own = match member.side {
-            Side::Host => self.path("simulator"),
+            Side::Host(_) => self.path("simulator"),
             Side::Agent => self.path(&format!("agent/agent{}", member.pair)),
         };
         for folder in [status, own] {
@@ -333,7 +336,7 @@ impl<'a> Kubelet<'a> {
     /// Routes that were begun on each pair's simulators, in their order. A simulator writes its log itself, so that no line is
     /// lost with a runner.
     pub fn begun(&self) -> Vec<Vec<String>> {
-        let simulators = members().filter(|member| member.side == Side::Host);
+        let simulators = members().filter(|member| member.side == SIMULATOR);
         simulators.map(|member| begun(&self.log(Name::Of(member)))).collect()
     }
 

@@ -16,7 +16,7 @@ use tokio::time::timeout;
 
 use super::kubelet::Kubelet;
 use super::measure::{Sink, most_memory, serve};
-use super::submission::{Submission, make_volumes};
+use super::submission::{Submission, carla, make_volumes};
 
 const PAIRS: usize = 16;
 /// Seven eighths of what the Pod gives to logcopy.
@@ -149,8 +149,9 @@ fn merged(report: &Report) -> Option<(u64, String)> {
 async fn sixteen_pairs_with_the_largest_checkpoints_stay_below_logcopys_memory() {
     let (sink, endpoint, serving) = serve().await;
     let mut submission = Submission::on(&endpoint, "bucket", LeaderboardVersion::V2, &mut Rng::new()).await;
-    submission.run.plan.carla.slices = (0..PAIRS).map(two_routes).collect();
-    submission.run.plan.carla.routes = i32::try_from(2 * PAIRS).unwrap();
+    let plan = carla(&mut submission.run);
+    plan.slices = (0..PAIRS).map(two_routes).collect();
+    plan.routes = i32::try_from(2 * PAIRS).unwrap();
     // Half of it is for the agents' files, so the sparse ones are sent in part.
     submission.run.plan.storage.s3.size_limit = leaderboard_api::ByteQuantity::gibibytes(1);
     let limits = results_plan(&submission.run).unwrap().limits_of(0);

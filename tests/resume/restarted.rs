@@ -8,7 +8,7 @@ use fastrand::Rng;
 use super::kubelet::{Kubelet, members};
 use super::results::{report, results};
 use super::singles::{rounds_past, until_reported};
-use super::submission::{FASTER, PAIRS, ROUTES_OF_PAIR, Submission};
+use super::submission::{FASTER, PAIRS, ROUTES_OF_PAIR, Submission, carla};
 use crate::ministack::server;
 use leaderboard_api::LeaderboardVersion;
 use leaderboard_contract::report::{Outcome, Report};
@@ -166,8 +166,8 @@ async fn a_last_route_without_a_record_is_driven_although_the_progress_counts_it
 #[tokio::test(flavor = "multi_thread", worker_threads = 2)]
 async fn complete_files_of_a_real_evaluator_without_sensors_finish_with_the_originals_merge() {
     let mut submission = submission(LeaderboardVersion::V2, "replay=real/done-{pair}.json").await;
-    let plan = &mut submission.run.plan;
-    (plan.carla.slices, plan.carla.routes) = (leaderboard_api::effective::slices(16, PAIRS.into()), 16);
+    let plan = carla(&mut submission.run);
+    (plan.slices, plan.routes) = (leaderboard_api::effective::slices(16, PAIRS.into()), 16);
     let mut kubelet = Kubelet::new(&submission);
     kubelet.make_pod();
     let last = to_the_end(&submission, &mut kubelet).await;

@@ -5,7 +5,7 @@ use std::time::{Duration, Instant};
 use fastrand::Rng;
 use nix::sys::signal::Signal;
 
-use super::kubelet::{Kubelet, Name, members};
+use super::kubelet::{Kubelet, Name, SIMULATOR, members};
 use super::results::{report, results};
 use super::submission::{FASTER, Submission};
 use crate::ministack::{Proxy, server};
@@ -82,10 +82,10 @@ async fn all_crash(kubelet: &mut Kubelet<'_>) {
         let members = members().filter(move |member| member.side == side);
         members.map(move |member| StatusFile::Of(member, mark))
     };
-    for file in of(Side::Host, Mark::Start(0)) {
+    for file in of(SIMULATOR, Mark::Start(0)) {
         kubelet.until_has(file).await;
     }
-    let simulators: Vec<Name> = members().filter(|m| m.side == Side::Host).map(Name::Of).collect();
+    let simulators: Vec<Name> = members().filter(|m| m.side == SIMULATOR).map(Name::Of).collect();
     for name in &simulators {
         kubelet.signal(*name, Signal::SIGSTOP);
     }

@@ -6,7 +6,7 @@ use std::path::{Path, PathBuf};
 use std::sync::OnceLock;
 use std::sync::atomic::{AtomicU32, Ordering};
 
-use leaderboard_api::{LeaderboardVersion, Verify};
+use leaderboard_api::{CarlaPlan, LeaderboardVersion, PlannedEvaluation, Verify};
 use leaderboard_aws::archive::Archive;
 use leaderboard_contract::run::{ENV_POD_UID, ENV_RUN, Run};
 use leaderboard_evaluation::fixtures;
@@ -115,7 +115,7 @@ impl Submission {
             .env_remove("RESUME")
             .env_remove("CHALLENGE_FORMAT");
         match member.side {
-            Side::Host => self.simulator(&mut command, member, &places),
+            Side::Host(_) => self.simulator(&mut command, member, &places),
             Side::Agent => self.agent(&mut command, member, &places),
         }
         command
@@ -147,7 +147,8 @@ impl Submission {
         let checkpoint = work.join("agent_results.json");
         let path = ["CARLA/PythonAPI/carla", "scenario_runner", "leaderboard"].map(contents);
         let path = std::env::join_paths(path).unwrap();
-        let slice = &self.run.plan.carla.slices[usize::from(member.pair.get()) - 1];
+        let plan = self.run.plan.carla().unwrap();
+        let slice = &plan.slices[usize::from(member.pair.get()) - 1];
         // No route needs the file's content.
         let team_agent = contents("leaderboard/README.md");
         command
@@ -156,7 +157,7 @@ impl Submission {
             .args(["--idle-seconds=60", "--python-path", path.to_str().unwrap()])
             .arg(format!(
                 "--route-runs={}",
-                slice.routes() * u32::try_from(self.run.plan.carla.repetitions).unwrap()
+                slice.routes() * u32::try_from(plan.repetitions).unwrap()
             ))
             .arg("--")
             .arg(&programs().agent)
@@ -181,7 +182,7 @@ impl Submission {
             let copy = places.status().join(member.to_string()).join(KEPT_CHECKPOINT);
             command.env("ROUTE_COPY", copy);
         }
-        match self.run.plan.carla.version {
+        match plan.version {
             LeaderboardVersion::V1 => {
                 let scenarios = contents("leaderboard/data/all_towns_traffic_scenarios_private.json");
                 command.arg(format!("--scenarios={}", scenarios.display()));
@@ -214,6 +215,14 @@ pub fn make_volumes(root: &Path) {
     fs::write(places.stop(), "").unwrap();
 }
 
+/// The plan of CARLA's evaluation.
+pub fn carla(run: &mut Run) -> &mut CarlaPlan {
+    match &mut run.plan.evaluation {
+        PlannedEvaluation::Carla(carla) => carla,
+        PlannedEvaluation::Container(_) => panic!("it is not CARLA's"),
+    }
+}
+
 fn run(endpoint: &str, bucket: &str, id: &str, format: LeaderboardVersion) -> Run {
     let mut run = Run {
         submission: id.to_owned(),
@@ -224,7 +233,7 @@ fn run(endpoint: &str, bucket: &str, id: &str, format: LeaderboardVersion) -> Ru
         ..fixtures::run()
     };
     run.plan.run_id = id.parse().unwrap();
-    let carla = &mut run.plan.carla;
+    let carla = carla(&mut run);
     (carla.version, carla.slices, carla.routes) = (format, leaderboard_api::effective::slices(20, 4), 20);
     let s3 = &mut run.plan.storage.s3;
     (s3.bucket, s3.prefix) = (bucket.to_owned(), Some("runs/".to_owned()));

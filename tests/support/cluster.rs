@@ -74,6 +74,11 @@ impl Lab {
     pub fn challenge(&self, image: &str) -> String {
         format!("{}/challenge/{image}", self.registry)
     }
+
+    /// An image of the guessing game, such as `agent:1`.
+    pub fn game(&self, image: &str) -> String {
+        format!("{}/guessing-game/{image}", self.registry)
+    }
 }
 
 /// One test's part of the cluster.

@@ -5,7 +5,7 @@ use std::time::Duration;
 
 use evalai_stand_in::faults::{Failure, Fault, When};
 use evalai_stand_in::log::Entry;
-use evalai_stand_in::model::{LeaderboardRow, Status, Submission};
+use evalai_stand_in::model::{DatasetSplit, LeaderboardRow, Status, Submission};
 use evalai_stand_in::sqs::SqsQueues;
 use evalai_stand_in::{Config, Handle, Knobs, Seed};
 use serde_json::{Value, json};
@@ -75,6 +75,24 @@ impl Evalai {
         let phases = std::mem::take(&mut seed.challenges[1].phases);
         seed.challenges[0].phases.extend(phases);
         Self::serve(scene, seed, 0).await
+    }
+
+    /// Starts one with the phase [`FIRST_PHASE`], which shows partial results and has one split with these labels, of which the first
+    /// ranks, lowest first.
+    pub async fn start_for(scene: &Scene, split: &str, labels: &[&str]) -> Self {
+        let mut seed = Self::wide_seed(1);
+        let phase = seed.challenges[0].phases.last_mut().unwrap();
+        phase.is_partial_submission_evaluation_enabled = true;
+        let board = &mut phase.splits[0];
+        board.dataset_split = DatasetSplit {
+            id: FIRST_PHASE,
+            name: split.to_owned(),
+            codename: split.to_owned(),
+        };
+        board.is_leaderboard_order_descending = false;
+        board.schema.labels = labels.iter().map(|&label| label.to_owned()).collect();
+        labels[0].clone_into(&mut board.schema.default_order_by);
+        Self::serve(scene, seed, REQUESTS_PER_MINUTE).await
     }
 
     async fn serve(scene: &Scene, mut seed: Seed, throttle: usize) -> Self {

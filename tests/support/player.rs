@@ -25,7 +25,7 @@ use tokio::sync::{oneshot, watch};
 use tokio::task::JoinHandle;
 use tokio::time::timeout;
 
-pub use self::reports::{ROUTES, report, reports};
+pub use self::reports::{ROUTES, report, reports, reports_as};
 use super::played;
 
 /// The node of Pods where a test names no other.

@@ -95,6 +95,11 @@ pub fn simulator_container(pair: usize) -> String {
     format!("simulator-{pair}")
 }
 
+/// Name of the container of a host's evaluator; workers count from 1.
+pub fn evaluator_container(worker: usize) -> String {
+    format!("evaluator-{worker}")
+}
+
 /// Name of the Submission of an EvalAI submission.
 pub fn submission(id: i64) -> String {
     format!("submission-{id}")

@@ -31,7 +31,7 @@ pub const SIMULATORS: &str = "simulator/";
 /// Before the keys of the evaluators' files; the number of the worker follows.
 pub const EVALUATORS: &str = "evaluators/";
 /// Name of the file in an evaluator's folder with its result.
-pub const RESULT_FILE: &str = "result.json";
+pub const RESULT_FILE: &str = leaderboard_protocol::files::RESULT;
 
 /// The folder of an agent, without a slash at its end.
 pub fn agent_folder(pair: Pair) -> String {

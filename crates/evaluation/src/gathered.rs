@@ -105,9 +105,9 @@ pub struct Summary {
 }
 
 /// What EvalAI gets as a result.
-#[derive(Clone, Debug, PartialEq, Eq)]
+#[derive(Clone, Debug, Default, PartialEq, Eq)]
 pub struct Texts {
-    /// JSON of the metrics; zeros until the results are complete.
+    /// JSON of the metrics; zeros or an empty list until the results are complete.
     pub results: String,
     /// The same with the metrics so far; `None` before the first unit, and once the results are complete.
     pub partial_results: Option<String>,

@@ -156,15 +156,17 @@ fn spoiled(gathered: &Gathered) -> Option<Ending> {
         return None;
     }
     let workers = gathered.seen.iter().zip(&gathered.unreadable).zip(&gathered.if_ended);
-    let mut short = workers.filter_map(|((seen, unreadable), ending)| {
+    let short = workers.filter_map(|((seen, unreadable), ending)| {
         let is_known = seen.done && !unreadable;
         ending.as_ref().filter(|_| is_known)
     });
-    if let Some(ending) = short.next() {
-        return Some(ending.clone());
-    }
     let all_done = gathered.seen.iter().all(|worker| worker.done);
-    gathered.unmerged.clone().filter(|_| all_done)
+    let unmerged = gathered.unmerged.iter().filter(|_| all_done);
+    // One refusal refuses all.
+    let first = short
+        .chain(unmerged)
+        .min_by_key(|ending| !matches!(ending, Ending::Invalid(_)));
+    first.cloned()
 }
 
 /// How long the programs wait for what they cannot observe.

@@ -16,6 +16,7 @@ pub mod container;
 #[cfg(any(test, feature = "fixtures"))]
 #[allow(clippy::unwrap_used, clippy::arithmetic_side_effects)]
 pub mod fixtures;
+mod gather;
 mod gathered;
 pub mod judge;
 pub mod workload;

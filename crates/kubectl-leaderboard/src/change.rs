@@ -109,7 +109,7 @@ fn how_it_stops(submission: &Submission, leaderboard: Observed<'_>) -> String {
     }
     format!(
         "The Pod is asked to stop and uploads its results. After {grace} the Job is deleted, then the Pod is force-deleted. \
-         Completed routes are kept, and results that are complete by then count."
+         Completed work is kept, and results that are complete by then count."
     )
 }
 
@@ -146,9 +146,9 @@ fn resume(submission: &Submission, leaderboard: Observed<'_>, frame: Frame) -> R
     page.paragraph(&format!("Requested attempt {attempt} of {}.", submission.name_any()));
     match results {
         Some(results) => page.paragraph(&format!(
-            "It continues from the results in {results} and runs the missing routes."
+            "It continues from the results in {results} and does what is missing."
         )),
-        None => page.paragraph("Its status names no stored results, so it starts with the first route."),
+        None => page.paragraph("Its status names no stored results, so it starts from the beginning."),
     }
     for problem in board::problems(&submission.spec.leaderboard_name, leaderboard) {
         page.paragraph(&problem.text);

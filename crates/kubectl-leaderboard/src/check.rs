@@ -1,4 +1,4 @@
-//! `check`: one route with an agent of the host's own, shown as `why` shows it, next to the conditions of its Leaderboard.
+//! `check`: one worker with an agent of the host's own, shown as `why` shows it, next to the conditions of its Leaderboard.
 //!
 //! Called by `main`. `object`, `lines` and `has_passed` are pure.
 
@@ -9,7 +9,7 @@ use clap::Args;
 use kube::ResourceExt;
 use leaderboard_api::conditions::{self, Condition};
 use leaderboard_api::text::sentence;
-use leaderboard_api::{Leaderboard, State, Submission, SubmissionStatus, reasons};
+use leaderboard_api::{Evaluation, Leaderboard, State, Submission, SubmissionStatus, reasons};
 use serde_json::{Value, json};
 
 use crate::board::Observed;
@@ -30,7 +30,7 @@ const NAME_PREFIX: &str = "check-";
 pub struct Check {
     /// Name of the Leaderboard.
     name: String,
-    /// Track to drive [default: the first].
+    /// Track to run it on [default: the first].
     #[arg(long)]
     track: Option<String>,
     /// Image of an agent of your own [default: spec.check.image of the Leaderboard].
@@ -88,9 +88,13 @@ pub(super) fn object(leaderboard: &Leaderboard, wanted: &Check) -> Result<Value,
     submit::fits(&wanted.name, &track, Observed::Found(leaderboard))?;
     let named = spec.check.as_ref().map(|check| check.image.clone());
     let image = wanted.image.clone().or(named).ok_or_else(|| {
+        let of_carla = match spec.evaluation {
+            Evaluation::Carla(_) => "; examples/check-agent/Dockerfile makes one of the Leaderboard's NPC agent",
+            Evaluation::Container(_) => "",
+        };
         format!(
-            "Leaderboard {} names no image for a check. Give the image of an agent of your own with --image, or set spec.check.image; \
-             examples/check-agent/Dockerfile makes one of the Leaderboard's NPC agent",
+            "Leaderboard {} names no image for a check. Give the image of an agent of your own with --image, or set \
+             spec.check.image{of_carla}",
             wanted.name
         )
     })?;
@@ -114,7 +118,7 @@ pub(super) fn lines(submission: &Submission, leaderboard: Observed<'_>, frame: F
     lines
 }
 
-/// Whether its route was driven, stored and sent to CloudWatch, and the Leaderboard is Ready.
+/// Whether its run has finished, and is stored and sent to CloudWatch, and the Leaderboard is Ready.
 pub(super) fn has_passed(submission: &Submission, leaderboard: Observed<'_>) -> bool {
     let is_well = |status: &SubmissionStatus| {
         let logged = conditions::get(&status.conditions, conditions::LOGGED);

@@ -194,7 +194,7 @@ pub(super) fn done(submission: &Submission, frame: Frame) -> Vec<String> {
         )
     };
     wrap(
-        &format!("Done.{part} Logs may reveal private routes: show them to hosts only."),
+        &format!("Done.{part} Logs may reveal private data: show them to hosts only."),
         frame.width,
     )
 }

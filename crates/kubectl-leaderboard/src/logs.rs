@@ -8,7 +8,7 @@ use clap::{Args, ValueEnum};
 use futures::StreamExt;
 use k8s_openapi::api::core::v1::Pod;
 use kube::ResourceExt;
-use leaderboard_api::{Attempt, State, Submission, SubmissionStatus, names};
+use leaderboard_api::{Attempt, RunPlan, State, Submission, SubmissionStatus, names};
 
 use crate::aws::{Unread, read};
 use crate::cluster::Cluster;
@@ -29,7 +29,7 @@ pub struct Logs {
     /// Only this worker, from 1.
     #[arg(long, value_name = "NUMBER")]
     worker: Option<usize>,
-    /// Containers: the agents, the simulators, workspace and contents (start), or logcopy, which stores results.
+    /// Containers: the agents, the simulators or evaluators beside them, workspace and contents (start), or logcopy, which stores results.
     #[arg(long, value_enum, default_value_t, value_name = "CONTAINERS")]
     of: Whose,
     /// Endpoint of the bucket, if it is not AWS's, that may get your AWS credentials once the Pod is gone.
@@ -43,6 +43,7 @@ pub(super) enum Whose {
     #[default]
     Agent,
     Simulator,
+    Evaluator,
     // The containers that prepare the Pod.
     Start,
     Logcopy,
@@ -58,12 +59,23 @@ impl Whose {
         match self {
             Self::Agent => of_workers(names::agent_container),
             Self::Simulator => of_workers(names::simulator_container),
+            Self::Evaluator => of_workers(names::evaluator_container),
             Self::Start => {
                 let all = names::INIT_CONTAINERS.into_iter();
                 let that_end = all.filter(|name| *name != names::CONTAINER_LOGCOPY);
                 that_end.map(|name| (name.to_owned(), name.to_owned())).collect()
             }
             Self::Logcopy => vec![("logcopy".to_owned(), names::CONTAINER_LOGCOPY.to_owned())],
+        }
+    }
+
+    /// The choice in place of this one, if the workers of the run have no such containers.
+    fn in_place(self, plan: Option<&RunPlan>) -> Option<&'static str> {
+        let has_evaluators = plan?.container().is_some();
+        match self {
+            Self::Simulator if has_evaluators => Some("evaluator"),
+            Self::Evaluator if !has_evaluators => Some("simulator"),
+            _ => None,
         }
     }
 
@@ -79,6 +91,7 @@ impl Whose {
         match self {
             Self::Agent => of_workers(|worker| format!("agent/agent{worker}/leaderboard.log")),
             Self::Simulator => of_workers(|worker| format!("simulator/console-{worker}.log")),
+            Self::Evaluator => of_workers(|worker| format!("evaluators/{worker}/console.log")),
             Self::Start => Vec::new(),
             Self::Logcopy => vec![("logcopy".to_owned(), "logcopy/logcopy.log".to_owned())],
         }
@@ -99,6 +112,12 @@ pub async fn logs(cluster: &Cluster, wanted: &Logs) -> Result<ExitCode, Error> {
     let workers = workers(&submission);
     if let Some(worker) = wanted.worker.filter(|worker| *worker == 0 || *worker > workers.max(1)) {
         return Err(Error::Unfit(no_worker(&wanted.name, worker, workers)));
+    }
+    if let Some(other) = wanted.of.in_place(plan(&submission)) {
+        return Err(Error::Unfit(format!(
+            "beside each agent of {} is its {other}. Use --of {other}",
+            wanted.name
+        )));
     }
     if wanted.follow && !facts::has_ended(&submission) {
         return follow::follow(cluster, wanted, submission).await;
@@ -165,15 +184,26 @@ fn sources(wanted: &Logs, workers: usize) -> Vec<Source> {
     containers.map(source).collect()
 }
 
+fn plan(submission: &Submission) -> Option<&RunPlan> {
+    submission.status.as_ref()?.plan.as_ref()
+}
+
 fn workers(submission: &Submission) -> usize {
-    let plan = submission.status.as_ref().and_then(|status| status.plan.as_ref());
-    plan.map_or(0, leaderboard_api::RunPlan::workers)
+    plan(submission).map_or(0, RunPlan::workers)
+}
+
+/// Whether a Pod has this container: not each kind of evaluation has all.
+fn has(pod: &Pod, container: &str) -> bool {
+    pod.spec.as_ref().is_none_or(|spec| {
+        let mut all = spec.containers.iter().chain(spec.init_containers.iter().flatten());
+        all.any(|known| known.name == container)
+    })
 }
 
 /// Prints the lines of several containers so far, one after the other, each with its label.
 async fn stream(cluster: &Cluster, pod: &Pod, sources: &[Source]) -> Result<ExitCode, Error> {
     let name = pod.name_any();
-    for source in sources {
+    for source in sources.iter().filter(|source| has(pod, &source.container)) {
         let container = &source.container;
         let mut lines = match cluster.log(&name, container).await {
             Ok(lines) => lines,
@@ -323,8 +353,45 @@ mod tests {
             vec!["simulator/console-2.log".to_owned()],
         );
         assert_eq!(names(Whose::Simulator, Some(2)), one);
+        let evaluators = (
+            two("evaluator-1", "evaluator-2"),
+            two("evaluators/1/console.log", "evaluators/2/console.log"),
+        );
+        assert_eq!(names(Whose::Evaluator, None), evaluators);
         assert_eq!(names(Whose::Start, None), (two("workspace", "contents"), vec![]));
         assert_eq!(names(Whose::Logcopy, Some(2)).0, ["logcopy"]);
+    }
+
+    #[test]
+    fn each_kind_of_evaluation_has_containers_of_its_own() {
+        let plan = |kind: &str, of: Value| -> RunPlan {
+            let plan =
+                json!({"runId": "mine", kind: of, "track": "t", "storage": {"s3": {"bucket": "b"}}, "image": "a"});
+            serde_json::from_value(plan).unwrap()
+        };
+        let evaluated =
+            json!({"mode": "Interactive", "workers": 2, "merge": "Mean", "score": {"metric": "m"}, "image": "e"});
+        let driven = json!({"version": "V2", "codename": "S", "slices": [], "routes": 1, "repetitions": 1, "contentsImage": "c",
+            "simulatorImage": "s"});
+        let (evaluated, driven) = (plan("container", evaluated), plan("carla", driven));
+        for (plan, of, other) in [
+            (Some(&evaluated), Whose::Simulator, Some("evaluator")),
+            (Some(&driven), Whose::Evaluator, Some("simulator")),
+            (Some(&evaluated), Whose::Evaluator, None),
+            (Some(&driven), Whose::Simulator, None),
+            (Some(&evaluated), Whose::Agent, None),
+            // Which kind it is, is not known yet.
+            (None, Whose::Simulator, None),
+        ] {
+            assert_eq!(of.in_place(plan), other, "{of:?}");
+        }
+        let containers = json!({"containers": [{"name": "evaluator-1"}], "initContainers": [{"name": "workspace"}]});
+        let pod: Pod = serde_json::from_value(json!({"metadata": {}, "spec": containers})).unwrap();
+        let has: Vec<bool> = ["workspace", "contents", "evaluator-1"]
+            .iter()
+            .map(|name| has(&pod, name))
+            .collect();
+        assert_eq!(has, [true, false, true]);
     }
 
     #[test]

@@ -102,12 +102,12 @@ enum Command {
     Dashboard(dashboard::Dashboard),
     /// Print what the agents of a submission print.
     Logs(logs::Logs),
-    /// Drive one route with an agent of your own, and show whether the Leaderboard works.
+    /// Run an agent of your own once, and show whether the Leaderboard works.
     #[command(
-        after_help = "Exit code 0: its route is Finished and the Leaderboard Ready; 1: one of them is not, or an error.\n\nMore: docs/check.md"
+        after_help = "Exit code 0: its run is Finished and the Leaderboard Ready; 1: one of them is not, or an error.\n\nMore: docs/check.md"
     )]
     Check(check::Check),
-    /// Stop a submission. Completed routes are kept.
+    /// Stop a submission. Completed work is kept.
     #[command(
         after_help = "Exit code 0: the cancellation is requested; with --wait, the submission has ended. 1: it had already ended, or an error."
     )]
@@ -126,7 +126,7 @@ enum Command {
     /// Check manifests by schema and rules, without a cluster.
     #[command(after_help = "Exit code 0: no fault. 1: a fault, or a file that cannot be read.")]
     Lint(lint::Lint),
-    /// Collect a support bundle in one file, without Secrets, routes and names of teams.
+    /// Collect a support bundle in one file, without Secrets, logs and names of teams.
     Report(report::Report),
     /// Print manifests for a pipeline of Step Functions that this operator takes over. It asks neither AWS nor a cluster.
     #[command(

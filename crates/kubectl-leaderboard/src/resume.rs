@@ -3,7 +3,7 @@
 use clap::{ArgGroup, Args};
 use jiff::Timestamp;
 use kube::ResourceExt;
-use leaderboard_api::{FailureClass, State, Submission, SubmissionStatus};
+use leaderboard_api::{FailureClass, PlannedEvaluation, State, Submission, SubmissionStatus};
 
 use crate::change::Request;
 use crate::cluster::Filter;
@@ -117,7 +117,13 @@ impl Resume {
 /// What is chosen, with the class of each failure.
 pub fn lines(chosen: &[&Submission], frame: Frame) -> Vec<String> {
     let rows: Vec<Vec<String>> = chosen.iter().map(|one| row(one, frame.now)).collect();
-    let head = ["NAME", "TEAM", "REASON", "CLASS", "SINCE", "NODE", "SIMULATOR"];
+    let is_by_evaluator = |one: &&Submission| matches!(evaluation(one), Some(PlannedEvaluation::Container(_)));
+    let image = if chosen.iter().any(is_by_evaluator) {
+        "EVALUATOR"
+    } else {
+        "SIMULATOR"
+    };
+    let head = ["NAME", "TEAM", "REASON", "CLASS", "SINCE", "NODE", image];
     table(&head, &rows, frame.width)
 }
 
@@ -132,13 +138,20 @@ pub fn dry_run(verb: &str, chosen: &[&Submission], frame: Frame) -> Vec<String> 
     lines
 }
 
+fn evaluation(one: &Submission) -> Option<&PlannedEvaluation> {
+    Some(&one.status.as_ref()?.plan.as_ref()?.evaluation)
+}
+
 fn row(one: &Submission, now: Timestamp) -> Vec<String> {
     let status = one.status.as_ref();
     let failure = status.and_then(|status| status.failure.as_ref());
     let class = failure.map_or("", |failure| failure.class.as_str());
-    let plan = status.and_then(|status| status.plan.as_ref());
+    let image = evaluation(one).map(|evaluation| match evaluation {
+        PlannedEvaluation::Carla(carla) => &carla.simulator_image,
+        PlannedEvaluation::Container(container) => &container.image,
+    });
     // The registry is the same for all, and the tag is what differs.
-    let simulator = plan.and_then(|plan| plan.carla.simulator_image.rsplit('/').next());
+    let image = image.and_then(|image| image.rsplit('/').next());
     let since = facts::since(one).map(|at| span(now.duration_since(at).as_secs()));
     vec![
         one.name_any(),
@@ -150,7 +163,7 @@ fn row(one: &Submission, now: Timestamp) -> Vec<String> {
         class.to_owned(),
         since.unwrap_or_default(),
         status.and_then(|status| status.node_name.clone()).unwrap_or_default(),
-        simulator.unwrap_or_default().to_owned(),
+        image.unwrap_or_default().to_owned(),
     ]
 }
 

@@ -9,9 +9,9 @@ const LEAST: usize = 8;
 /// What is copied from a table or searched for, so it is not cut.
 const WHOLE: [&str; 5] = ["NAMESPACE", "NAME", "SUBMISSION", "STATE", "REASON"];
 /// What `why`, `logs` and `-o wide` show as well, so that a narrow terminal may go without it.
-const SPARE: [&str; 4] = ["QUEUE", "CRASHES", "NODE", "SIMULATOR"];
+const SPARE: [&str; 5] = ["QUEUE", "CRASHES", "NODE", "SIMULATOR", "EVALUATOR"];
 /// What is cut at its start: the tags of an image's versions differ at the end.
-const ENDS: [&str; 1] = ["SIMULATOR"];
+const ENDS: [&str; 2] = ["SIMULATOR", "EVALUATOR"];
 /// What a bar is made of: the part that is done, and the rest.
 pub(super) const DONE: char = '█';
 pub(super) const OPEN: char = '░';

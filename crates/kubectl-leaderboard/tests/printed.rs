@@ -227,6 +227,8 @@ fn manifests_are_checked_without_a_cluster() {
             &["lint", "tests/manifests/good.yaml"],
             &["lint", "tests/manifests/bad.yaml"],
             &["lint", "tests/manifests/broken.yaml", "tests/manifests/good.yaml"],
+            &["lint", "tests/manifests/result.json"],
+            &["lint", "tests/manifests/bad-result.json"],
             &["lint", "tests/manifests/missing.yaml"],
             &["lint", "-"],
         ],

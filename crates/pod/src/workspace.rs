@@ -279,6 +279,7 @@ mod tests {
     use leaderboard_contract::report::RefusedResults;
     use leaderboard_contract::verdict::{NotAVerdict, VERDICT_BYTES};
     use leaderboard_evaluation::fixtures;
+    use leaderboard_evaluation::judge::Pace;
 
     fn first() -> Report {
         let (run, folder) = (fixtures::run(), tempfile::tempdir().unwrap());
@@ -336,6 +337,26 @@ mod tests {
                 verdict.message
             );
         }
+    }
+
+    #[test]
+    fn each_evaluator_finds_a_folder_that_any_user_may_write() {
+        let root = tempfile::tempdir().unwrap();
+        let setting = Setting {
+            run: fixtures::container_run(),
+            pod_uid: "pod-1".to_owned(),
+            api_server: None,
+            role_arn: None,
+            places: Places::below(root.path()),
+            pace: Pace::default(),
+        };
+        fs::create_dir(&setting.places.logs).unwrap();
+        let made = folders(&setting).unwrap();
+        for folder in ["agent", "evaluators/1", "evaluators/2"] {
+            let mode = fs::metadata(made.path().join(folder)).unwrap().permissions().mode();
+            assert_eq!(mode & 0o777, 0o777, "{folder}");
+        }
+        assert!(!made.path().join("evaluators/3").exists() && !made.path().join("simulator").exists());
     }
 
     #[test]

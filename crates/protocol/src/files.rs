@@ -93,7 +93,7 @@ impl FromStr for Pair {
     }
 }
 
-/// What the host's container of a pair runs. All pairs of a run have the same.
+/// Kind of the host's container of a pair. All pairs of a run have the same.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, PartialOrd, Ord, Hash)]
 pub enum Host {
     /// A simulator's server, for an agent that evaluates itself against it. The agent has the last word.

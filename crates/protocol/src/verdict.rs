@@ -36,9 +36,10 @@ pub enum What {
     Cancelled,
     /// The container was ended from outside (SIGTERM).
     Stopped,
-    /// The simulator's server did not answer in time, the evaluator could not be reached or had no complete result in time, or the
-    /// agent's host did not come.
+    /// The simulator's server did not answer in time, the evaluator did not listen in time, or the agent's host did not come.
     NotReady,
+    /// The evaluator's agent is done, or has forged that it is, and no complete result came in time.
+    NoResult,
     /// The agent crashed, and at that moment the simulator's server did not answer any more.
     ServerSilent,
     /// Another process of the Pod has taken a port of the simulator's server or of the evaluator.

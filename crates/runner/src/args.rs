@@ -97,7 +97,7 @@ pub enum Role {
     },
 }
 
-/// What a host's container runs.
+/// Command of a host's container.
 #[derive(Debug, Clone, PartialEq)]
 pub enum Server {
     Simulator {
@@ -115,7 +115,7 @@ pub enum Server {
     },
 }
 
-/// What an agent's container runs.
+/// Command of an agent's container.
 #[derive(Debug, Clone, PartialEq)]
 pub enum Program {
     /// It evaluates itself against a simulator, and keeps a checkpoint.
@@ -157,7 +157,7 @@ impl Job {
         }
     }
 
-    /// What the host's container of the pair runs.
+    /// Kind of the pair's host.
     pub const fn host(&self) -> Host {
         match &self.role {
             Role::Host {

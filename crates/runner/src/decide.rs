@@ -101,7 +101,7 @@ pub(crate) struct Seen {
     pub(crate) terminated: bool,
     /// The agent has printed nothing for too long.
     pub(crate) idle: bool,
-    /// What this side waits for is late: its command to be ready, its host, or the result of an evaluator whose agent is done.
+    /// Late is the readiness of a host's command, an agent's host, or the result of an evaluator whose agent is done.
     pub(crate) overdue: bool,
 }
 

@@ -76,8 +76,10 @@ fn of_host(job: &Job, round: u32) -> Result<Command, NoGraphics> {
         words = words.iter().map(|word| graphics::with_adapter(word, adapter)).collect();
         environment.push((ADAPTER, adapter.to_string().into()));
     }
-    if let Server::Evaluator { .. } = server {
-        environment.push(("RESUME", resume(env::var_os("RESUME"), round, false)));
+    if let Server::Evaluator { results, .. } = server {
+        // A Job that follows on a failed one in the same attempt has its files.
+        let has_files = results.read_dir().is_ok_and(|mut files| files.next().is_some());
+        environment.push(("RESUME", resume(env::var_os("RESUME"), round, has_files)));
         words = expand_all(&words, &environment);
     }
     let mut command = group::command(&words, &environment);

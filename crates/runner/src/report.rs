@@ -72,7 +72,8 @@ const fn what(end: &End<'_>) -> What {
         Cause::PeerCrashed => What::PeerCrashed,
         Cause::Cancelled => What::Cancelled,
         Cause::Idle => What::Idle,
-        Cause::NotReady | Cause::NoResult => What::NotReady,
+        Cause::NotReady => What::NotReady,
+        Cause::NoResult => What::NoResult,
         Cause::ServerSilent => What::ServerSilent,
         Cause::PortTaken => What::PortTaken,
         Cause::NoGpu | Cause::AgentHasNoGpu => What::NoGpu,
@@ -259,7 +260,7 @@ mod tests {
                     left: Some("its result is not final".to_owned()),
                     ..END
                 },
-                What::NotReady,
+                What::NoResult,
                 "the agent is done, and the evaluator had no complete result in time; its result is not final",
             ),
         ];

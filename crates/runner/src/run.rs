@@ -364,11 +364,7 @@ impl Runner {
         let ran = self.group.is_some();
         own_folder::reopen(&self.job.status.join(self.me.to_string()));
         let (complete, left) = self.results(cause);
-        // What was complete a moment ago counts only if it still is, now that nothing can change it any more.
-        let cause = match cause {
-            Cause::HasResult if !complete => Cause::ChildEnded,
-            other => other,
-        };
+        let cause = self.of_the_result(cause, complete);
         self.report(&report::End {
             status: self.status(),
             out_of_memory: ran && memory::kills() > self.memory_kills,

@@ -207,7 +207,7 @@ fn an_evaluator_without_a_result_in_time_is_a_crash() {
     assert!(began.elapsed() >= Duration::from_secs(1));
     let verdict = evaluator.verdict();
     let why = "the agent is done, and the evaluator had no complete result in time; there is no result file";
-    assert_eq!((verdict.what, verdict.why.as_str()), (What::NotReady, why));
+    assert_eq!((verdict.what, verdict.why.as_str()), (What::NoResult, why));
     assert_eq!(pod.files(EVALUATOR), ["evaluator-1.crash0", "evaluator-1.start0"]);
 }
 
@@ -239,6 +239,16 @@ fn an_evaluator_that_crashes_after_its_agents_end_is_started_again_alone() {
     assert!(!never.exists(), "an agent that is done is not started again");
     assert_eq!(fs::read_to_string(pod.path("said")).unwrap(), "RESUME=[1]\n");
     assert_eq!(pod.files(AGENT), ["agent-1.done", "agent-1.start0"]);
+}
+
+#[test]
+fn an_evaluator_that_has_files_of_an_earlier_pod_resumes() {
+    let pod = Pod::new();
+    fs::write(pod.path("results/games.json"), "[]").unwrap();
+    let (mut evaluator, _agent) = (pod.evaluator(&patient(&pod), &[]), pod.plain("exec sleep 1000", &[]));
+    go(&pod);
+    is_stored(&pod, &mut evaluator);
+    assert_eq!(fs::read_to_string(pod.path("said")).unwrap(), "RESUME=[1]\n");
 }
 
 #[test]
@@ -278,9 +288,7 @@ fn an_agent_that_crashes_while_its_evaluator_completes_is_done_with_it() {
     let crash = format!("until [ -e {} ]; do sleep 0.02; done; exit 3", begun.display());
     let (mut evaluator, mut agent) = (pod.evaluator(&script, &[]), pod.plain(&crash, &[]));
     assert_eq!(agent.code(), 0, "{}", agent.stderr());
-    pod.until(EVALUATOR, Mark::Done);
-    pod.write(StatusFile::Stored);
-    assert_eq!(evaluator.code(), 0);
+    is_stored(&pod, &mut evaluator);
     assert!(pod.has(AGENT, Mark::Done) && pod.has(AGENT, Mark::Crash(0)));
 }
 
@@ -418,13 +426,9 @@ fn what_an_agent_forges_ends_nothing_and_completes_nothing() {
     support::until_exists(&pod.status().join("agent-1/result.json"));
     assert!(evaluator.stays(MOMENT), "only the time for the result has begun");
     assert!(agent.stays(Duration::ZERO));
-    assert_eq!(evaluator.code(), 1);
-    assert_eq!(evaluator.verdict().what, What::NotReady);
-    assert_eq!(
-        agent.code(),
-        1,
-        "its evaluator's crash stops it, whatever it has forged"
-    );
+    assert_eq!((evaluator.code(), evaluator.verdict().what), (1, What::NoResult));
+    let end = (agent.code(), agent.verdict().what);
+    assert_eq!(end, (1, What::PeerCrashed), "no agent that is done ends so");
     assert!(!pod.has(EVALUATOR, Mark::Done));
 
     let mut evaluator = pod.evaluator(&patient(&pod), &[]);
@@ -435,12 +439,23 @@ fn what_an_agent_forges_ends_nothing_and_completes_nothing() {
 }
 
 #[test]
-fn the_words_of_an_evaluator_see_the_round() {
-    let pod = Pod::new();
-    let script = format!("echo '[$(RESUME)] $$(RESUME)' > {}; exit 4", pod.path("said").display());
-    for expected in ["[] $(RESUME)\n", "[1] $(RESUME)\n"] {
-        let mut evaluator = pod.evaluator(&script, &["--peer-seconds=0"]);
+fn the_words_of_both_commands_see_their_environment() {
+    let mut pod = Pod::new();
+    pod.environment.push(("WORKER".to_owned(), "1".to_owned()));
+    let said = |name: &str| fs::read_to_string(pod.path(name)).unwrap();
+    let words = "echo '$(WORKER) [$(RESUME)] $$(WORKER)'";
+    let script = |name: &str| format!("{words} >> {}; exit 4", pod.path(name).display());
+    for _ in 0..2 {
+        let mut evaluator = pod.evaluator(&script("evaluator"), &["--peer-seconds=0"]);
         assert_eq!(evaluator.code(), 1);
-        assert_eq!(fs::read_to_string(pod.path("said")).unwrap(), expected);
     }
+    assert_eq!(said("evaluator"), "1 [] $(WORKER)\n1 [1] $(WORKER)\n");
+    pod.write(StatusFile::Of(EVALUATOR, Mark::Start(2)));
+    let mut agent = pod.plain(&script("agent"), &["--peer-seconds=0"]);
+    assert_eq!(agent.code(), 1);
+    assert_eq!(
+        said("agent"),
+        "1 [$(RESUME)] $(WORKER)\n",
+        "a plain program has no rounds"
+    );
 }

@@ -31,13 +31,13 @@ function cause(row, now) {
   return element("div", { class: "cause" }, element("p", {}, badge("plain", row.reason ?? "New"), " ", row.since === null ? null : element("span", { class: "muted" }, "for ", span(now - row.since))), element("p", {}, place, row.message));
 }
 
-function pairs(row) {
+function workers(row) {
   if (!row.workers.length) return null;
   const items = row.workers.map((worker) => {
     const crashes = worker.crashes ? badge("warn", `${worker.crashes} ${worker.crashes === 1 ? "crash" : "crashes"}${worker.last ? `: ${worker.last}` : ""}`) : null;
-    return element("li", {}, `Pair ${worker.id}`, bar(worker.total ? worker.done / worker.total : 0, worker.state === "Done" ? "good" : worker.crashes ? "warn" : "running"), element("span", {}, `${worker.done}/${worker.total}`), element("span", { class: "muted" }, WORKER[worker.state] ?? ""), crashes);
+    return element("li", {}, `Worker ${worker.id}`, bar(worker.total ? worker.done / worker.total : 0, worker.state === "Done" ? "good" : worker.crashes ? "warn" : "running"), element("span", {}, `${worker.done}/${worker.total}`), element("span", { class: "muted" }, WORKER[worker.state] ?? ""), crashes);
   });
-  return part("Pairs", element("ul", { class: "pairs" }, items));
+  return part("Workers", element("ul", { class: "workers" }, items));
 }
 
 function conditions(row, now) {
@@ -69,7 +69,7 @@ export function detail(row, now) {
     cause(row, now),
     score(row),
     part("Timeline", axis(row.phases, now), steps(row.phases, now)),
-    pairs(row),
+    workers(row),
     ways(row),
     conditions(row, now),
   );

@@ -106,7 +106,7 @@ function progress(row) {
 
 function trouble(row) {
   const crashed = row.workers.filter((worker) => worker.crashes > 0);
-  const texts = crashed.map((worker) => `Pair ${worker.id}: ${worker.crashes} ${worker.crashes === 1 ? "crash" : "crashes"}`);
+  const texts = crashed.map((worker) => `Worker ${worker.id}: ${worker.crashes} ${worker.crashes === 1 ? "crash" : "crashes"}`);
   return [row.attempt > 1 ? badge("plain", `Attempt ${row.attempt}`) : null, texts.length ? badge("warn", texts.join(", ")) : null];
 }
 

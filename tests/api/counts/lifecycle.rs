@@ -54,24 +54,34 @@ pub struct Scenario {
     pub name: &'static str,
     has_evalai: bool,
     has_limits: bool,
+    /// A container of the host's evaluates it.
+    has_evaluator: bool,
 }
 
 impl Scenario {
-    pub const ALL: [Self; 4] = [
+    pub const ALL: [Self; 5] = [
         Self::of("local", false, false),
         Self::of("local, limited", false, true),
         Self::of("EvalAI and table", true, false),
         Self::of("EvalAI and table, limited", true, true),
+        Self::EVALUATED,
     ];
 
     /// One that EvalAI and a table get.
     pub const PUBLISHED: Self = Self::ALL[2];
+
+    /// The same with a host's own evaluator.
+    pub const EVALUATED: Self = Self {
+        has_evaluator: true,
+        ..Self::of("EvalAI and table, a host's evaluator", true, false)
+    };
 
     const fn of(name: &'static str, has_evalai: bool, has_limits: bool) -> Self {
         Self {
             name,
             has_evalai,
             has_limits,
+            has_evaluator: false,
         }
     }
 
@@ -215,6 +225,12 @@ impl World {
             let table = self.aws.name("counts");
             make_table(&self.aws, &table).await;
             spec["table"] = json!({"dynamoDB": {"name": table, "endpoint": self.table.endpoint()}});
+        }
+        if scenario.has_evaluator {
+            let container = json!({"mode": "Interactive", "image": "evaluator:1", "command": ["evaluate"]});
+            spec["evaluation"] = json!({"carla": null, "container": container});
+            spec["agent"]["command"] = json!(["play"]);
+            spec["tracks"][0]["container"] = json!({"score": {"metric": "Driving score"}});
         }
         let api = Kind::Leaderboard.api(&self.client, &self.namespace);
         let board = Kind::Leaderboard.object(BOARD, &[&json!({ "spec": spec })]);

@@ -196,7 +196,7 @@ async fn a_resume_takes_up_the_checkpoints_of_the_newest_pipelines_workers() {
 #[tokio::test]
 async fn a_failure_is_written_to_the_termination_log() {
     let mut pod = Pod::new().await;
-    pod.setting.run.plan.carla.slices = vec![RouteSlice { first: 0, last: 1 }, RouteSlice { first: 1, last: 2 }];
+    carla(&mut pod.setting.run).slices = vec![RouteSlice { first: 0, last: 1 }, RouteSlice { first: 1, last: 2 }];
     // It never asks S3, so that no credentials are needed.
     workspace::main(pod.setting.clone()).await.unwrap_err();
     let said = fs::read_to_string(&pod.setting.places.termination_log).unwrap();

@@ -18,8 +18,9 @@ async fn four_pairs() -> Pod {
     let bucket = server().await.bucket().await;
     let mut run = run(&bucket);
     let first = [0, 4, 8, 12];
-    run.plan.carla.slices = first.map(|first| RouteSlice { first, last: first + 3 }).to_vec();
-    run.plan.carla.routes = 16;
+    let plan = carla(&mut run);
+    plan.slices = first.map(|first| RouteSlice { first, last: first + 3 }).to_vec();
+    plan.routes = 16;
     let pod = Pod::on(&server().await.endpoint(), &bucket, run).await;
     pod.prepare().await.unwrap();
     for pair in 1..=4 {

@@ -12,7 +12,7 @@ async fn a_whole_run_ends_with_the_final_report_and_the_original_layout() {
     let logcopy = pod.logcopy();
     pod.reported(|report| report.round >= 1).await;
     for pair in [1, 2] {
-        pod.mark(Side::Host, pair, Mark::Start(0));
+        pod.mark(SIMULATOR, pair, Mark::Start(0));
         pod.mark(Side::Agent, pair, Mark::Start(0));
     }
     pod.append("agent/agent1/leaderboard.log", b"one\n");
@@ -37,7 +37,7 @@ async fn a_whole_run_ends_with_the_final_report_and_the_original_layout() {
     pod.checkpoint(2, 2);
     for pair in [1, 2] {
         pod.mark(Side::Agent, pair, Mark::Done);
-        pod.mark(Side::Host, pair, Mark::Done);
+        pod.mark(SIMULATOR, pair, Mark::Done);
     }
     pod.append("agent/agent1/leaderboard.log", b"last line\n");
     pod.until_has(StatusFile::Stored).await;

@@ -25,15 +25,25 @@ pub fn reports(
     s3: aws_sdk_s3::Client,
     bucket: &str,
 ) -> impl Fn(Part) -> BoxFuture<'static, ()> + Send + Sync + use<> {
+    reports_as(period, s3, bucket, |report| report)
+}
+
+/// The same with each report changed.
+pub fn reports_as(
+    period: Duration,
+    s3: aws_sdk_s3::Client,
+    bucket: &str,
+    change: fn(Report) -> Report,
+) -> impl Fn(Part) -> BoxFuture<'static, ()> + Send + Sync + use<> {
     let place: Arc<(aws_sdk_s3::Client, String)> = Arc::new((s3, bucket.to_owned()));
     move |part| {
         let run = &part.job.labels()[names::LABEL_RUN];
         let archive = Archive::new(place.0.clone(), &place.1, format!("{run}/"));
-        play(part, archive, period).boxed()
+        play(part, archive, period, change).boxed()
     }
 }
 
-async fn play(mut part: Part, archive: Archive, period: Duration) {
+async fn play(mut part: Part, archive: Archive, period: Duration, change: fn(Report) -> Report) {
     let dressed = |phase: &str, state| status(&part.pod, phase, digest, &state);
     let name = part.pod.name_any();
     part.cluster
@@ -43,7 +53,7 @@ async fn play(mut part: Part, archive: Archive, period: Duration) {
     let (submission, pod) = (part.job.owner_references()[0].uid.clone(), part.pod.uid().unwrap());
     let report = |round: u32, done| Report {
         round: round.into(),
-        ..report(submission.clone(), pod.clone(), done)
+        ..change(report(submission.clone(), pod.clone(), done))
     };
     // Not all at the same moment, as Pods are not.
     let first = Instant::now() + period.mul_f64(fastrand::f64());
@@ -124,6 +134,7 @@ pub fn report(submission_uid: String, pod_uid: String, done: u32) -> Report {
         outcome: if is_last { Outcome::Finished } else { Outcome::Running },
         stopped: None,
         refused: None,
+        unusable: None,
         warnings: Vec::new(),
         logs: None,
         results: json!([{"split": "leaderboard", "show_to_participant": true, "accuracies": accuracies}]).to_string(),

@@ -91,7 +91,7 @@ reasons! {
              run. A new Job continues from the stored results.",
             "Nothing. The message names the cause.";
         Stopping,
-            "The submission is being stopped; completed routes are kept.",
+            "The submission is being stopped; completed work is kept.",
             "Nothing. It ends within about three minutes after `deadlines.cancelSeconds`; later while the bucket cannot be read.";
         InProgress,
             "The submission has been accepted and has not come to its end (condition `Succeeded`).",
@@ -102,10 +102,10 @@ reasons! {
     }
     End {
         Finished,
-            "All routes are done, and the results count.",
+            "All work is done, and the results count.",
             "Nothing.";
         Cancelled,
-            "A person cancelled it; completed routes are kept.",
+            "A person cancelled it; completed work is kept.",
             "To continue it, resume it: a patch to a higher `attempt` with `cancel: false`.";
         EndedInEvalAI,
             "It ended in EvalAI: cancelled, archived, deleted, or set to an end by hand. `finished` counts only before the run was \
@@ -137,9 +137,9 @@ reasons! {
             after_failure: "Fix this, then resume the submission.",
             log: "the log of agent `<n>`, `agent/agent<n>/leaderboard.log`";
         TimeLimit,
-            "The run took longer than `deadlines.runSeconds`. Completed routes are kept.",
+            "The run took longer than `deadlines.runSeconds`. Completed work is kept.",
             "Make the agent faster, or ask the host for more time.",
-            log: "the log of the agent of the first pair that was not done, else of the first pair";
+            log: "the log of the agent of the first worker that was not done, else of the first worker";
         InvalidResults,
             "A checkpoint was refused: malformed, implausible, or incomplete at the end. Or it names a crash of the simulation that \
              its simulator did not have. Or the host's evaluator refused the submission.",
@@ -148,7 +148,7 @@ reasons! {
         NotEligible,
             "The run is complete, but its results do not count (`Rejected`, `Invalid`).",
             "Compare the agent's sensors with those the track allows, and submit again.",
-            log: "the log of the agent of the first pair that was not done, else of the first pair";
+            log: "the log of the agent of the first worker that was not done, else of the first worker";
         ImageInvalid,
             "The name is no valid image reference, or its registry has no container image there, or the Pod sets `runAsNonRoot` and \
              the image runs as root or names its user. The submission fails at once.",
@@ -173,7 +173,7 @@ reasons! {
             "Write less to disk or to the log.",
             after_failure: "Look at what fills the disk, such as saved files and core dumps, or raise the limit; then resume the \
              submission.",
-            log: "the log of the agent of the first pair that was not done, else of the first pair";
+            log: "the log of the agent of the first worker that was not done, else of the first worker";
     }
     Infrastructure {
         SimulationCrashed,

@@ -41,18 +41,15 @@ pub(super) enum MergeError {
     TooMany,
 }
 
-/// Merges the results of workers in their order, of which each may have none yet. `None` if none has one.
-pub(super) fn merge(method: MergeMethod, workers: &[Option<&ResultFile>]) -> Result<Option<Merged>, MergeError> {
+/// Merges the results of workers in their order, of which each may have none yet.
+pub(super) fn merge(method: MergeMethod, workers: &[Option<&ResultFile>]) -> Result<Merged, MergeError> {
     let known: Vec<(usize, &ResultFile)> = (1..)
         .zip(workers)
         .filter_map(|(id, result)| Some((id, (*result)?)))
         .collect();
-    if known.is_empty() {
-        return Ok(None);
-    }
     let results = || known.iter().map(|(_, result)| *result);
     let is_final = known.len() == workers.len() && results().all(|result| result.is_final);
-    Ok(Some(Merged {
+    Ok(Merged {
         done: results()
             .map(|result| u64::from(result.done))
             .fold(0, u64::saturating_add),
@@ -65,7 +62,7 @@ pub(super) fn merge(method: MergeMethod, workers: &[Option<&ResultFile>]) -> Res
             [(_, only)] => only.splits.clone(),
             _ => splits(method, &known, is_final)?,
         },
-    }))
+    })
 }
 
 fn splits(method: MergeMethod, known: &[(usize, &ResultFile)], is_final: bool) -> Result<Vec<Split>, MergeError> {
@@ -205,8 +202,11 @@ impl Merged {
         }
     }
 
-    /// The summary that a participant reads, with the messages of workers by their numbers.
-    pub(super) fn stdout(&self, messages: &[(usize, &str)]) -> String {
+    /// The summary that a participant reads, with the messages of these workers.
+    pub(super) fn stdout(&self, workers: &[Option<&ResultFile>]) -> String {
+        if workers.iter().all(Option::is_none) {
+            return NOTHING_YET.to_owned();
+        }
         let current = if self.is_final { "" } else { "current " };
         let (done, total) = (self.done, self.total);
         let mut out =
@@ -218,15 +218,17 @@ impl Merged {
                 let _ = writeln!(out, "  - {name}: {}", number.text());
             }
         }
-        for (worker, message) in messages {
-            let _ = writeln!(out, "- Evaluator {worker}: {message}");
+        for (id, worker) in (1..).zip(workers) {
+            if let Some(message) = worker.and_then(|worker| worker.message.as_ref()) {
+                let _ = writeln!(out, "- Evaluator {id}: {message}");
+            }
         }
         out
     }
 }
 
 /// EvalAI's list of splits without one.
-pub(super) const NO_RESULTS: &str = "[]";
+const NO_RESULTS: &str = "[]";
 /// Summary before the first result.
 pub(super) const NOTHING_YET: &str = "The submission is about to be evaluated. Its results will be found here.\n";
 
@@ -251,7 +253,7 @@ fn quoted(text: &str) -> String {
     Value::from(text).to_string()
 }
 
-pub(super) fn clamp(units: u64) -> u32 {
+fn clamp(units: u64) -> u32 {
     u32::try_from(units).unwrap_or(u32::MAX)
 }
 
@@ -275,7 +277,7 @@ mod tests {
 
     fn merged(method: MergeMethod, workers: &[ResultFile]) -> Result<Merged, MergeError> {
         let workers: Vec<Option<&ResultFile>> = workers.iter().map(Some).collect();
-        merge(method, &workers).map(Option::unwrap)
+        merge(method, &workers)
     }
 
     fn score(split: Option<&str>, metric: &str) -> ScoreMetric {
@@ -421,14 +423,15 @@ mod tests {
             (vec![Some(&done), Some(&rejected)], Outcome::Rejected, false),
             (vec![Some(&rejected), None], Outcome::Running, false),
         ] {
-            let merged = merge(MergeMethod::Mean, &workers).unwrap().unwrap();
+            let merged = merge(MergeMethod::Mean, &workers).unwrap();
             let summary = merged.summary(&score(None, "x"));
             assert_eq!((summary.outcome, summary.eligible), (outcome, eligible), "{workers:?}");
             assert_eq!(summary.is_complete, outcome != Outcome::Running);
             assert_eq!(merged.texts().results == NO_RESULTS, outcome == Outcome::Running);
             assert_eq!(merged.texts().partial_results.is_some(), outcome == Outcome::Running);
         }
-        assert_eq!(merge(MergeMethod::Mean, &[None, None]), Ok(None));
+        let nothing = merge(MergeMethod::Mean, &[None, None]).unwrap();
+        assert_eq!((nothing.is_final, nothing.texts().partial_results), (false, None));
     }
 
     #[test]
@@ -460,10 +463,13 @@ mod tests {
 
     #[test]
     fn a_participant_reads_numbers_and_messages() {
-        let workers = [one(2, true, &json!({"x": 0.5})), one(3, false, &json!({"x": 0.5}))];
-        let text = merged(MergeMethod::Mean, &workers)
-            .unwrap()
-            .stdout(&[(2, "Episode 4 of 100 has begun.")]);
+        let first = one(2, true, &json!({"x": 0.5}));
+        let second = ResultFile {
+            message: Some("Episode 4 of 100 has begun.".into()),
+            ..one(3, false, &json!({"x": 0.5}))
+        };
+        let workers = [Some(&first), Some(&second)];
+        let text = merge(MergeMethod::Mean, &workers).unwrap().stdout(&workers);
         let expected = "Here is a summary of the submission's current results\n\n- Completed 5 of 102 units\n- test:\n  - x: 0.5\n\
                         - Evaluator 2: Episode 4 of 100 has begun.\n";
         assert_eq!(text, expected);

@@ -11,9 +11,10 @@ use leaderboard_contract::run::Run;
 use leaderboard_evidence::Tree;
 use leaderboard_protocol::files::{Host, Pair};
 
+use crate::gather::Kind;
 use crate::workload::{Asked, Contents, Reserved, Workload};
 use crate::{Column, Evaluation, Refused, Results, Words};
-use gather::Gatherer;
+use gather::{Evaluators, Gatherer};
 
 const HOST: Host = Host::Evaluator;
 const WORDS: Words = Words {
@@ -70,7 +71,7 @@ impl Evaluation for Container {
     }
 
     fn check(&self, run: &Run) -> Result<(), Refused> {
-        gather::plan(run)?;
+        Evaluators::of(run)?;
         Ok(())
     }
 

@@ -5,7 +5,7 @@ use leaderboard_contract::keys::{agent_folder, host_folder, host_log_name};
 use leaderboard_protocol::files::Pair;
 
 use super::HOST;
-use crate::workload::{AGENT, Asked, HOST_LOG_LIMIT, Mount, Reserved, Role, Workload, of_host, seconds};
+use crate::workload::{AGENT, Asked, HOST_LOG_LIMIT, Mount, Reserved, Role, Workload, literal, of_host, seconds};
 
 /// Where an evaluator writes its result, and what it goes on with.
 const RESULTS: &str = "/results";
@@ -70,7 +70,7 @@ impl Known<'_> {
                 .into_iter()
                 .chain(flags)
                 .collect(),
-            command: self.spec.words(),
+            command: literals(&self.spec.words()),
             env: self.variables().chain(own).collect(),
             mounts: vec![Mount::Own {
                 folder: host_folder(HOST, self.worker),
@@ -95,7 +95,7 @@ impl Known<'_> {
         Some(Role {
             image: self.asked.plan.image.clone(),
             flags,
-            command: of_host(spec.command.as_deref(), spec.args.as_deref())?,
+            command: literals(&of_host(spec.command.as_deref(), spec.args.as_deref())?),
             env: self.variables().collect(),
             mounts: vec![Mount::Own {
                 folder: agent_folder(self.worker),
@@ -129,6 +129,11 @@ impl Known<'_> {
     }
 }
 
+/// Words as they reach the runner, which expands them: RESUME is then what it is in this round.
+fn literals(words: &[String]) -> Vec<String> {
+    words.iter().map(|word| literal(word)).collect()
+}
+
 #[cfg(test)]
 mod tests {
     use leaderboard_api::{Attempt, LeaderboardSpec};
@@ -139,7 +144,7 @@ mod tests {
 
     fn spec(port: Option<i32>) -> LeaderboardSpec {
         let mut evaluation =
-            json!({"mode": "Interactive", "image": "evaluator", "command": ["python3"], "args": ["e.py"]});
+            json!({"mode": "Interactive", "image": "evaluator", "command": ["python3"], "args": ["$(RESUME)"]});
         if let Some(port) = port {
             evaluation["port"] = port.into();
         }
@@ -176,7 +181,7 @@ mod tests {
         let Workload { host, agent } = of_second_worker(&spec(Some(5000)), true).unwrap();
         let agent = agent.unwrap();
         assert_eq!(host.flags[0], "--port=5100");
-        assert_eq!(host.command, ["python3", "e.py"]);
+        assert_eq!(host.command, ["python3", "$$(RESUME)"]);
         for (name, of_both) in [
             ("WORKER", "2"),
             ("WORKERS", "2"),

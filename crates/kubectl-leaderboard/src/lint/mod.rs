@@ -1,4 +1,5 @@
-//! `lint`: manifests checked by the schemas and the CEL rules of this version's definitions, without a cluster.
+//! `lint`: manifests checked by the schemas and the CEL rules of this version's definitions, and results of evaluators by the reader of
+//! them, without a cluster.
 //!
 //! `findings` is pure. What an API server alone knows, such as other objects and a change of an existing one, is not checked.
 
@@ -16,7 +17,7 @@ use kube::CustomResourceExt;
 use kube_cel::{ErrorKind, Validator};
 use leaderboard_api::definitions::served;
 use leaderboard_api::text::sentence;
-use leaderboard_api::{GROUP, Leaderboard, Submission, VERSION};
+use leaderboard_api::{GROUP, Leaderboard, Submission, VERSION, evaluator_result};
 use serde_json::{Value, json};
 
 use self::manifest::Node;
@@ -29,7 +30,8 @@ use crate::output::{paragraphs, print};
 /// The manifests.
 #[derive(Args, Debug)]
 pub struct Lint {
-    /// Files with Leaderboards and Submissions in YAML or JSON, each with any number of objects; `-` is standard input.
+    /// Files with Leaderboards and Submissions in YAML or JSON, each with any number of objects, or result.json of an evaluator; `-` is
+    /// standard input.
     #[arg(required = true, value_name = "FILE")]
     files: Vec<PathBuf>,
 }
@@ -119,6 +121,15 @@ impl Kinds {
     /// All faults of a file in the order of their lines.
     pub(super) fn findings(&self, text: &str) -> (Vec<Finding>, Checked) {
         let mut checked = Checked::default();
+        if is_result(text) {
+            let fault = evaluator_result::parse(text.as_bytes()).err();
+            (checked.valid, checked.faulty) = (fault.is_none().into(), fault.is_some().into());
+            let findings = fault.map(|fault| Finding {
+                line: 1,
+                text: format!("this is no result of an evaluator: {fault}"),
+            });
+            return (findings.into_iter().collect(), checked);
+        }
         let nodes = match manifest::parse(text) {
             Ok(nodes) => nodes,
             Err((line, why)) => {
@@ -195,6 +206,13 @@ impl Kinds {
             })
             .collect()
     }
+}
+
+/// Whether a text is meant as an evaluator's result: it has fields of one, and no kind.
+fn is_result(text: &str) -> bool {
+    let parsed: Value = serde_json::from_str(text).unwrap_or_default();
+    let has = |field: &str| !parsed[field].is_null();
+    !has("kind") && ["schema", "done", "splits"].into_iter().any(has)
 }
 
 fn finding(node: &Node, fault: &Fault) -> Finding {

@@ -108,6 +108,7 @@ fn object(schema: &Value, fields: &mut Map<String, Value>, path: &str, faults: &
             text: format!("{} is missing", at(name)),
         });
     }
+    faults.extend(union(schema, fields, path));
     let most = schema["maxProperties"]
         .as_u64()
         .filter(|most| fields.len() as u64 > *most);
@@ -131,6 +132,26 @@ fn object(schema: &Value, fields: &mut Map<String, Value>, path: &str, faults: &
             });
         }
     }
+}
+
+/// A fault of a union: exactly one of its members is set.
+fn union(schema: &Value, fields: &Map<String, Value>, path: &str) -> Option<Fault> {
+    let members = schema["oneOf"].as_array()?.iter();
+    let members: Vec<&str> = members.filter_map(|one| one["required"][0].as_str()).collect();
+    let set: Vec<&str> = members
+        .iter()
+        .copied()
+        .filter(|name| fields.contains_key(*name))
+        .collect();
+    let text = match set.as_slice() {
+        [_] => return None,
+        [] => format!("{path} has none of {}. It must have one", members.join(" and ")),
+        _ => format!("{path} has {}. It may have one of them", set.join(" and ")),
+    };
+    Some(Fault {
+        path: path.to_owned(),
+        text,
+    })
 }
 
 /// A fault of a list itself: its length, or two items with one key.

@@ -7,7 +7,7 @@ use serde_json::{Value, json};
 use super::{Kinds, manifest, schema};
 
 /// Keywords that `schema::check` and the rules judge, and those that say nothing about one object.
-const KNOWN: [&str; 22] = [
+const KNOWN: [&str; 23] = [
     "additionalProperties",
     "default",
     "description",
@@ -22,6 +22,7 @@ const KNOWN: [&str; 22] = [
     "minLength",
     "minimum",
     "nullable",
+    "oneOf",
     "pattern",
     "properties",
     "required",
@@ -77,6 +78,8 @@ fn each_keyword_finds_its_fault_and_a_null_may_stand_for_a_default() {
                       "x-kubernetes-list-type": "map", "x-kubernetes-list-map-keys": ["name"]},
             "map": {"type": "object", "additionalProperties": {"type": "string"}, "maxProperties": 1},
             "free": {"type": "object", "x-kubernetes-preserve-unknown-fields": true},
+            "union": {"type": "object", "properties": {"a": {"type": "string"}, "b": {"type": "string"}},
+                      "oneOf": [{"required": ["a"]}, {"required": ["b"]}]},
         },
     });
     let faults = |field: &str, value: Value| {
@@ -99,6 +102,7 @@ fn each_keyword_finds_its_fault_and_a_null_may_stand_for_a_default() {
         ("time", json!("2026-11-01T10:00:00Z")),
         ("map", json!({"a": "b"})),
         ("free", json!({"a": [1, {"b": null}]})),
+        ("union", json!({"b": "x"})),
     ] {
         assert_eq!(faults(field, value), "", "{field}");
     }
@@ -139,6 +143,12 @@ fn each_keyword_finds_its_fault_and_a_null_may_stand_for_a_default() {
             "map",
             json!({"a": "b", "c": "d"}),
             "spec.map has 2 entries. It may have 1",
+        ),
+        ("union", json!({}), "spec.union has none of a and b. It must have one"),
+        (
+            "union",
+            json!({"a": "x", "b": "y"}),
+            "spec.union has a and b. It may have one of them",
         ),
         ("nmae", json!("a"), "there is no field spec.nmae. Did you mean name?"),
     ] {

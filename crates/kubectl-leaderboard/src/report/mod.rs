@@ -1,4 +1,4 @@
-//! `report`: what a person who helps needs of a namespace, in one file, without secrets, routes and names of teams.
+//! `report`: what a person who helps needs of a namespace, in one file, without secrets, logs and names of teams.
 //!
 //! `redact`, which is pure, takes out what is nobody's business.
 

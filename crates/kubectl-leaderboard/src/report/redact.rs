@@ -16,8 +16,13 @@ const DROPPED: [&str; 6] = [
     "nextStep",
     "podOverrides",
 ];
-/// Reasons whose messages quote a checkpoint, and with it routes.
-const OF_RESULTS: [Reason; 3] = [Reason::InvalidResults, Reason::NotEligible, Reason::UnexplainedScores];
+/// Reasons whose messages quote results, and with CARLA's routes.
+const OF_RESULTS: [Reason; 4] = [
+    Reason::InvalidResults,
+    Reason::NotEligible,
+    Reason::UnexplainedScores,
+    Reason::EvaluatorFailed,
+];
 
 /// Names of the teams of submissions that have no id: counts and messages call these by their name.
 pub(super) fn names(submissions: &[Value]) -> BTreeSet<String> {

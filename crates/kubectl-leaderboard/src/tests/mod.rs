@@ -2,6 +2,7 @@
 
 mod change;
 mod check;
+mod containers;
 mod daily;
 mod docs;
 mod documents;

@@ -239,7 +239,7 @@ impl Explanation<'_> {
         }
     }
 
-    /// Where the log of a failure is. It may reveal private routes, so it is not shown: only who may read the bucket can read it.
+    /// Where the log of a failure is. It may reveal private data, so it is not shown: only who may read the bucket can read it.
     fn log(&mut self) {
         let Some(failure) = self.status.failure.as_ref().filter(|_| has_ended(self.submission)) else {
             return;
@@ -256,7 +256,7 @@ impl Explanation<'_> {
         } else {
             &log
         };
-        let text = format!("the last 10,000 characters of {log}. Hosts only: it may reveal private routes.");
+        let text = format!("the last 10,000 characters of {log}. Hosts only: it may reveal private data.");
         self.page.row("Log", &text);
         let storage = self.status.plan.as_ref().map(|plan| &plan.storage.s3);
         let command = bucket::print(&format!("{results}/{FAILURE_LOG_KEY}"), storage);

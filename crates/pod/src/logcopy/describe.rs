@@ -77,3 +77,68 @@ fn shown(results: &RefusedResults) -> RefusedResults {
 fn shorten(text: &str) -> String {
     one_line(text, LONGEST_TEXT)
 }
+
+#[cfg(test)]
+mod tests {
+    use std::sync::Arc;
+
+    use leaderboard_contract::report::Outcome;
+    use leaderboard_evaluation::fixtures::{container_run, put_result, result};
+    use leaderboard_evaluation::of_plan;
+    use leaderboard_evidence::Tree;
+
+    use super::*;
+
+    /// The report of a run whose evaluators have these results.
+    fn report(results: &[String], ending: Option<&Ending>) -> Report {
+        let folder = tempfile::tempdir().unwrap();
+        for (worker, text) in (1..).zip(results) {
+            put_result(folder.path(), worker, text);
+        }
+        let (run, tree) = (container_run(), Arc::new(Tree::open(folder.path()).unwrap()));
+        let gathered = of_plan(&run.plan).results(&run, tree).unwrap().round();
+        let report = describe(&run, "pod-1", &gathered, ending);
+        assert_eq!(
+            Report::parse(&to_bytes(&report)).as_ref(),
+            Ok(&report),
+            "the controller reads it"
+        );
+        report
+    }
+
+    #[test]
+    fn results_that_an_evaluator_has_spoiled_are_a_warning_first_and_the_hosts_in_the_end() {
+        let results = [result(3, 10, 0.5), "no result".to_owned()];
+        let running = report(&results, None);
+        let [warning] = &running.warnings[..] else {
+            panic!("{:?}", running.warnings)
+        };
+        assert!(
+            warning.starts_with("evaluator 2: result.json can't be used: "),
+            "{warning}"
+        );
+        assert_eq!(
+            (running.unusable, running.refused, running.unit.as_str()),
+            (None, None, "units")
+        );
+
+        let unusable = RefusedResults::new(Some(2), warning.as_str());
+        let ended = report(&results, Some(&Ending::Unusable(unusable.clone())));
+        assert_eq!((ended.unusable, ended.refused), (Some(unusable), None));
+        assert!(ended.is_final && !ended.eligible && ended.done < ended.total);
+    }
+
+    #[test]
+    fn a_complete_run_of_evaluators_has_its_score() {
+        let results = [result(1, 1, 0.5), result(3, 3, 1.0)];
+        let ended = report(&results, Some(&Ending::Complete));
+        assert_eq!((ended.done, ended.total, ended.outcome), (4, 4, Outcome::Finished));
+        assert_eq!(ended.score.map(|score| score.value).as_deref(), Some("0.875"));
+        assert!(ended.is_final && ended.eligible && ended.warnings.is_empty());
+        assert_eq!(
+            ended.results,
+            r#"[{"split":"test","show_to_participant":true,"accuracies":{"accuracy":0.875}}]"#
+        );
+        assert_eq!(ended.files.len(), 2, "{:?}", ended.files);
+    }
+}

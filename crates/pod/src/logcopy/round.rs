@@ -445,6 +445,29 @@ fn is_news(name: &OsStr) -> bool {
 mod tests {
     use super::*;
 
+    #[test]
+    fn the_marks_and_the_folders_of_containers_are_news() {
+        for news in [
+            "evaluator-1",
+            "simulator-2",
+            "agent-1",
+            "agent1",
+            "evaluator-1.start0",
+            "agent-1.done",
+        ] {
+            assert!(is_news(OsStr::new(news)), "{news}");
+        }
+        for other in [
+            "result.json",
+            ".result.json",
+            "console.log",
+            "evaluators",
+            "agent_results.json",
+        ] {
+            assert!(!is_news(OsStr::new(other)), "{other}");
+        }
+    }
+
     #[tokio::test(start_paused = true)]
     async fn only_a_node_that_goes_cuts_the_logs_of_a_round_under_way() {
         let (sender, receiver) = watch::channel(None);

@@ -215,7 +215,8 @@ fn by_times_and_rounds(end: &EndView, agent: &EndView) -> Order {
 
 fn of_both(host: Option<&ContainerView>, end: &EndView, blamed: Crash) -> Crash {
     match what(end) {
-        Some(What::PeerCrashed | What::Finished) => blamed,
+        // An agent that is done ends regularly: one that crashes in that round has forged its mark.
+        Some(What::PeerCrashed | What::Finished | What::NoResult) => blamed,
         _ => crash(of_host(host, end), end),
     }
 }
@@ -270,7 +271,7 @@ fn of_host(host: Option<&ContainerView>, end: &EndView) -> EndReason {
     match what(end) {
         // The agents can use up the Pod's processes once they run.
         Some(What::NoProcess) if !is_first => EndReason::NoProcess,
-        Some(What::NotReady) => EndReason::SimulatorNotReady,
+        Some(What::NotReady | What::NoResult) => EndReason::SimulatorNotReady,
         Some(What::ServerSilent) => EndReason::SimulatorSilent,
         Some(What::PortTaken) => EndReason::PortTaken,
         Some(What::NoGpu) => EndReason::NoGPU,
@@ -296,6 +297,7 @@ fn of_agent(container: &ContainerView, end: &EndView) -> EndReason {
         Some(
             What::PeerCrashed
             | What::NotReady
+            | What::NoResult
             | What::ServerSilent
             | What::PortTaken
             | What::NoGpu

@@ -1,4 +1,4 @@
-//! Pairs whose agent a host's evaluator evaluates, and what any container has left at its end. For `run`.
+//! Evaluators, the agents that they evaluate, and what any container has left at its end. For `run`.
 //!
 //! The evaluator's result alone ends such a pair. An agent can forge its own marks, so that its `.done` does no more than start the time
 //! that the evaluator has for the result.
@@ -53,7 +53,7 @@ impl Runner {
         }
     }
 
-    /// Whether all is complete, and what is left, in words. Asked once every process has ended.
+    /// Completeness of the results, and what is left, in words. Asked once every process has ended.
     pub(super) fn results(&self, cause: Cause) -> (bool, Option<String>) {
         match (&self.job.role, self.job.result()) {
             (_, Some(path)) => {
@@ -76,6 +76,18 @@ impl Runner {
                 self.part == Part::Plain && self.status() == Some(Status::Exited(0)),
                 None,
             ),
+        }
+    }
+
+    /// Cause of an evaluator's end, now that nothing can change its result any more: what was complete a moment ago can have been written
+    /// over, and what was not can be complete.
+    pub(super) fn of_the_result(&self, cause: Cause, complete: bool) -> Cause {
+        match cause {
+            Cause::HasResult if !complete => Cause::ChildEnded,
+            Cause::ChildEnded | Cause::PeerCrashed | Cause::NoResult if complete && self.part == Part::Evaluator => {
+                Cause::HasResult
+            }
+            _ => cause,
         }
     }
 

@@ -1,18 +1,23 @@
 use std::fs;
 use std::io;
 use std::os::unix::fs::symlink;
-use std::path::Path;
+use std::path::{Path, PathBuf};
+use std::sync::Arc;
 use std::time::Duration;
 
 use leaderboard_api::WorkerState;
+use leaderboard_contract::keys::result_path;
 use leaderboard_contract::report::Outcome;
+use leaderboard_evidence::Tree;
 use leaderboard_protocol::files::{Mark, Side};
 use nix::errno::Errno;
 use nix::sys::stat::Mode;
 
+use super::super::merge::NOTHING_YET;
 use super::*;
 use crate::fixtures::{container_run, put_result, put_status, result, run};
 use crate::judge::{Judge, Outside, Situation};
+use crate::{Gathered, Results};
 
 struct Volume {
     folder: tempfile::TempDir,
@@ -154,7 +159,7 @@ fn what_cannot_be_used_leaves_the_last_good_one() {
             panic!("{bad:.40}")
         };
         assert!(
-            why.starts_with("evaluator 1: result.json can't be used: ") && why.contains(part),
+            why.starts_with("evaluator 1: result.json can't be ") && why.contains(part),
             "{why}"
         );
         assert_eq!(
@@ -215,6 +220,13 @@ fn one_refusal_refuses_all_and_is_the_participants() {
         "nothing is resumed from a refusal"
     );
     volume.done(&[2]);
+    let (_, seen) = volume.round();
+    assert_eq!(seen.spoiled, Some((Ending::Invalid(expected.clone()), Duration::ZERO)));
+    // Also where another worker's evaluator is at fault.
+    let mut volume = Volume::new();
+    put_result(volume.path(), 1, "no result");
+    put_result(volume.path(), 2, &refused);
+    volume.done(&[1, 2]);
     let (_, seen) = volume.round();
     assert_eq!(seen.spoiled, Some((Ending::Invalid(expected), Duration::ZERO)));
 }
@@ -365,7 +377,7 @@ fn a_round_writes_nothing_to_the_volume() {
 
 #[test]
 fn a_plan_that_does_not_hold_is_refused() {
-    let refused = plan(&run()).unwrap_err();
+    let refused = Evaluators::of(&run()).unwrap_err();
     assert!(
         refused.problem.ends_with("it is of another kind of evaluation"),
         "{refused}"
@@ -375,5 +387,5 @@ fn a_plan_that_does_not_hold_is_refused() {
         panic!("not of a container")
     };
     container.workers = 0;
-    assert!(plan(&none).unwrap_err().problem.ends_with("it has no worker"));
+    assert!(Evaluators::of(&none).unwrap_err().problem.ends_with("it has no worker"));
 }

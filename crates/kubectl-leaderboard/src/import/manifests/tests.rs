@@ -61,7 +61,8 @@ fn both_leaderboards_run_what_the_original_ran() {
         .iter()
         .zip([(LeaderboardVersion::V1, 5), (LeaderboardVersion::V2, 1)])
     {
-        assert_eq!(spec.evaluation.carla.version, version);
+        let carla = spec.evaluation.carla().unwrap();
+        assert_eq!(carla.version, version);
         assert_eq!(spec.deadlines.run_seconds, None);
         let evalai = spec.evalai.as_ref().unwrap();
         assert_eq!((evalai.challenge, evalai.requests_per_minute), (2098, 54));
@@ -73,22 +74,16 @@ fn both_leaderboards_run_what_the_original_ran() {
         let scenarios = spec.tracks.iter().all(|track| track.carla.scenarios_file.is_some());
         assert_eq!(scenarios, version == LeaderboardVersion::V1);
         assert_eq!(
-            spec.evaluation
-                .carla
-                .simulator
-                .security_context
-                .as_ref()
-                .unwrap()
-                .privileged,
+            carla.simulator.security_context.as_ref().unwrap().privileged,
             Some(true)
         );
         let gpu = spec.gpu.as_ref().unwrap();
         assert_eq!(gpu.mode, Some(GpuMode::NodeIndex));
         assert_eq!(gpu.resource_name.as_deref(), Some("nvidia.com/gpu"));
-        let is_on_screen = spec.evaluation.carla.simulator.display == Display::X11Socket;
+        let is_on_screen = carla.simulator.display == Display::X11Socket;
         assert_eq!(is_on_screen, version == LeaderboardVersion::V2);
         for track in &spec.tracks {
-            let shape = effective::shape(spec, track);
+            let shape = effective::shape(carla, track);
             let slices: Vec<_> = shape.slices.iter().map(ToString::to_string).collect();
             assert_eq!(slices, ["0-4", "5-9", "10-14", "15-19"]);
             assert_eq!(shape.repetitions, repetitions);

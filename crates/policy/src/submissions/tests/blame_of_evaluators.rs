@@ -45,7 +45,7 @@ fn an_evaluator_that_failed_in_the_round_is_the_cause_whatever_the_agent_reports
         ),
         after_agent(
             "no final result in time",
-            ended("evaluator-1", 2, "notReady", 1, 100),
+            ended("evaluator-1", 2, "noResult", 1, 100),
             Settled(EvaluatorNotReady),
         ),
         after_agent(
@@ -65,6 +65,8 @@ fn an_agent_whose_evaluator_followed_it_is_the_cause_by_its_own_report() {
         both("killed with its runner", "peerCrashed", "silentDeath", SilentDeath),
         both("claims a regular end", "peerCrashed", "incomplete", Exited),
         both("blames its evaluator", "peerCrashed", "notReady", BlamesHost),
+        both("forged its end", "noResult", "peerCrashed", BlamesHost),
+        both("forged its end and crashed", "noResult", "exited", Exited),
         both("took its port", "portTaken", "peerCrashed", PortTaken),
         row(
             "its own end is not seen yet",
