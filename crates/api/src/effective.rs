@@ -20,7 +20,7 @@ pub struct Shape {
     pub slices: Vec<RouteSlice>,
 }
 
-/// What a track of this Leaderboard runs.
+/// The pairs, routes and repetitions of a track: its own values, else the Leaderboard's, else the defaults.
 pub fn shape(spec: &LeaderboardSpec, track: &Track) -> Shape {
     let (own, carla) = (&track.carla, &spec.evaluation.carla);
     let pairs = positive(own.pairs.unwrap_or(carla.pairs));

@@ -1,4 +1,4 @@
-//! What programs ask of a plan and of a Leaderboard, whatever kind of evaluation they are of.
+//! Questions that programs ask of a plan and of a Leaderboard, for every kind of evaluation.
 //!
 //! Pure. Fields of one kind alone are read here, and in `evaluation`.
 
@@ -73,7 +73,7 @@ pub struct Given<'a> {
 }
 
 impl LeaderboardSpec {
-    /// What the host writes of a container, with the overrides of a track.
+    /// The fields that the host writes for a container, with the overrides of a track.
     pub fn given<'a>(&'a self, track: Option<&Track>, part: Part) -> Given<'a> {
         let carla = &self.evaluation.carla;
         match part {
@@ -104,7 +104,7 @@ impl LeaderboardSpec {
         }
     }
 
-    /// Images of the host, which are nobody's submission.
+    /// Images of the host, contents first, then simulator. Neither may be submitted.
     pub fn host_images(&self) -> [&str; 2] {
         let carla = &self.evaluation.carla;
         [&carla.contents.image, &carla.simulator.image]
