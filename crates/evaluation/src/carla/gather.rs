@@ -1,8 +1,8 @@
-//! What the pairs have so far: their checkpoints read, merged and rendered, and their status files.
+//! The results that the pairs have so far: checkpoints, which it reads, merges and renders, and status files.
 //!
 //! Called by `logcopy` once a round. Reads the `logs` volume through [`Tree`] and writes nothing; knows no S3. A checkpoint that
-//! is torn, gone, refused or poorer leaves the last good one in place. What is to be stored is handed out from memory, so that no torn
-//! file and no full disk comes between the results and S3. [`Plan::limits_of`] bounds the memory of all pairs together.
+//! is torn, gone, refused or poorer leaves the last good one in place. Results are handed out from memory for storing, so that no torn
+//! file and no full disk comes between them and S3. [`Plan::limits_of`] bounds the memory of all pairs together.
 
 use std::path::PathBuf;
 use std::sync::Arc;
@@ -62,7 +62,7 @@ fn kept_path(pair: Pair) -> String {
     format!("{STATUS_FOLDER}/{}/{KEPT_CHECKPOINT}", pair.agent())
 }
 
-/// What one worker has, over the rounds.
+/// The last good checkpoint of one worker, and the state of its files, kept from round to round.
 #[derive(Debug, Default)]
 struct Worker {
     good: Option<Checkpoint>,
@@ -74,7 +74,7 @@ struct Worker {
     unreadable: Option<String>,
 }
 
-/// What reading a checkpoint gave.
+/// The outcome of reading a checkpoint.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 enum ReadOutcome {
     /// Another good one.

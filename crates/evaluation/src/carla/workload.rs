@@ -1,6 +1,6 @@
 //! CARLA's simulators and agents: images, commands, flags, variables and mounts of a pair. Pure.
 //!
-//! What they see is the original's, version by version.
+//! Both programs see the flags and variables of the original setup, version by version.
 
 use super::commands::{self, Adapter};
 use super::display;
@@ -20,7 +20,7 @@ const LIVE_RESULTS: &str = "/tmp/agent/live_results.txt";
 const SIMULATOR_LOG_LIMIT: u64 = 64 << 20;
 /// An agent's own folder of results and log.
 const AGENT: &str = "/tmp/agent";
-/// What a simulator keeps.
+/// The folder that a simulator writes.
 const SAVED: &str = "/home/carla/CarlaUE4/Saved";
 const CONTENTS_VOLUMES: [ContentsVolume; 3] = [
     ContentsVolume {
@@ -112,7 +112,7 @@ fn simulator(asked: &Asked<'_>, pair: Pair) -> Role {
     }
 }
 
-/// What the server draws with. Of a command of the host's that is not known.
+/// The graphics API that the server draws with. `Any` if the host has a command of its own: it may start any server.
 fn needs(spec: &SimulatorContainer, version: LeaderboardVersion) -> Needs {
     match (&spec.command, version) {
         (Some(_), _) => Needs::Any,
