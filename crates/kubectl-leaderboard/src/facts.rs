@@ -1,4 +1,4 @@
-//! What is read off one Submission, and how it is called: its state, since when, its team and track.
+//! Facts of one Submission in words: its state, since when, its team and track.
 //!
 //! Called by every module that shows or changes submissions. Pure: the time is handed in.
 
@@ -85,8 +85,8 @@ pub(super) fn headline(submission: &Submission, now: Timestamp) -> String {
     }
 }
 
-/// The state of this attempt, or of a later one, with its reason; and with the message, as a person who waits for it reads it. None before
-/// the attempt has begun.
+/// The state of this attempt, or of a later one, with its reason; then the lines that a person who waits for it reads, which have the
+/// message too. None before the attempt has begun.
 pub(super) fn transition(submission: &Submission, attempt: Attempt, frame: Frame) -> Option<(String, Vec<String>)> {
     let status = submission.status.as_ref().filter(|s| s.attempt >= Some(attempt))?;
     let shown = status.state_of_conditions().as_str();
@@ -126,19 +126,19 @@ pub(super) fn track(submission: &Submission) -> String {
     text
 }
 
-/// Whether the attempt has ended and no higher one is requested.
+/// True if the attempt has ended and no higher one is requested.
 pub(super) fn has_ended(submission: &Submission) -> bool {
     let status = submission.status.as_ref();
     status.is_some_and(SubmissionStatus::has_ended) && !is_attempt_requested(submission)
 }
 
-/// Whether it has a Job and has not ended.
+/// True if the submission has a Job and has not ended.
 pub(super) fn is_run(submission: &Submission) -> bool {
     let status = submission.status.as_ref();
     status.is_some_and(|status| status.job_name.is_some() && !status.has_ended())
 }
 
-/// Whether a higher attempt is requested than the operator has started.
+/// True if a higher attempt is requested than the operator has started.
 pub(super) fn is_attempt_requested(submission: &Submission) -> bool {
     let status = submission.status.as_ref();
     status.is_some_and(|status| status.is_followed_by(submission.spec.attempt))

@@ -37,7 +37,7 @@ pub struct Logs {
     endpoint: Option<String>,
 }
 
-/// Whose log is shown.
+/// The containers whose log is shown.
 #[derive(ValueEnum, Clone, Copy, Debug, Default, PartialEq, Eq)]
 pub(super) enum Whose {
     #[default]
@@ -67,7 +67,7 @@ impl Whose {
         }
     }
 
-    /// Whether each container begins when the one before has ended.
+    /// True if each container begins when the one before has ended.
     fn is_in_turn(self) -> bool {
         self == Self::Start
     }
@@ -134,7 +134,7 @@ pub(super) fn begins_again(container: &str, restarts: i32) -> String {
     format!("{container} was started again (restart {restarts}). Its log follows.")
 }
 
-/// What has become of a submission whose log was followed.
+/// One sentence about the end of a submission whose log was followed, with the next step.
 pub(super) fn end(submission: &Submission) -> String {
     let status = submission.status.as_ref();
     let shown = facts::shown(submission);
