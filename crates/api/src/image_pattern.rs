@@ -113,8 +113,8 @@ fn have_parts(pattern: &str, text: &str, separator: char, team: Option<&str>) ->
         })
 }
 
-/// True if a text matches a pattern in which `*` stands for at least one character. The number of steps is the product of
-/// both lengths, because a stranger wrote the text.
+/// True if a text matches a pattern in which `*` stands for at least one character. It takes no more steps than the product of
+/// both lengths, because a participant wrote the text.
 fn is_like(pattern: &[u8], text: &[u8]) -> bool {
     // Which beginnings of the pattern the text so far is like.
     let mut reached = vec![false; pattern.len() + 1];

@@ -1,7 +1,7 @@
 //! Ranges of addresses, and which addresses the policy of a Leaderboard lets its Pods reach. Pure.
 //!
 //! The controller reads them to make the policy, and a Pod reads them to measure whether the policy is enforced.
-//! The module also tells public addresses from others, because a stranger's URL may only lead to a public one.
+//! The module also tells public addresses from others: a URL that a participant may have chosen leads to public ones only.
 
 use std::net::{IpAddr, Ipv4Addr};
 
