@@ -20,7 +20,7 @@ pub const REFUSED: &str = "logcopy/refused/";
 pub const OWN_LOG: &str = "logcopy/logcopy.log";
 /// The log of `workspace`.
 pub const WORKSPACE_LOG: &str = "logcopy/workspace.log";
-/// What the host's contents print; the runner writes it.
+/// The output of the host's contents. The runner writes it.
 pub const CONTENTS_LOG: &str = "contents/contents.log";
 
 /// The folder of an agent, without a slash at its end.
@@ -33,7 +33,7 @@ pub fn checkpoint_path(pair: Pair) -> String {
     format!("{}/agent_results.json", agent_folder(pair))
 }
 
-/// What the agent of a pair has printed.
+/// The output of a pair's agent.
 pub fn agent_log(pair: Pair) -> String {
     format!("{}/leaderboard.log", agent_folder(pair))
 }
