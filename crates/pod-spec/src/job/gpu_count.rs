@@ -37,7 +37,7 @@ fn claimed(source: GpuSource<'_>, plan: &RunPlan) -> i64 {
     }
 }
 
-/// What a container requests of GPUs: the limit of such a resource is its request.
+/// Number of GPUs that a container requests. The limit of such a resource is its request.
 fn requested(resources: &Value, source: GpuSource<'_>) -> i64 {
     let of_list = |list: &str| {
         let named = resources[list].as_object().into_iter().flatten();
@@ -75,7 +75,7 @@ mod tests {
         gpus(&spec, Some(&track), &plan)
     }
 
-    /// What a container with one GPU asks for.
+    /// The resources of a container with one GPU.
     fn one() -> Value {
         json!({"limits": {"nvidia.com/gpu": "1", "cpu": "4"}})
     }

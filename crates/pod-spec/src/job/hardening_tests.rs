@@ -1,4 +1,4 @@
-//! What keeps a stranger's container from the node and from its neighbors: security contexts, disk, name files.
+//! Barriers between a participant's container, the node and its neighbors: security contexts, disk, name files.
 
 use std::collections::BTreeSet;
 
@@ -182,7 +182,7 @@ fn a_pod_requests_and_may_fill_so_much_of_its_nodes_disk() {
     };
     let named = |list: &str, amount: &str| json!({list: {"ephemeral-storage": amount, "memory": "1Gi"}});
     for (simulator, agent, expected) in [
-        // Nothing is said of the disk.
+        // The host names no disk.
         (
             json!({}),
             json!({"limits": {"memory": "1Gi"}}),

@@ -186,7 +186,7 @@ fn refused(cases: &[(&str, &str)]) {
     }
 }
 
-/// The same within one entry of `list`.
+/// Overlays with one entry in `list`, each with how the message goes on behind that list's path.
 #[track_caller]
 fn refused_in(list: &str, cases: &[(&str, &str)]) {
     for (entry, expected) in cases {
