@@ -13,7 +13,7 @@ use leaderboard_policy::allowed::Allowed;
 /// The Leaderboards at one moment.
 #[derive(Clone, Debug)]
 pub struct Leaderboards {
-    /// Those that can be read.
+    /// The Leaderboards that can be read.
     pub all: Vec<Arc<Leaderboard>>,
     /// True if none can be missing. One that this program can't read might serve any phase.
     pub is_complete: bool,

@@ -61,8 +61,7 @@ impl<K> Source<K> {
     }
 }
 
-/// A list under way. What it brings is cached at once, so that no second cache is needed, and is an event once the list is
-/// complete.
+/// A list under way. Its objects are cached at once, so that no second cache is needed. They become events once the list is complete.
 pub(super) struct Listing<K> {
     /// Names that this list has shown.
     pub shown: HashSet<Box<str>>,

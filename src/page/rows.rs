@@ -77,7 +77,7 @@ pub(super) struct Worker {
     pub total: i32,
     pub crashes: i32,
     pub state: WorkerState,
-    /// What ended its last round, after a crash.
+    /// Cause of the end of its last round, after a crash.
     pub last: Option<EndReason>,
 }
 
@@ -144,7 +144,7 @@ pub(super) fn message(text: &str) -> String {
     one_line(&sentence(text), MESSAGE)
 }
 
-/// What the status shows, or nothing before there is one.
+/// Reads the status; an empty one before there is any.
 fn with_status<T>(submission: &Submission, read: impl FnOnce(&SubmissionStatus) -> T) -> T {
     match &submission.status {
         Some(status) => read(status),

@@ -1,4 +1,4 @@
-//! What the leader shows of what is there: one walk over the caches every 15 s. It wakes each Leaderboard whose status has other counts or
+//! The leader's samples of all objects: one walk over the caches every 15 s. It wakes each Leaderboard whose status has other counts, or
 //! standings of other results.
 
 use std::collections::{BTreeMap, HashMap};
@@ -109,7 +109,7 @@ fn standing(submission: &Submission) -> [&'static str; 3] {
     [state.as_str(), reason, class.map_or("", FailureClass::as_str)]
 }
 
-/// What is summed up of the Submissions of a Leaderboard.
+/// The sums over the Submissions of a Leaderboard.
 #[derive(Default)]
 struct OfBoard {
     census: Census,

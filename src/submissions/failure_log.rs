@@ -1,5 +1,5 @@
-//! The tail of the log that explains a failure: read while it can be had, remembered until every system has the end, and
-//! stored in S3 for people.
+//! The tail of the log that explains a failure. It is read while it can be had, remembered until every system has the end, and stored in
+//! S3 for people.
 //!
 //! `decide` asks for it; `external` hands the text on to EvalAI's hosts. A log may hold private parts of the challenge, so it never gets into status,
 //! events or our own log.
@@ -104,7 +104,7 @@ pub struct Tail {
 }
 
 impl Tail {
-    /// Whether the participant's own program wrote it.
+    /// True if the participant's own program wrote it.
     pub fn is_agents(&self) -> bool {
         names::is_agent_container(&self.container)
     }
@@ -127,7 +127,7 @@ impl Tail {
     }
 }
 
-/// What came of looking for a log.
+/// Result of the search for a log.
 #[derive(Clone, Debug, PartialEq)]
 pub struct LogAnswer {
     pub tail: Option<Tail>,
@@ -257,7 +257,7 @@ async fn store(archive: &Archive, tail: &Tail) -> bool {
 /// is left.
 fn tail(room: usize, bytes: &[u8]) -> Option<String> {
     let clean = plain(&String::from_utf8_lossy(bytes));
-    // What was read may begin in the middle of a character.
+    // The bytes may begin in the middle of a character.
     let clean = clean.trim_start_matches(char::REPLACEMENT_CHARACTER).trim();
     if clean.is_empty() {
         return None;
@@ -354,7 +354,7 @@ mod tests {
         }
     }
 
-    /// What a node's answer of this status and body is taken for, and what was asked.
+    /// How an answer of a node with this status and body is read, and the path that was asked for.
     async fn asked(code: u16, body: &'static str, previous: bool) -> (Result<Option<Vec<u8>>, String>, String) {
         let (service, mut handle) = tower_test::mock::pair::<Request<Body>, Response<Body>>();
         let client = Client::new(service, "default");
