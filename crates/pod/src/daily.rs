@@ -67,8 +67,8 @@ impl Daily {
 
 /// The day in UTC, counted from 1970.
 pub fn today() -> u64 {
-    let since = SystemTime::now().duration_since(UNIX_EPOCH).unwrap_or_default();
-    since.as_secs().checked_div(DAY).unwrap_or(0)
+    let seconds = u64::try_from(Clock::system().now().as_second()).unwrap_or_default();
+    seconds.checked_div(DAY).unwrap_or(0)
 }
 
 #[cfg(test)]

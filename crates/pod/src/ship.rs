@@ -1,7 +1,7 @@
 //! Sends the containers' logs to CloudWatch: each file once, in order, line by line.
 //!
-//! A task of `logcopy` with a pace of its own, so that neither waits for the other. Streams are `<run id>/<container>`. What
-//! was sent is noted next to the files, so that a restarted logcopy goes on where the last one was.
+//! A task of `logcopy` with a pace of its own, so that neither waits for the other. Streams are `<run id>/<container>`. The position
+//! in each file is noted next to the files, so that a restarted logcopy goes on where the last one was.
 
 use std::collections::{BTreeMap, BTreeSet};
 use std::os::unix::fs::FileExt;
@@ -80,8 +80,8 @@ pub struct Shipper {
 }
 
 impl Shipper {
-    /// Goes on where the last one was. What a Pod before this one has stored was also sent by it. `a_day`: bytes that one stream
-    /// gets on a day.
+    /// Goes on where the last one was. Bytes that a Pod before this one has stored count as sent: that Pod sent them. `a_day`: bytes
+    /// that one stream gets on a day.
     pub fn new(
         client: LogClient,
         tree: Arc<Tree>,
@@ -345,6 +345,5 @@ fn billed(events: &[LogEvent]) -> u64 {
 }
 
 fn milliseconds() -> i64 {
-    let since = SystemTime::now().duration_since(UNIX_EPOCH).unwrap_or_default();
-    i64::try_from(since.as_millis()).unwrap_or(i64::MAX)
+    Clock::system().now().as_millisecond()
 }
