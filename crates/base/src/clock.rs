@@ -43,21 +43,21 @@ impl Clock {
 
 #[cfg(any(test, feature = "fixtures"))]
 impl Clock {
-    /// The same clock with another wall time.
+    /// This clock with another wall time.
     #[must_use]
     pub fn with_wall(self, now: impl Fn() -> Timestamp + Send + Sync + 'static) -> Self {
         let wall = Arc::new(now);
         Self { wall, ..self }
     }
 
-    /// The same clock with another boot time.
+    /// This clock with another boot time.
     #[must_use]
     pub fn with_boot(self, since_boot: impl Fn() -> Duration + Send + Sync + 'static) -> Self {
         let boot = Arc::new(since_boot);
         Self { boot, ..self }
     }
 
-    /// The same clock, whose wall time is ahead by this; behind where it is negative.
+    /// This clock with its wall time ahead by `by`, or behind if `by` is negative.
     #[must_use]
     pub fn ahead(self, by: jiff::SignedDuration) -> Self {
         let wall = Arc::clone(&self.wall);
