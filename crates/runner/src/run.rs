@@ -185,7 +185,7 @@ impl Runner {
         let (Role::Agent { idle, .. }, Some(tee)) = (&self.job.role, &self.tee) else {
             return None;
         };
-        // What it prints waits in its pipe while the node takes nothing of standard output: that is no silence. Only the node reads
+        // Output that waits in its pipe while the node reads no standard output is no silence. Only the node reads
         // there, so no command can bring this about.
         if tee.wants_stdout() {
             return Some(*idle);
@@ -368,7 +368,7 @@ impl Runner {
         self.announce_end(decide::conclude(self.me.side, cause, complete, &seen))
     }
 
-    /// Writes the file that belongs to the conclusion; without it nobody could rely on the conclusion.
+    /// Writes the file that belongs to the conclusion. If that fails, the conclusion changes: other containers rely on the file.
     fn announce_end(&mut self, conclusion: Conclusion) -> Conclusion {
         let mark = match conclusion.mark {
             None => return conclusion,
