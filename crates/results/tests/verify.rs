@@ -242,8 +242,8 @@ fn a_driving_score_that_is_no_product_is_reported() {
     }
 }
 
-/// Lower than the infractions ask for is nobody's gain: a percentage that counts, a fork that punishes more, a message that
-/// is not the evaluator's.
+/// A score below the one that the infractions give is no gain. It comes from a percentage that counts, a fork that punishes
+/// more, or a message that is not the evaluator's.
 #[test]
 fn what_is_no_gain_is_not_reported() {
     let foreign = vec!["Agent collided with “café” 车".to_owned()];
