@@ -61,7 +61,7 @@ pub fn parse(body: &str) -> Result<Message, Malformed> {
     })
 }
 
-/// The text as the image of a Submission, if the definition would take it. Whether it can be pulled is judged at acceptance.
+/// The text as the image of a Submission. None if the definition would refuse it. Acceptance judges if it can be pulled.
 fn fitting(text: &str) -> Option<String> {
     let text = text.trim();
     let starts_well = text.starts_with(|c: char| c.is_ascii_lowercase() || c.is_ascii_digit());

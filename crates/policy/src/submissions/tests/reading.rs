@@ -1,4 +1,4 @@
-//! What is waited for before an end is decided, a Pod is given up, a Job is deleted and an end is published; and how long.
+//! The waits before an end is decided, a Pod is given up, a Job is deleted and an end is published, with their lengths.
 
 use std::sync::Arc;
 use std::time::Duration;
