@@ -1,4 +1,4 @@
-//! Whose turn it is: which waiting submissions start now, the place of the others, and how long they may have to wait.
+//! The order of waiting submissions: which of them start now, the place of the others, and the estimate of their wait.
 //!
 //! Pure; called by `slots`. Fair between teams: each pick goes to the team that has the least running
 //! and picked so far, and among these to the one whose last run began longest ago. So a team with a hundred submissions

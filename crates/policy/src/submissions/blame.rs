@@ -1,4 +1,4 @@
-//! Whose fault the last crash of a worker was: one table over both containers. Pure.
+//! The fault for the last crash of a worker: one table over both containers. Pure.
 //!
 //! No participant's program runs in the host's container, so its verdict, and what the kubelet reports of it,
 //! decide. An agent's processes can replace or suppress the agent's verdict; it therefore only names the agent's fault more closely.

@@ -108,7 +108,7 @@ impl World {
                 submission: Arc::new(submission(evalai)),
                 leaderboard: Some(Arc::new(leaderboard(evalai))),
                 is_policy_in_place: true,
-                // Nobody else runs it; the tests of foreign runs set it otherwise.
+                // No other program runs it; the tests of foreign runs set it otherwise.
                 row: foreign::free(1),
                 turn: Turn::Go,
                 node: NodeView::default(),
