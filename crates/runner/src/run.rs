@@ -272,7 +272,7 @@ impl Runner {
         Ok(())
     }
 
-    /// Nobody crashes so often: an agent has made the files itself, and its simulator must not answer for it.
+    /// No run crashes so often: an agent has made the files itself, and its simulator must not answer for it.
     fn too_many_crashes(&mut self) -> Cause {
         let of_peer = StatusFile::Of(self.me.peer(), Mark::Crash(MAX_ROUNDS - 1));
         if self.me.side == Side::Host && of_peer.exists(&self.job.status) {
