@@ -139,9 +139,7 @@ pub(super) fn end(submission: &Submission) -> String {
     let status = submission.status.as_ref();
     let shown = facts::shown(submission);
     let reason = status.and_then(|status| status.reason.as_ref());
-    let reason = reason
-        .filter(|reason| reason.as_str() != shown)
-        .map(|reason| format!(" ({reason})"));
+    let reason = reason.map(|reason| format!(" ({reason})"));
     let next = if shown == State::Finished.as_str() {
         String::new()
     } else {
