@@ -46,7 +46,7 @@ impl Leaderboards {
     }
 }
 
-/// One that names what it may not has no queue, and no say in what becomes of another's messages.
+/// Drops each Leaderboard that names a place it may not: it has no queue, and no say in the end of another's messages.
 fn served(all: Vec<Arc<Leaderboard>>, allowed: &Allowed) -> Vec<Arc<Leaderboard>> {
     let is_allowed = |leaderboard: &Arc<Leaderboard>| allowed.refusal(leaderboard).is_none();
     all.into_iter().filter(is_allowed).collect()

@@ -90,7 +90,7 @@ impl<K> Listing<K> {
         self.unreadable.clear();
     }
 
-    /// One that has become unreadable stays as it was last read: it has not been deleted.
+    /// Notes an unreadable object. It stays as it was last read, because it has not been deleted.
     pub(super) fn unreadable(&mut self, key: Box<str>) {
         self.shown.insert(key.clone());
         self.unreadable.insert(key);

@@ -111,7 +111,7 @@ pub(crate) mod tests {
         }
     }
 
-    /// With a single subscriber in the process, a line that a thread of another test reaches first is off for good.
+    /// Guard of the collection. With a single subscriber in the process, a line that another test's thread reaches first is off for good.
     pub(crate) struct Collecting {
         _guard: tracing::subscriber::DefaultGuard,
         _second: Dispatch,

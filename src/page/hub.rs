@@ -14,11 +14,11 @@ use tokio::time::{sleep, timeout};
 
 use leaderboard_base::shutdown::Stop;
 
-/// So many may look at once. Each can hold one view that is no longer the newest.
+/// Most viewers at once. Each can hold one view that is no longer the newest.
 pub(super) const VIEWERS: usize = 32;
-/// Two views follow each other after so long at the soonest.
+/// Least time between two views.
 const PACE: Duration = Duration::from_secs(1);
-/// Without a change a view is made again after so long: failures grow old, and this replica may have begun to lead.
+/// Time until a view is made again without a change: failures grow old, and this replica may have begun to lead.
 const REFRESH: Duration = Duration::from_secs(15);
 /// Time between two signs of life, which show viewers and programs in between that an idle connection is not a dead one.
 const KEEP_ALIVE: Duration = Duration::from_secs(15);
@@ -87,7 +87,7 @@ impl Hub {
         }
     }
 
-    /// Until the last viewer has gone.
+    /// Makes views until the last viewer has gone.
     async fn show(&self, source: &dyn Source) {
         let latest = &self.0.latest;
         let mut changes = source.changes();

@@ -29,7 +29,7 @@ pub(super) struct Who {
     pub is_check: bool,
 }
 
-/// One that waits.
+/// A submission that waits.
 #[derive(Serialize, Clone, Debug, PartialEq, Eq)]
 #[serde(rename_all = "camelCase")]
 pub(super) struct Waits {
@@ -44,7 +44,7 @@ pub(super) struct Waits {
     pub since: Option<i64>,
 }
 
-/// One that runs.
+/// A submission that runs.
 #[derive(Serialize, Clone, Debug, PartialEq, Eq)]
 #[serde(rename_all = "camelCase")]
 pub(super) struct Runs {
@@ -81,7 +81,7 @@ pub(super) struct Worker {
     pub last: Option<EndReason>,
 }
 
-/// One that has ended.
+/// A submission that has ended.
 #[derive(Serialize, Clone, Debug, PartialEq, Eq)]
 #[serde(rename_all = "camelCase")]
 pub(super) struct Ended {
@@ -102,7 +102,7 @@ pub(super) struct Ended {
     pub phases: Phases,
 }
 
-/// One that has failed.
+/// A submission that has failed.
 #[derive(Serialize, Clone, Debug, PartialEq, Eq)]
 #[serde(rename_all = "camelCase")]
 pub(super) struct Failed {

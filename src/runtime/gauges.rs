@@ -168,7 +168,8 @@ impl OfBoard {
         *oldest = [*oldest, stands_since(submission)].into_iter().flatten().min();
     }
 
-    /// Until its Pod was lost, where that is known: what the next Pod brings is counted from that one's node on.
+    /// Adds the GPU seconds of a submission that holds GPUs. They end with the loss of its Pod, if that is known: those of the next Pod
+    /// count from its node on.
     fn add_holder(&mut self, submission: &Submission, now: Timestamp) {
         let live = submission.status.as_ref().filter(|status| !status.has_ended());
         let Some((status, since)) = live.and_then(|status| Some((status, status.times.scheduled.as_ref()?.0))) else {

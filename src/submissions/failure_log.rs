@@ -99,7 +99,7 @@ pub struct Tail {
     pub attempt: Attempt,
     /// Where all of it is, below the run's prefix, if it is stored.
     pub key: Option<String>,
-    /// With the first line for hosts at most 10,000 characters.
+    /// The lines, at most 10,000 characters with the first line for hosts.
     pub text: String,
 }
 
@@ -109,7 +109,7 @@ impl Tail {
         names::is_agent_container(&self.container)
     }
 
-    /// With a first line that shows whose log it is, and where all of it is.
+    /// The text with a first line that names the container, the attempt and the key of the whole log.
     pub fn for_hosts(&self) -> String {
         format!(
             "{}{}",
@@ -118,7 +118,7 @@ impl Tail {
         )
     }
 
-    /// With a first line that names no file which only hosts can read.
+    /// The text with a first line that names no file which only hosts can read.
     pub fn for_participants(&self) -> String {
         format!(
             "The end of {}'s log in attempt {}:\n{}",
@@ -131,7 +131,7 @@ impl Tail {
 #[derive(Clone, Debug, PartialEq)]
 pub struct LogAnswer {
     pub tail: Option<Tail>,
-    /// One that may have it did not answer, or storing failed.
+    /// True if a place that may have the log did not answer, or if storing it failed.
     pub is_unclear: bool,
 }
 

@@ -42,7 +42,7 @@ const JOB_SHOWS: Duration = Duration::from_secs(15);
 struct Written {
     version: u64,
     at: Instant,
-    /// Until the cache is as new.
+    /// The written status; None once the cache is as new.
     status: Option<Box<SubmissionStatus>>,
 }
 

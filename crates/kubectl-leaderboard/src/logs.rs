@@ -120,7 +120,7 @@ fn no_worker(name: &str, worker: usize, workers: usize) -> String {
     }
 }
 
-/// That nothing can be followed yet.
+/// One sentence for a submission that has no log to follow yet.
 pub(super) fn begins_later(submission: &Submission) -> String {
     let shown = facts::shown(submission);
     format!(
@@ -129,7 +129,7 @@ pub(super) fn begins_later(submission: &Submission) -> String {
     )
 }
 
-/// That a container runs again; the lines of its life before are above.
+/// One sentence between the lives of a container; the lines of the life before are above.
 pub(super) fn begins_again(container: &str, restarts: i32) -> String {
     format!("{container} was started again (restart {restarts}). Its log follows.")
 }

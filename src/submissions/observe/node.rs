@@ -77,7 +77,7 @@ fn of(node: &Node) -> NodeView {
     }
 }
 
-/// One that only asks new Pods to prefer other nodes announces no end, and the next Pod could come to this node again.
+/// The key of the taint that announces the node's end. A taint that only asks new Pods to prefer other nodes announces none.
 fn leaving(node: &Node) -> Option<String> {
     let mut taints = node.spec.taints.iter();
     let found = taints.find(|taint| {
