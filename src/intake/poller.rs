@@ -104,6 +104,10 @@ impl<S: Source> Poller<S> {
         *self.stop.borrow() || self.stop.has_changed().is_err()
     }
 
+    fn now_ms(&self) -> i64 {
+        self.shared.telemetry.clock.now().as_millisecond()
+    }
+
     /// Receives once and processes what came.
     async fn round(&mut self) -> Result<(), String> {
         let received = self.receive().await?;
@@ -136,7 +140,7 @@ impl<S: Source> Poller<S> {
         let received = tokio::select! {
             biased;
             // A message that was handed out would wait until its time is over.
-            received = self.source.receive(self.each) => received?,
+            received = self.source.receive(self.each, &self.shared.telemetry.clock) => received?,
             _ = stop.wait_for(|stop| *stop) => return Ok(Vec::new()),
         };
         if !self.is_over() {
@@ -223,12 +227,12 @@ impl<S: Source> Poller<S> {
             hindrance: received.hindrance.clone(),
         };
         let rules = &readers.rules;
-        let outcome = match route::route(rules, &envelope, &readers.all, now_ms(), readers.is_complete) {
+        let outcome = match route::route(rules, &envelope, &readers.all, self.now_ms(), readers.is_complete) {
             // The watch may be behind: nothing is given up by its cache alone.
             MessageOutcome::Dead(DeadReason::Unknown(_)) => match self.fresh(readers).await {
                 Some(fresh) => {
                     let rules = self.source.rules(&fresh.all);
-                    route::route(&rules, &envelope, &fresh.all, now_ms(), fresh.is_complete)
+                    route::route(&rules, &envelope, &fresh.all, self.now_ms(), fresh.is_complete)
                 }
                 None => MessageOutcome::Lapse,
             },
@@ -240,7 +244,7 @@ impl<S: Source> Poller<S> {
                 let span = ingest::span(&namespace, &leaderboard, incoming.submission);
                 let ingested = self.ingest(&namespace, &leaderboard, &incoming).instrument(span).await;
                 ingested.map_or(MessageOutcome::Lapse, |ingested| {
-                    route::settle(&envelope, &ingested.map_err(Into::into), rules, now_ms())
+                    route::settle(&envelope, &ingested.map_err(Into::into), rules, self.now_ms())
                 })
             }
             (_, outcome) => outcome,
@@ -262,7 +266,7 @@ impl<S: Source> Poller<S> {
         };
         match &outcome {
             Ok(Outcome::Created | Outcome::Bumped(_)) => {
-                let waited = now_ms().saturating_sub(incoming.sent_ms);
+                let waited = self.now_ms().saturating_sub(incoming.sent_ms);
                 let waited = Duration::from_millis(u64::try_from(waited).unwrap_or_default());
                 self.shared
                     .telemetry
@@ -357,10 +361,6 @@ async fn extended<T>(work: impl Future<Output = T>, half: Duration, extend: impl
         () = tokio::time::sleep(half) => {}
     }
     join(work, extend).await.0
-}
-
-fn now_ms() -> i64 {
-    jiff::Timestamp::now().as_millisecond()
 }
 
 fn report(done: Result<(), String>) {

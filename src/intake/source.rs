@@ -4,6 +4,7 @@ use std::sync::Arc;
 use std::time::Duration;
 
 use leaderboard_api::{Leaderboard, Reason};
+use leaderboard_base::clock::Clock;
 use leaderboard_policy::intake::route::{DeadReason, Hindrance, Rules};
 
 /// A message that was received and is ours until its visibility lapses.
@@ -46,8 +47,8 @@ pub trait Source: Send + Sync + 'static {
     /// What its readers want done with its messages.
     fn rules(&self, readers: &[Arc<Leaderboard>]) -> Rules;
 
-    /// Waits for as many messages as can be used in time, if each takes so long.
-    fn receive(&mut self, each: Duration) -> impl Future<Output = Result<Vec<Received>, String>> + Send;
+    /// Waits for as many messages as can be used in time, if each takes so long. One whose time is not known counts from now.
+    fn receive(&mut self, each: Duration, clock: &Clock) -> impl Future<Output = Result<Vec<Received>, String>> + Send;
 
     /// How long a received message is ours.
     fn visibility(&self) -> Duration;

@@ -140,7 +140,7 @@ pub fn spawn_watch<K: Watchable>(
     let task = Task {
         check: format!("{} synced", K::plural(&())),
         sources: apis.iter().map(source).collect(),
-        metrics: telemetry.metrics.watch(&kind),
+        metrics: telemetry.metrics.watch(&kind, &telemetry.clock),
         readiness: telemetry.readiness.clone(),
         kind,
         trim,

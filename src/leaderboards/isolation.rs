@@ -21,6 +21,7 @@ use crate::runtime::stores::Stores;
 use crate::slots::Slots;
 use leaderboard_api::text::sentence;
 use leaderboard_api::{Enforcement, Leaderboard, PolicySource, Reason, conditions, names};
+use leaderboard_base::clock::Clock;
 use leaderboard_contract::verdict::{NotAVerdict, WorkspaceReason, WorkspaceVerdict};
 use leaderboard_pod_spec::network_policy::{is_in_place, network_policy};
 use leaderboard_policy::leaderboards::view::Policy;
@@ -31,6 +32,7 @@ const RESTORED_AT_ONCE: usize = 16;
 /// What keeps the policies in place.
 #[derive(Clone, Copy)]
 pub struct Policies<'a> {
+    pub clock: &'a Clock,
     pub client: &'a Client,
     pub stores: &'a Stores,
     pub state: &'a LeaderboardState,
@@ -163,7 +165,7 @@ pub async fn keep_missing(policies: Policies<'_>, reference: &ObjectRef<Leaderbo
     if policies.stores.shows_policy(&leaderboard) {
         policies.state.note_seen(&uid_of(leaderboard.as_ref()));
     } else {
-        keep(policies, &leaderboard, Timestamp::now()).await;
+        keep(policies, &leaderboard, policies.clock.now()).await;
     }
 }
 

@@ -88,7 +88,7 @@ pub async fn reconcile(leaderboard: Arc<Leaderboard>, uses: Uses<'_>) -> Result<
 
 /// One reconcile of a Leaderboard that this installation drives.
 async fn drive(leaderboard: Arc<Leaderboard>, uses: Uses<'_>) -> Result<Duration, CallError> {
-    let now = Timestamp::now();
+    let now = uses.policies.clock.now();
     let (writer, Policies { stores, state, .. }) = (uses.writer, uses.policies);
     // One that is being deleted keeps it too: its submissions may still run.
     let policy = isolation::keep(uses.policies, &leaderboard, now).await;

@@ -168,6 +168,7 @@ fn sample_job(settings: &Settings, leaderboard: &Leaderboard, track: &Track) -> 
         number: JobNumber::default(),
         own: &settings.own,
         failed_nodes: &[],
-        now: Timestamp::now(),
+        // How old a measurement of the isolation is changes nothing that a Job is refused for.
+        now: Timestamp::UNIX_EPOCH,
     }))
 }

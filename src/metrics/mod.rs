@@ -13,7 +13,6 @@ use std::fmt;
 use std::sync::{Arc, Mutex};
 use std::time::Duration;
 
-use jiff::Timestamp;
 use prometheus_client::encoding::text;
 use prometheus_client::metrics::counter::Counter;
 use prometheus_client::metrics::gauge::Gauge;
@@ -26,6 +25,7 @@ use prometheus_client::registry::Registry;
 use crate::observability::REVISION;
 use families::{Counters, Families, Gauges, Timings};
 use leader::{Leader, Samples};
+use leaderboard_base::clock::Clock;
 use leaderboard_base::lock::lock;
 use leaderboard_base::meter::Meter;
 use process::Process;
@@ -324,13 +324,14 @@ impl Metrics {
         }
     }
 
-    /// What is counted of one kind's watch; it appears at once, at zero.
-    pub fn watch(&self, kind: &str) -> WatchMetrics {
+    /// The metrics of one kind's watch; they appear at once, at zero.
+    pub fn watch(&self, kind: &str, clock: &Clock) -> WatchMetrics {
         let kind = || [kind.to_owned()];
         WatchMetrics {
             errors: self.shared.watch_errors.of(kind()),
             unreadable: self.shared.watch_unreadable.of(kind()),
             last_event: self.shared.watch_last_event.of(kind()),
+            clock: clock.clone(),
         }
     }
 }
@@ -342,12 +343,13 @@ pub struct WatchMetrics {
     /// Objects that cannot be read now.
     pub unreadable: Gauge,
     last_event: Gauge,
+    clock: Clock,
 }
 
 impl WatchMetrics {
     /// The watch brought something.
     pub fn event(&self) {
-        self.last_event.set(Timestamp::now().as_second());
+        self.last_event.set(self.clock.now().as_second());
     }
 }
 

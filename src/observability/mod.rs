@@ -13,6 +13,7 @@ pub mod traces;
 use std::sync::Arc;
 
 use crate::metrics::{Metrics, Program};
+use leaderboard_base::clock::Clock;
 use leaderboard_base::shutdown::Stop;
 use leaderboard_base::tasks::Tasks;
 use liveness::Liveness;
@@ -28,6 +29,7 @@ pub const REVISION: &str = match option_env!("LEADERBOARD_REVISION") {
 /// What every part of a process is handed: where it counts, where it reports what it misses, and when it has to end.
 #[derive(Clone, Debug)]
 pub struct Observability {
+    pub clock: Clock,
     pub metrics: Arc<Metrics>,
     pub liveness: Liveness,
     pub readiness: Readiness,
@@ -37,7 +39,7 @@ pub struct Observability {
 }
 
 impl Observability {
-    /// Of a controller: empty registries around a process's stop signal.
+    /// Empty registries of a controller, around the process's stop signal, and the system's clock.
     pub fn new(stop: Stop) -> Self {
         Self::of(Program::Controller, stop)
     }
@@ -45,6 +47,7 @@ impl Observability {
     /// The same of any program.
     pub fn of(program: Program, stop: Stop) -> Self {
         Self {
+            clock: Clock::system(),
             metrics: Arc::new(Metrics::new(program)),
             liveness: Liveness::default(),
             readiness: Readiness::default(),

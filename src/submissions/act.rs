@@ -91,7 +91,7 @@ pub async fn act(uses: Uses<'_>, view: &View, plan: Plan) -> Result<Option<Durat
     for event in &plan.events {
         actor.publish(event).await;
     }
-    let ended = view.ended_at();
+    let ended = view.ended_at().unwrap_or(view.now);
     uses.workers
         .demand_report(&view.submission, &plan.status, ended, plan.report);
     // Last comes what the API server may refuse for as long as a quota is used up: it keeps nothing else from being done.

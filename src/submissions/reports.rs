@@ -53,8 +53,8 @@ impl RunFiles {
 #[derive(Clone, Debug)]
 pub struct Report {
     pub demand: ReportDemand,
-    /// When the run ended: of several that have, the oldest end is read first.
-    pub ended: Option<Timestamp>,
+    /// When the run ended, or was seen to have ended: of several that have, the oldest end is read first.
+    pub ended: Timestamp,
     pub files: Arc<RunFiles>,
 }
 
@@ -105,7 +105,7 @@ impl Ask for Report {
     fn rank(&self) -> Rank {
         match self.demand.stage {
             Stage::Live => (1, 0),
-            Stage::RunEnded | Stage::JobEnded => (0, self.ended.unwrap_or_else(Timestamp::now).as_second()),
+            Stage::RunEnded | Stage::JobEnded => (0, self.ended.as_second()),
         }
     }
 

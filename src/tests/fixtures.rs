@@ -37,6 +37,7 @@ use crate::submissions::records;
 use leaderboard_api::{Attempt, JobNumber, Leaderboard, State, Submission, SubmissionStatus, Times, effective, names};
 use leaderboard_aws::clients::Aws;
 use leaderboard_aws::table::Tables;
+use leaderboard_base::clock::Clock;
 use leaderboard_base::shutdown::Stop;
 use leaderboard_base::tasks::Tasks;
 use leaderboard_evalai::{Hub, Options};
@@ -113,6 +114,7 @@ pub async fn surroundings(cluster: Cluster, endpoint: &str) -> Surroundings {
     let (turning, _) = mpsc::unbounded_channel();
     let tables = Arc::new(Tables::new(aws.clone()));
     let context = Context {
+        clock: Clock::system(),
         writer: Writer::new(client.clone(), || true),
         settings: settings(),
         slots: Arc::new(Slots::new(stores.clone(), noting(&turning))),

@@ -3,9 +3,10 @@
 //! Used for S3 (`upload`) and CloudWatch (`ship`), which note it next to the files, so that a restart does not begin anew.
 
 use std::collections::BTreeMap;
-use std::time::{SystemTime, UNIX_EPOCH};
 
 use serde::{Deserialize, Serialize};
+
+use leaderboard_base::clock::Clock;
 
 /// Seconds of a day.
 const DAY: u64 = 24 * 60 * 60;

@@ -6,7 +6,7 @@
 use std::collections::{BTreeMap, BTreeSet};
 use std::os::unix::fs::FileExt;
 use std::sync::Arc;
-use std::time::{Duration, Instant, SystemTime, UNIX_EPOCH};
+use std::time::{Duration, Instant};
 
 use serde::{Deserialize, Serialize};
 use tokio::sync::watch;
@@ -17,6 +17,7 @@ use super::upload::Memory;
 use leaderboard_api::RunId;
 use leaderboard_aws::logs::{BETWEEN_BATCHES, LogClient, LogEvent, LogsError, Miss, OVERHEAD, cut};
 use leaderboard_base::backoff::Backoff;
+use leaderboard_base::clock::Clock;
 use leaderboard_contract::keys::agent_log;
 use leaderboard_contract::keys::{CONTENTS_LOG, OWN_LOG, WORKSPACE_LOG};
 use leaderboard_contract::report::Logs;

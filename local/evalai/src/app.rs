@@ -64,6 +64,7 @@ fn lock<T>(mutex: &Mutex<T>) -> MutexGuard<'_, T> {
 }
 
 /// Now, to the microsecond, as the server's database keeps it.
+#[allow(clippy::disallowed_methods, reason = "a stand-in for another program")]
 pub(crate) fn now() -> Timestamp {
     let now = Timestamp::now();
     now.round(Unit::Microsecond).unwrap_or(now)

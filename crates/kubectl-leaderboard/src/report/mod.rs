@@ -7,7 +7,6 @@ mod redact;
 use std::path::PathBuf;
 
 use clap::Args;
-use jiff::Timestamp;
 use leaderboard_api::text::sentence;
 use serde_json::{Value, json};
 
@@ -38,7 +37,7 @@ struct Part {
 
 /// Writes the report.
 pub async fn report(cluster: &Cluster, wanted: &Report) -> Result<(), Error> {
-    let now = Timestamp::now();
+    let now = frame().now;
     let parts = ask(cluster).await;
     let submissions = parts.iter().find(|part| part.name == SUBMISSIONS);
     let names = submissions
