@@ -80,9 +80,15 @@ mod tests {
         json!({"limits": {"nvidia.com/gpu": "1", "cpu": "4"}})
     }
 
+    fn assert_counted<const N: usize>(cases: [(&str, Value, i64); N]) {
+        for (what, fields, expected) in cases {
+            assert_eq!(counted(&fields), expected, "{what}");
+        }
+    }
+
     #[test]
-    fn gpus_are_counted_as_they_are_requested() {
-        let cases = [
+    fn gpus_are_counted_by_the_mode() {
+        assert_counted([
             ("nothing is requested", json!({}), 0),
             (
                 "one for each container",
@@ -100,6 +106,12 @@ mod tests {
                 json!({"gpu": {"mode": "Claim", "claim": {"deviceClassName": "gpu.nvidia.com"}}}),
                 4,
             ),
+        ]);
+    }
+
+    #[test]
+    fn gpus_are_counted_as_containers_request_them() {
+        assert_counted([
             (
                 "one a simulator",
                 json!({"evaluation": {"carla": {"simulator": {"resources": one()}}}}),
@@ -137,10 +149,7 @@ mod tests {
                 json!({"evaluation": {"carla": {"simulator": {"resources": {"limits": {"cpu": "2"}}}}}}),
                 0,
             ),
-        ];
-        for (what, fields, expected) in cases {
-            assert_eq!(counted(&fields), expected, "{what}");
-        }
+        ]);
     }
 
     #[test]

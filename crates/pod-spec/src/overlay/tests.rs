@@ -396,6 +396,10 @@ fn what_may_not_be_mounted_is_refused() {
             refused_in(list, &[(&entry, &expected)]);
         }
     }
+}
+
+#[test]
+fn mounts_of_another_shape_are_refused() {
     refused_in(
         "containers",
         &[
