@@ -38,9 +38,9 @@ const FIFO: &str = ".fifo";
 pub struct QueueError {
     /// URL of the queue.
     pub queue: String,
-    /// What was tried, as IAM calls it.
+    /// The action that failed, by its IAM name without `sqs:`.
     pub action: &'static str,
-    /// What kind of failure.
+    /// Class of the failure.
     pub fault: Fault,
     /// SQS's message.
     pub text: String,
@@ -138,8 +138,8 @@ impl Reader {
         Ok(())
     }
 
-    /// Deletes messages. What can't be deleted comes back and is a repeat then, so that only a failure of the whole
-    /// request is an error.
+    /// Deletes messages. A single message that can't be deleted comes back and is a repeat then; only a failure of a whole request is
+    /// an error.
     pub async fn delete(&self, receipts: &[&str]) -> Result<(), QueueError> {
         for chunk in receipts.chunks(BATCH) {
             let mut request = self.client.delete_message_batch().queue_url(&self.url);

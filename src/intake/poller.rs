@@ -27,11 +27,11 @@ use leaderboard_policy::intake::route::{self, DeadReason, Envelope, Later, Messa
 
 /// Longest time that one message may take; half of it is over when its visibility is extended.
 const MESSAGE_LIMIT: Duration = Duration::from_secs(20);
-/// What a visibility is extended to at least, in seconds.
+/// Shortest time by which a visibility is extended, in seconds.
 const EXTENSION: i32 = 30;
 /// The longest visibility that SQS allows, in seconds.
 const LONGEST_VISIBILITY: i32 = 43_200;
-/// A message that can be received again is, within so long: a receive looks into a part of the queue, and those before it come first.
+/// Time within which a free message is received again. A receive looks into a part of the queue, and earlier messages come first.
 const SEEN_AGAIN: Duration = Duration::from_mins(5);
 /// How soon the API server must answer about events and Leaderboards.
 const CALL_LIMIT: Duration = Duration::from_secs(5);
@@ -57,7 +57,7 @@ struct Readers {
     all: Vec<Arc<Leaderboard>>,
     rules: Rules,
     is_complete: bool,
-    /// The same read without a cache, when a message is about to be given up.
+    /// The Leaderboards, read without a cache when a message is about to be given up. None inside: that read failed.
     fresh: OnceCell<Option<Leaderboards>>,
 }
 
@@ -119,7 +119,7 @@ impl<S: Source> Poller<S> {
         Ok(())
     }
 
-    /// What was received is in hand; what was to come back by now, and did not, is gone.
+    /// Notes the age of each received message, and forgets messages that did not come back in time.
     fn remember(&mut self, received: &[Received]) {
         let now = Instant::now();
         let until = now + self.source.visibility() + SEEN_AGAIN;

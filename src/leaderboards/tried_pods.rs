@@ -62,7 +62,7 @@ impl Ask for Pods {
 pub(super) struct TriedPods {
     /// Why they would be refused.
     pub(super) refused: Option<String>,
-    /// What their host should know all the same.
+    /// Notes for their host, one sentence each.
     pub(super) notes: Vec<String>,
     /// How the template of their claims stands.
     pub(super) claims: Claims,

@@ -1,8 +1,8 @@
-//! Every metric of the operator: what is counted, with which labels.
+//! Every metric of the operator, with its labels.
 //!
-//! Parts count in these families; the health server asks for the text. Labels hold kinds, outcomes and other fixed values, the names of
-//! Leaderboards and queues, which are few, those of the first teams of each Leaderboard, and those of submissions as long as they hold
-//! GPUs: never those of an image, nor of what has ended.
+//! Parts count in these families; the health server asks for the text. Labels hold kinds, outcomes and other fixed values. They also
+//! hold names: of Leaderboards and queues, which are few, of the first teams of each Leaderboard, and of submissions that hold GPUs.
+//! No label names an image, or an object that has ended.
 
 mod families;
 pub mod leader;
@@ -96,7 +96,7 @@ impl Shared {
     }
 }
 
-/// What a controller does.
+/// Counts of a controller's work.
 #[derive(Debug)]
 pub struct Work {
     reconciles: Counters<2>,
@@ -132,7 +132,7 @@ impl Work {
     }
 }
 
-/// What has become of submissions while this process led.
+/// Counts of submissions since this process began to lead.
 #[derive(Debug)]
 pub struct Submissions {
     pub failures: Counters<3>,
@@ -246,7 +246,7 @@ impl Default for Metrics {
 }
 
 impl Metrics {
-    /// What counts the calls of clients here.
+    /// The meter that counts the calls of this process's clients.
     pub fn meter(self: &Arc<Self>) -> Meter {
         let metrics = Arc::clone(self);
         Meter::new(move |call| {
@@ -304,7 +304,7 @@ impl Metrics {
         self.shared.oldest_message.clear();
     }
 
-    /// What the leader shows, until the next walk.
+    /// Sets the leader's samples, which hold until the next walk.
     pub fn show(&self, samples: Samples) {
         self.leader.show(samples);
     }
@@ -336,7 +336,7 @@ impl Metrics {
     }
 }
 
-/// Of one kind's watch.
+/// The metrics of one kind's watch.
 #[derive(Clone, Debug)]
 pub struct WatchMetrics {
     pub errors: Counter,

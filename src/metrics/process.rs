@@ -113,7 +113,7 @@ fn busy_seconds(runtime: &RuntimeMetrics) -> f64 {
     busy.sum::<Duration>().as_secs_f64()
 }
 
-/// Of `stat`: the fields 14 and 15. The second, the program's name, may hold anything up to its last bracket.
+/// User and system time, in seconds: the fields 14 and 15 of `stat`. The second field, a name, may hold anything up to its last bracket.
 fn cpu_seconds(stat: &str) -> Option<f64> {
     let (_, fields) = stat.rsplit_once(')')?;
     let mut times = fields.split_whitespace().skip(11);

@@ -56,11 +56,11 @@ pub struct Page {
     title: String,
 }
 
-/// What the page reads.
+/// The sources that the page reads.
 pub struct Reads {
     pub leaderboards: Watch<Leaderboard>,
     pub submissions: Watch<Submission>,
-    /// Whether this replica leads at present.
+    /// Returns true while this replica leads.
     pub leads: Box<dyn Fn() -> bool + Send + Sync>,
 }
 
@@ -82,7 +82,7 @@ impl Page {
         })
     }
 
-    /// The same page under the installation's title, such as the name of its cluster.
+    /// Sets the page's title, such as the name of its cluster.
     #[must_use]
     pub fn titled(mut self, title: &str) -> Self {
         title.clone_into(&mut self.title);

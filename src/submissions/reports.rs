@@ -1,6 +1,6 @@
 //! The report of a run in its bucket. It is read for each demand of `decide`, and once a period while the run goes on.
 //!
-//! An end is decided only on a report that was asked for after the end was seen, so the stage that was known is part of the question.
+//! An end is decided only on a report that was requested after the end was seen, so the known stage is part of the question.
 
 use std::sync::Arc;
 use std::time::Duration;
@@ -177,8 +177,8 @@ pub fn seen(lookup: &Lookup<Report>, job: JobNumber, pod: Option<&str>) -> Repor
     }
 }
 
-/// The report as that of an attempt. `is_former`: what is read is of the time before the object was restored from a backup, and may be
-/// of a later attempt than the object knows of. Its own Pods store reports of its attempt alone.
+/// The report as that of an attempt. `is_former`: the report is older than the object, which was restored from a backup. It may be of a
+/// later attempt than the object knows. Its own Pods store reports of its attempt alone.
 fn shown(stored: &Stored, wanted: Attempt, is_former: bool) -> ObservedReport {
     match stored {
         Stored::Nothing => ObservedReport::Absent,

@@ -78,8 +78,8 @@ pub(super) fn headline(submission: &Submission, now: Timestamp) -> String {
     }
 }
 
-/// The state of this attempt, or of a later one, with its reason; then the lines that a person who waits for it reads, which have the
-/// message too. None before the attempt has begun.
+/// The state of this attempt, or of a later one, with its reason. Then the lines for a person who waits for it, which have the message
+/// too. None before the attempt has begun.
 pub(super) fn transition(submission: &Submission, attempt: Attempt, frame: Frame) -> Option<(String, Vec<String>)> {
     let status = submission.status.as_ref().filter(|s| s.attempt >= Some(attempt))?;
     let shown = status.state_of_conditions().as_str();

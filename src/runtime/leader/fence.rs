@@ -1,4 +1,4 @@
-//! The fence: whether this process may write to EvalAI, DynamoDB and Kubernetes at this very moment.
+//! The fence: shows if this process may write to EvalAI, DynamoDB and Kubernetes at this very moment.
 //!
 //! Written by the election alone, asked by every such write. Cheap, without a lock or a call. It counts by the boot clock, which goes on
 //! while the process or the machine is paused. So a leader that wakes up late finds its fence closed.

@@ -87,7 +87,7 @@ impl Settings {
 /// Where this process stands.
 #[derive(Clone, Debug, PartialEq, Eq)]
 pub enum Leadership {
-    /// Somebody else leads, or nobody is known to.
+    /// Another process leads, or no leader is known.
     Standby,
     /// This process leads.
     Leader {

@@ -25,7 +25,7 @@ use leaderboard_policy::submissions::job_name;
 use leaderboard_policy::view::{EvalaiView, NodeView, ObservedJob, PodView, View};
 use workers::Workers;
 
-/// What reading the world of a submission uses.
+/// The sources of a submission's view.
 #[derive(Clone, Copy)]
 pub struct Uses<'a> {
     pub clock: &'a Clock,
@@ -78,7 +78,7 @@ pub fn observe(uses: Uses<'_>, submission: Arc<Submission>, is_policy_in_place: 
     }
 }
 
-/// Whether a Job may be made now.
+/// True if a Job may be made now.
 fn may_create(job: &ObservedJob) -> bool {
     matches!(job, ObservedJob::Absent { .. } | ObservedJob::Foreign)
 }

@@ -27,7 +27,7 @@ pub struct Workers {
 }
 
 impl Workers {
-    /// Starts them. What `wake` makes is called for each submission that has its answer.
+    /// Starts them. Each calls its own result of `wake` with each submission that has its answer.
     pub fn start(
         aws: &Aws,
         tables: Arc<Tables>,
