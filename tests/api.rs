@@ -1,9 +1,10 @@
-//! What only a real API server can show: whether it takes the definitions, and what it then refuses, fills in and shows.
+//! Tests that need a real API server: it takes the definitions, refuses faulty objects, fills in defaults, and prints columns.
 
 #![allow(
     clippy::unwrap_used,
     clippy::expect_used,
     clippy::panic,
+    clippy::disallowed_methods,
     reason = "clippy knows a test by its attribute; what tests call is a test too"
 )]
 

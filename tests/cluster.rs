@@ -1,13 +1,14 @@
 //! The whole system on a real cluster: the operator's own programs, real Pods, and stand-ins for AWS and EvalAI.
 //!
-//! Each test has a namespace, queues, a table and a prefix in the bucket of its own, and runs the operator as child processes
-//! that it may kill and stop. Six tests run at once, begun in the order of their names, so that those that take longest come
-//! first; each prints its seconds. What `restarts` has disturbs all others and runs alone, after them.
+//! Each test has a namespace, queues, a table and a prefix in the bucket of its own. It runs the operator as child processes that it may
+//! kill and stop. Six tests run at once, begun in the order of their names, so that the longest come first. Each prints its seconds.
+//! `restarts` disturbs all others, so it runs alone, after them.
 
 #![allow(
     clippy::unwrap_used,
     clippy::expect_used,
     clippy::panic,
+    clippy::disallowed_methods,
     reason = "clippy knows a test by its attribute; what tests call is a test too"
 )]
 

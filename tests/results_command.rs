@@ -72,7 +72,7 @@ fn leaves_all(format: &str, flags: &[&str], inputs: &[PathBuf], code: i32) -> St
     stderr(&output)
 }
 
-/// Compares what was said with its file in `tests/results_command`. UPDATE_GOLDEN=1 writes it; read the difference then.
+/// Compares output with its file in `tests/results_command`. UPDATE_GOLDEN=1 writes it; read the difference then.
 fn assert_said(name: &str, said: &[(&str, String)]) {
     let cases = cases().display().to_string();
     let text = said.iter().map(|(what, said)| format!("=== {what}\n{said}"));
@@ -110,7 +110,7 @@ fn every_normal_case_gives_the_originals_files() {
         assert_eq!(names(&out).len(), FILES.len(), "{case}");
         written += 1;
     }
-    // Past the harness, which hides what a passing test prints. Nobody has to read it.
+    // Written past the harness, which hides the output of a passing test. A lost line is no fault.
     let words = format!("results command: {written} normal cases equal, {refused} refused as by the original\n");
     let _ = std::io::stderr().write_all(words.as_bytes());
     assert_eq!((written, refused), (48, 6));

@@ -1,6 +1,6 @@
-//! A submission of 20 routes on 4 pairs as plain processes, killed in every part at every moment: the final score is always that
-//! of a run that nobody disturbed. The programs are the real ones (runner, workspace, logcopy) and the stand-ins for simulator and
-//! agent, the test plays the kubelet, and S3 is a stand-in.
+//! A submission of 20 routes on 4 pairs as plain processes, killed in every part at every moment. The final score is always that of an
+//! undisturbed run. The programs are the real ones (runner, workspace, logcopy), with stand-ins for simulator and agent. The test plays
+//! the kubelet, and S3 is a stand-in.
 //!
 //! `LEADERBOARD_KILL_RUNS` sets how many runs, `LEADERBOARD_TEST_SEED` repeats one that failed.
 

@@ -19,7 +19,7 @@ pub const JSON: &str = "application/json";
 pub const MERGE: &str = "application/merge-patch+json";
 pub const APPLY: &str = "application/apply-patch+yaml";
 
-/// What is needed of an object.
+/// The parts of an object that a measurement reads.
 #[derive(Deserialize, Clone, Debug)]
 pub struct Slim<S> {
     pub metadata: Meta,

@@ -1,4 +1,4 @@
-//! What the API server's audit log shows of the operator: its requests by verb and resource, their times and bodies.
+//! The operator's requests in the API server's audit log: by verb and resource, with their times and bodies.
 
 use std::collections::BTreeMap;
 use std::fs::File;
@@ -16,7 +16,7 @@ use crate::servers::OPERATOR;
 
 /// The process's own requests, which no submission causes.
 const OF_THE_PROCESS: [&str; 2] = ["leases", "selfsubjectaccessreviews"];
-/// What is written for a Leaderboard, however many submissions it has.
+/// Resources that are written for a Leaderboard, however many submissions it has.
 const OF_THE_LEADERBOARD: [&str; 2] = ["leaderboards", "networkpolicies"];
 const READS: [&str; 3] = ["get", "list", "watch"];
 /// Longer than the API server takes to note a request.
@@ -124,7 +124,7 @@ pub fn read(log: &Path) -> Outcome<Vec<Entry>> {
     Ok(found)
 }
 
-/// The same once no more writes come: the event of an end follows its status, and each line its answer.
+/// The operator's requests once no more writes come: the event of an end follows its status, and each line its answer.
 pub async fn read_settled(log: &Path) -> Outcome<Vec<Entry>> {
     let mut known = read(log)?;
     loop {

@@ -1,4 +1,4 @@
-//! What every part of a measurement uses: the parameters of a run, and one kind of error.
+//! The parts that every measurement uses: the parameters of a run, and one kind of error.
 
 use std::path::PathBuf;
 
@@ -6,7 +6,7 @@ type Fault = Box<dyn std::error::Error + Send + Sync>;
 /// Every error is for a person to read.
 pub type Outcome<T> = Result<T, Fault>;
 
-/// What all cases share.
+/// The settings that all cases share.
 pub struct Bench {
     pub tools: PathBuf,
     pub operator: PathBuf,

@@ -1,4 +1,4 @@
-//! What /proc shows of this machine and of the processes under test: time of the CPU, memory, and what others took meanwhile.
+//! This machine and the processes under test by /proc: CPU time, memory, and the use of other processes meanwhile.
 
 use std::fs;
 use std::time::Instant;
@@ -10,7 +10,7 @@ use crate::bench::Outcome;
 /// Clock ticks a second in /proc; Linux has no other value on the machines that this runs on.
 const TICKS: f64 = 100.0;
 
-/// What the figures were measured on.
+/// The machine of the figures.
 #[derive(Serialize, Deserialize, Clone, Debug, Default, PartialEq)]
 #[serde(rename_all = "camelCase")]
 pub struct Machine {
@@ -70,7 +70,7 @@ impl Used {
         })
     }
 
-    /// What was used between two moments. A process that was started again in between counts from its start.
+    /// The use between two moments. A process that was started again in between counts from its start.
     pub fn since(&self, before: &Self) -> Self {
         let less = |now: f64, before: f64| if now >= before { now - before } else { now };
         Self {

@@ -1,5 +1,5 @@
-//! Plays the kubelets, and where it has to, the Job controller: a Pod of 11 containers runs as soon as it exists, its report is
-//! in S3, and after its time all of its containers have ended well.
+//! Plays the kubelets, and in some cases the Job controller. A Pod of 11 containers runs as soon as it exists, and its report is in S3.
+//! After its time all of its containers have ended well.
 
 use std::collections::HashSet;
 use std::sync::Arc;
@@ -25,7 +25,7 @@ pub const NODE: &str = "played";
 const AT_ONCE: usize = 16;
 const LAG: Duration = Duration::from_secs(10);
 
-/// What becomes of the Pods.
+/// The course of the Pods.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 pub enum Pods {
     /// They run so long and end well.
@@ -83,7 +83,7 @@ impl Player {
         Self { pods, tasks }
     }
 
-    /// Whether no Pod comes to its end.
+    /// True if no Pod comes to its end.
     pub fn is_endless(&self) -> bool {
         !matches!(self.pods, Pods::Last(_))
     }

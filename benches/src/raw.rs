@@ -1,5 +1,5 @@
-//! A client that does nothing but write: the limit that the operator is compared with. It sends the operator's own bodies, as
-//! the API server's audit log has them, with other names in them.
+//! A client that only writes: the limit that the operator is compared with. It sends the operator's own bodies, as the API server's audit
+//! log has them, with other names in them.
 
 use http::Method;
 use kube::Client;
@@ -10,7 +10,7 @@ use crate::audit;
 use crate::bench::Outcome;
 use crate::names::{LEADERBOARD, SAMPLE};
 
-/// What is written for one submission until its Job exists.
+/// The writes for one submission until its Job exists.
 pub struct Bodies {
     uid: String,
     status: Body,
@@ -50,7 +50,7 @@ pub async fn create_submission(client: &Client, name: &str) -> Outcome<Meta> {
 }
 
 impl Bodies {
-    /// Those of [`SAMPLE`], whose UID is this, among the entries of an audit log; none as long as one of them is missing.
+    /// The bodies of [`SAMPLE`], which has this UID, among the entries of an audit log; None until both are there.
     pub fn of_sample(entries: &[audit::Entry], uid: &str) -> Option<Self> {
         let found = |resource: &str, holds: &dyn Fn(&Value) -> bool| {
             let mut all = entries

@@ -34,7 +34,7 @@ pub struct Line {
     /// Values over time, for the plots.
     #[serde(default, skip_serializing_if = "BTreeMap::is_empty")]
     pub series: BTreeMap<String, Vec<(f64, f64)>>,
-    /// What must be known to read the figures, such as a limit of time that was reached.
+    /// Sentences that a reader of the figures needs, such as a limit of time that was reached.
     #[serde(default, skip_serializing_if = "Vec::is_empty")]
     pub notes: Vec<String>,
 }

@@ -1,5 +1,5 @@
-//! What more controllers and more clusters would bring, simulated with the measured rates: Leaderboards of unequal size are
-//! distributed by a hash of their names, first to clusters, then to the controllers of each. Pure.
+//! The gain of more controllers and more clusters, simulated with the measured rates. Leaderboards of unequal size are distributed by a
+//! hash of their names, first to clusters, then to the controllers of each. Pure.
 
 use std::fmt::Write as _;
 
@@ -16,7 +16,7 @@ const SHARDS: [usize; 4] = [1, 2, 4, 8];
 const CLUSTERS: [usize; 3] = [1, 2, 4];
 const DAY: u32 = 86_400;
 
-/// What was measured.
+/// The measured rates.
 #[derive(Clone, Copy, Debug, PartialEq)]
 struct Rates {
     /// Jobs a second that one API server takes.
@@ -31,7 +31,7 @@ struct Rates {
     ready: f64,
 }
 
-/// What comes of a distribution.
+/// The result of a distribution.
 #[derive(Clone, Copy, Debug, PartialEq)]
 struct Outlook {
     /// Part of all submissions that the largest controller has.
@@ -142,7 +142,7 @@ fn serve(backlog: &mut [f64], rates: Rates) {
     let mut left = rates.apiserver;
     let mut waiting = backlog.iter().filter(|left| **left > 0.0).count();
     let mut order: Vec<usize> = (0..backlog.len()).collect();
-    // Who has little to do leaves the rest of its share to the others.
+    // A controller with little to do leaves the rest of its share to the others.
     order.sort_by(|a, b| backlog[*a].total_cmp(&backlog[*b]));
     for shard in order {
         if backlog[shard] <= 0.0 {

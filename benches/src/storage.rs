@@ -1,5 +1,5 @@
-//! S3 as the operator sees it: one bucket that answers from memory, at once. A run without a Pod has no report; a live one has
-//! one of real size, which changes once a minute; an ended one has its final report.
+//! S3 as the operator sees it: one bucket that answers from memory, at once. A run without a Pod has no report. A live one has a report of
+//! real size, which changes once a minute. An ended one has its final report.
 
 use std::collections::{BTreeMap, HashMap};
 use std::sync::atomic::{AtomicU64, Ordering};
@@ -25,11 +25,11 @@ pub const ROUTES: u32 = 20;
 pub const PAIRS: u32 = 4;
 /// A route takes minutes, and each pair drives one.
 const NEWS: Duration = Duration::from_mins(1);
-/// What stands for the numbers of a run in the two texts.
+/// Placeholders for the numbers of a run in the two texts.
 const SUBMISSION: &str = "00000000-0000-0000-0000-000000000001";
 const POD: &str = "00000000-0000-0000-0000-000000000002";
 const ROUND: u64 = 987_654_321;
-/// What the evaluator's own merge renders for EvalAI.
+/// The results that the evaluator's own merge renders for EvalAI.
 const RESULTS: &str = include_str!("../../crates/results/tests/cases/v2/case01/results.json");
 const EMPTY_LIST: &str = "<?xml version=\"1.0\" encoding=\"UTF-8\"?><ListBucketResult \
     xmlns=\"http://s3.amazonaws.com/doc/2006-03-01/\"><Name>bench-results</Name><Prefix></Prefix><KeyCount>0</KeyCount>\

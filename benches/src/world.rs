@@ -23,7 +23,7 @@ use crate::storage::{BUCKET, PAIRS, ROUTES, Storage};
 const CLIENTS: usize = 16;
 const WARM_LIMIT: Duration = Duration::from_mins(2);
 
-/// What a run needs.
+/// The parts of a run.
 #[derive(Clone, Debug)]
 pub struct Setup {
     pub audit: Audit,
@@ -172,7 +172,7 @@ impl World {
     }
 }
 
-/// What exists before the first submission.
+/// Makes the objects that exist before the first submission.
 async fn prepare(client: &Client, setup: &Setup, storage: &str) -> Outcome<()> {
     for definition in leaderboard_operator::crds::definitions()? {
         let path = "/apis/apiextensions.k8s.io/v1/customresourcedefinitions";

@@ -21,7 +21,8 @@ def ensure(settings: Settings, names: Sequence[str]) -> None:
     """Builds what is missing: the named tools, and what the demo runs of this repository."""
     works: Mapping[str, Callable[[], object]] = {
         "tools": lambda: tools.ensure(settings, names, tools.fitting_assets(os.environ)),
-        "programs": lambda: (build.programs(settings), build.static_programs(settings)),
+        # The small build first: at the end it would leave a core idle.
+        "programs": lambda: (build.static_programs(settings), build.programs(settings)),
         "packages": lambda: pythonenv.ensure(settings),
     }
     cold = [bool(absent(settings, names)), build.cold_seconds(settings) > 0, not pythonenv.is_whole(settings)]

@@ -312,6 +312,11 @@ def narrow(tab: Tab, page: Page) -> str:
             wide = tab.run(f"{place}.scrollWidth")
             need(wide <= width, f"{wide} pixels do not fit into {width}")
             open_one(tab, "submission-4200")
+        # A node's name of AWS has 45 characters.
+        beyond = tab.run("""[...document.querySelectorAll('.row')]
+            .filter((row) => [...row.children].some((one) => one.getBoundingClientRect().right > row.getBoundingClientRect().right + 1))
+            .map((row) => row.textContent)""")
+        need(not beyond, f"parts of rows reach out of them at {width} pixels: {beyond}")
     return "320 to 1280 pixels, with a submission open too"
 
 

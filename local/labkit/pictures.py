@@ -14,7 +14,7 @@ from dataclasses import dataclass
 
 from . import browser, build, evalai_server, image, pagetest, terminal, tools
 from .browser import Tab
-from .demo import CHALLENGE, LEADERBOARD, NAMESPACE
+from .demo import CHALLENGE, LEADERBOARD, NAMESPACE, make_images
 from .errors import LabError
 from .kube import Kube, of_lab
 from .settings import Settings
@@ -25,6 +25,8 @@ SENSORS, MAP = 1, 2
 # A route of the submissions that are shown while they run, long enough for all pictures.
 ROUTE_MS = 9000
 PATIENCE = 180
+# What the submissions of the pictures run. The demo makes the first of them only.
+AGENTS = ("standard", "crash-once", "crash-always", "nonsense", "slow")
 
 
 @dataclass(frozen=True)
@@ -43,6 +45,7 @@ def run(settings: Settings) -> None:
     with of_person(settings) as kube, browser.tab() as tab:
         if kube.attempt("kubectl", "get", "leaderboard", LEADERBOARD).returncode != 0:
             raise LabError("the pictures are of the demo's cluster, which is not there: run `make demo` first")
+        make_images(settings, [f"challenge/agent:{name}" for name in AGENTS])
         with changed_back(kube):
             shown = submissions(settings, kube)
             folder = settings.repository / "docs" / "images"

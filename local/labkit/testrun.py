@@ -36,6 +36,7 @@ from . import (
 from .console import say, seconds
 from .errors import LabError, NotRun
 from .failures import Failure, Reader, Summary, failed_cases
+from .image import target_folder
 from .settings import Settings, client_environment, without_proxy
 from .toolsets import ENVTEST_TOOLS
 
@@ -104,6 +105,9 @@ def run(settings: Settings, core: bool, name_filter: str, only: Sequence[str]) -
     chosen = [layer for layer in LAYERS if not (core and layer.needs_root) and (not only or layer.name in only)]
     if not chosen:
         raise LabError("no layer is left to run: the cluster's needs a node, so leave --core out")
+    # A disk that fills in mid-run fails a layer that has nothing to do with it.
+    for folder in (settings.cache, settings.state, target_folder(settings.repository, os.environ)):
+        tools.check_space(folder)
     plan = Plan(settings, name_filter)
     results: list[Result] = []
     for at_once in stages(chosen):

@@ -39,6 +39,13 @@ class Borders(unittest.TestCase):
         rules = tomllib.loads((POLICY / "clippy.toml").read_text())
         refused = {rule["path"] for rule in rules["disallowed-methods"]}
         self.assertEqual(DISALLOWED - refused, set())
-        # The file takes the place of the workspace's.
+
+    def test_a_crate_with_rules_of_its_own_has_those_of_the_workspace_too(self) -> None:
         of_workspace = tomllib.loads((REPOSITORY / "clippy.toml").read_text())
-        self.assertEqual({name: rules.get(name) for name in of_workspace}, of_workspace)
+        clocks = {rule["path"] for rule in of_workspace.pop("disallowed-methods")}
+        self.assertIn("jiff::Timestamp::now", clocks)
+        for path in REPOSITORY.glob("crates/*/clippy.toml"):
+            with self.subTest(path.parent.name):
+                rules = tomllib.loads(path.read_text())
+                self.assertEqual(clocks - {rule["path"] for rule in rules["disallowed-methods"]}, set())
+                self.assertEqual({name: rules.get(name) for name in of_workspace}, of_workspace)

@@ -9,6 +9,7 @@ from collections.abc import Callable, Sequence
 from contextlib import redirect_stderr, redirect_stdout
 from pathlib import Path
 from types import SimpleNamespace
+from typing import Any
 from unittest.mock import patch
 
 from labkit import testrun
@@ -28,6 +29,20 @@ class Matrix(unittest.TestCase):
                 "no node          Pending           as expected  0.2",
             ],
         )
+
+
+class Space(unittest.TestCase):
+    def test_a_full_disk_is_named_before_any_layer_begins(self) -> None:
+        with tempfile.TemporaryDirectory() as folder:
+            place = Path(folder)
+            settings: Any = SimpleNamespace(cache=place, state=place, repository=place)
+            with (
+                patch("labkit.tools.shutil.disk_usage", return_value=SimpleNamespace(free=1 << 30)),
+                patch("labkit.testrun.run_layer") as run_layer,
+                self.assertRaisesRegex(LabError, "has 1.0 GiB free and 5 GiB are needed"),
+            ):
+                testrun.run(settings, core=True, name_filter="", only=["unit"])
+        run_layer.assert_not_called()
 
 
 class Alone(unittest.TestCase):

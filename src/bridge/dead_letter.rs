@@ -19,8 +19,8 @@ pub(super) struct DeadLetter {
     pub attributes: Vec<(&'static str, String)>,
 }
 
-/// The whole message first. Attributes count for the limit of size as well, so they go next; a message that is as large as a queue of EvalAI
-/// takes is left as what it names.
+/// The copy in three forms, from whole to cut. The second lacks most attributes, because they count for the limit of size as well. The
+/// third names only the submission and the message, because a message can be as large as a queue of EvalAI takes.
 pub(super) fn forms(message: &Received, reason: &DeadReason, queue: &str) -> [DeadLetter; 3] {
     let known = |fields: &[(&'static str, &str)]| {
         let fields = fields.iter().filter(|(_, text)| !text.is_empty());

@@ -13,7 +13,7 @@ use leaderboard_policy::allowed::Allowed;
 /// The Leaderboards at one moment.
 #[derive(Clone, Debug)]
 pub struct Leaderboards {
-    /// Those that can be read.
+    /// The Leaderboards that can be read.
     pub all: Vec<Arc<Leaderboard>>,
     /// True if none can be missing. One that this program can't read might serve any phase.
     pub is_complete: bool,
@@ -46,7 +46,7 @@ impl Leaderboards {
     }
 }
 
-/// One that names what it may not has no queue, and no say in what becomes of another's messages.
+/// Drops each Leaderboard that names a place it may not: it has no queue, and no say in the end of another's messages.
 fn served(all: Vec<Arc<Leaderboard>>, allowed: &Allowed) -> Vec<Arc<Leaderboard>> {
     let is_allowed = |leaderboard: &Arc<Leaderboard>| allowed.refusal(leaderboard).is_none();
     all.into_iter().filter(is_allowed).collect()

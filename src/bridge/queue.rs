@@ -18,6 +18,7 @@ use super::dead_letter::{self, DeadLetter};
 use crate::intake::source::Received;
 use leaderboard_aws::fault::{self, Fault};
 use leaderboard_aws::metered::Metered;
+use leaderboard_base::clock::Clock;
 use leaderboard_base::meter::Meter;
 use leaderboard_policy::intake::route::DeadReason;
 
@@ -37,9 +38,9 @@ const FIFO: &str = ".fifo";
 pub struct QueueError {
     /// URL of the queue.
     pub queue: String,
-    /// What was tried, as IAM calls it.
+    /// The action that failed, by its IAM name without `sqs:`.
     pub action: &'static str,
-    /// What kind of failure.
+    /// Class of the failure.
     pub fault: Fault,
     /// SQS's message.
     pub text: String,
@@ -99,8 +100,8 @@ impl Reader {
         self.visibility
     }
 
-    /// Waits up to 20 s for up to `most` messages.
-    pub async fn receive(&self, most: i32) -> Result<Vec<Received>, QueueError> {
+    /// Waits up to 20 s for up to `most` messages. One whose times SQS does not show counts from now.
+    pub async fn receive(&self, most: i32, clock: &Clock) -> Result<Vec<Received>, QueueError> {
         let request = self
             .client
             .receive_message()
@@ -113,12 +114,9 @@ impl Reader {
             .message_system_attribute_names(MessageSystemAttributeName::MessageGroupId)
             .send();
         let output: ReceiveMessageOutput = self.call("ReceiveMessage", request).await?;
-        Ok(output
-            .messages
-            .unwrap_or_default()
-            .into_iter()
-            .filter_map(received)
-            .collect())
+        let now = clock.now().as_millisecond();
+        let messages = output.messages.unwrap_or_default().into_iter();
+        Ok(messages.filter_map(|message| received(message, now)).collect())
     }
 
     /// Keeps messages invisible for so many seconds from now. A lease that is lost already is no error: the message
@@ -140,8 +138,8 @@ impl Reader {
         Ok(())
     }
 
-    /// Deletes messages. What can't be deleted comes back and is a repeat then, so that only a failure of the whole
-    /// request is an error.
+    /// Deletes messages. A single message that can't be deleted comes back and is a repeat then; only a failure of a whole request is
+    /// an error.
     pub async fn delete(&self, receipts: &[&str]) -> Result<(), QueueError> {
         for chunk in receipts.chunks(BATCH) {
             let mut request = self.client.delete_message_batch().queue_url(&self.url);
@@ -237,10 +235,9 @@ pub fn batch_size(visibility: Duration, each: Duration) -> i32 {
     i32::try_from(fit).unwrap_or(i32::MAX).clamp(1, 10)
 }
 
-fn received(message: Message) -> Option<Received> {
+fn received(message: Message, now: i64) -> Option<Received> {
     let attributes = message.attributes.unwrap_or_default();
     let number = |name| attributes.get(&name).and_then(|text| text.parse::<i64>().ok());
-    let now = jiff::Timestamp::now().as_millisecond();
     Some(Received {
         id: message.message_id?,
         receipt: message.receipt_handle?,

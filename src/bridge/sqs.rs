@@ -14,6 +14,7 @@ use crate::intake::source::{Received, SetAside, Source, named};
 use crate::kubernetes::{Namespaces, call_within};
 use crate::observability::liveness::Liveness;
 use leaderboard_api::{Leaderboard, Reason};
+use leaderboard_base::clock::Clock;
 use leaderboard_base::lock::lock;
 use leaderboard_base::meter::Meter;
 use leaderboard_policy::intake::route::{self, DeadReason, Rules};
@@ -119,7 +120,7 @@ impl Source for SqsQueue {
         route::rules(readers)
     }
 
-    async fn receive(&mut self, each: Duration) -> Result<Vec<Received>, String> {
+    async fn receive(&mut self, each: Duration, clock: &Clock) -> Result<Vec<Received>, String> {
         let pulse = self.pulse.check().await;
         pulse.map_err(|text| {
             format!(
@@ -128,7 +129,7 @@ impl Source for SqsQueue {
             )
         })?;
         let reader = self.open().await?;
-        let received = reader.receive(batch_size(reader.visibility(), each)).await;
+        let received = reader.receive(batch_size(reader.visibility(), each), clock).await;
         received.map_err(|error| {
             self.reader = None;
             error.to_string()

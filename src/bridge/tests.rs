@@ -42,7 +42,7 @@ fn telemetry() -> (Observability, watch::Sender<bool>) {
     (Observability::of(Program::Bridge, signal), stop)
 }
 
-/// Whether a request is the check that the API server answers.
+/// True if a request is the check that the API server answers.
 fn is_pulse(request: &Request<Body>) -> bool {
     request.uri().query() == Some("&limit=1")
 }

@@ -68,7 +68,7 @@ impl Command {
     }
 }
 
-/// What the servers have in common.
+/// Arguments that controller and bridge share.
 #[derive(Args, Debug)]
 struct Server {
     /// A namespace to serve; may be given several times, or with commas. All namespaces if there is none.
@@ -114,7 +114,7 @@ struct Controller {
     pod_uid: String,
 }
 
-/// What a controller has rights to besides its namespaces.
+/// Rights of a controller besides those in its namespaces, and its Lease.
 #[derive(Args, Debug)]
 struct Scope {
     /// Whether the operator may read nodes. Without it a lost node is noticed later.

@@ -55,7 +55,7 @@ enum VerifyName {
     Refuse,
 }
 
-/// What the exit code of `results` means.
+/// Exit codes of `results`, for its help.
 pub(super) const EXIT_CODES: &str = "Exit code 0: the four files are written. 2: the files or the arguments are refused. 1: \
     something can't be read or written. Unless it is 0, what had been in the folder is still there.";
 
@@ -286,7 +286,7 @@ fn write_all(out: &Path, merged: &str, files: &Files) -> Result<(), Failure> {
     let done = staged.and_then(|()| places.iter().try_for_each(OutputFile::take));
     if done.is_err() {
         for place in &places {
-            // What is left of the attempt; most of it may not be there.
+            // The files that this call wrote go; most of them may not be there.
             let _ = fs::remove_file(&place.staged);
         }
     }

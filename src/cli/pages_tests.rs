@@ -15,7 +15,7 @@ fn the_program_takes_every_line_of_the_documents() {
     let lines = support::lines(Path::new(env!("CARGO_MANIFEST_DIR")), "leaderboard-operator");
     assert!(lines.len() > 10, "{}", lines.len());
     for line in lines {
-        // What is left for the reader to complete.
+        // The reader replaces `…` by a value.
         let words = line.words.iter().map(String::as_str).filter(|word| *word != "…");
         let Err(error) = Cli::try_parse_from(std::iter::once("leaderboard-operator").chain(words)) else {
             continue;

@@ -17,7 +17,7 @@ use crate::observability::logging::Format;
 use crate::runtime::KINDS;
 use leaderboard_api::client_errors;
 
-/// What the exit code means.
+/// Exit codes, for the help.
 pub(super) const EXIT_CODES: &str =
     "Exit code 0: nothing is missing. 1: something is. 2: arguments or RUST_LOG are refused.";
 /// Between two looks.

@@ -31,10 +31,10 @@ use leaderboard_pod::places::{Places, Setting};
 use leaderboard_pod::{logcopy as logcopy_program, ownlog, workspace as workspace_program};
 use leaderboard_pod_spec::job::OwnImage;
 
-/// What the exit code of controller and bridge means.
+/// Exit codes of controller and bridge, for their help.
 pub(super) const EXIT_CODES: &str = "Exit code 0: it was stopped. 1: an error, which is the last line of its log. 2: arguments or \
     RUST_LOG are refused. 130: a second Ctrl-C.";
-/// What the exit code of a Pod's programs means.
+/// Exit codes of a Pod's programs, for their help.
 pub(super) const POD_EXIT_CODES: &str =
     "Exit code 0: its work is done. 1: an error, which is the last line of its log. 2: the arguments are refused.";
 /// Threads that run the tasks of controller and bridge. All that a burst needs is a part of one core, and each thread more is woken by
@@ -114,7 +114,7 @@ where
         }
     };
     let result = runtime.block_on(async { work().await });
-    // What still runs has no one to work for; a thread that hangs on a disk must not keep the process.
+    // The remaining tasks have no purpose any more, and a thread that hangs on a disk must not keep the process.
     runtime.shutdown_background();
     match result {
         Ok(()) => ExitCode::SUCCESS,

@@ -18,6 +18,7 @@ use crate::runtime::objects::key_of;
 use leaderboard_api::text::one_line;
 use leaderboard_api::{EvalaiQueue, Leaderboard, Reason};
 use leaderboard_base::backoff::Backoff;
+use leaderboard_base::clock::Clock;
 use leaderboard_base::object_key::ObjectKey;
 use leaderboard_evalai::answer::{About, Answer};
 use leaderboard_evalai::request::{Reply, Request};
@@ -136,9 +137,8 @@ impl Inbox {
         }
     }
 
-    /// What EvalAI shows of a message; none if it is to come back first.
-    async fn look_up(&mut self, body: String, receipt: String) -> Result<Option<Received>, String> {
-        let now = Timestamp::now();
+    /// The message with the facts of its row in EvalAI. None if it has to come back first, because the row was not read or is missing.
+    async fn look_up(&mut self, body: String, receipt: String, now: Timestamp) -> Result<Option<Received>, String> {
         let (mut id, mut sent, mut hindrance) = ("evalai".to_owned(), None, None);
         if let Ok(message) = message::parse(&body) {
             let submission = message.submission;
@@ -185,7 +185,7 @@ impl Source for Inbox {
         }
     }
 
-    async fn receive(&mut self, _: Duration) -> Result<Vec<Received>, String> {
+    async fn receive(&mut self, _: Duration, clock: &Clock) -> Result<Vec<Received>, String> {
         if self.empty > 0 {
             sleep(IDLE.bound(self.empty)).await;
         }
@@ -200,7 +200,7 @@ impl Source for Inbox {
             return Ok(Vec::new());
         };
         self.empty = 0;
-        let received = self.look_up(found.body.to_string(), receipt).await?;
+        let received = self.look_up(found.body.to_string(), receipt, clock.now()).await?;
         Ok(received.into_iter().collect())
     }
 

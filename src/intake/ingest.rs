@@ -1,8 +1,8 @@
 //! Creates and bumps Submissions: the only code that does. The bridge calls it for messages, the controller's leader
 //! for what its sweep of EvalAI finds.
 //!
-//! `decide_ingest` is pure and holds all policy; `apply` carries it out and is safe twice: names are deterministic,
-//! a bump carries the resourceVersion it was decided on. Knows no queue, and of EvalAI only what a swept row shows.
+//! `decide_ingest` is pure and holds all policy. `apply` carries it out and can run twice: names are deterministic, and a bump carries
+//! the resourceVersion it was decided on. This module knows no queue, and only the swept rows of EvalAI.
 
 use std::collections::BTreeMap;
 use std::time::Duration;
@@ -30,9 +30,9 @@ const SWEEP_AGE_MS: i64 = 120_000;
 const CALL_LIMIT: Duration = Duration::from_secs(8);
 /// How often a lost race is run again before the caller has to come back later.
 const ROUNDS: usize = 6;
-/// So many attempts begin without a message after one that came. EvalAI lets hosts resume, and participants only where the challenge has
-/// `allow_participants_resubmissions`; but any participant may write the row's status and times: more would be runs without a grant. One is enough for a resume whose message was lost; a person
-/// who wants another one raises `spec.attempt`.
+/// Most attempts that begin without a message after the last message. EvalAI lets hosts resume; it lets participants resume only if the
+/// challenge has `allow_participants_resubmissions`. Any participant may write the row's status and times, so more attempts would be runs
+/// without a grant. One is enough for a resume whose message was lost; a person who wants another one raises `spec.attempt`.
 const MOST_WITHOUT_MESSAGE: usize = 1;
 
 /// Where a submission that is to run comes from.
@@ -72,7 +72,7 @@ pub struct Incoming {
 }
 
 impl Incoming {
-    /// What a message asks for; `id` is the message's own.
+    /// The request of a message. `id` is the message's id in its queue; `sent_ms` is in milliseconds since 1970.
     pub fn of(message: &Message, id: String, sent_ms: i64) -> Self {
         Self {
             challenge: message.challenge,
@@ -93,7 +93,7 @@ impl Incoming {
     }
 }
 
-/// What is to be done.
+/// The step that an incoming submission needs.
 #[derive(Clone, Debug, PartialEq)]
 pub enum Ingest {
     /// There is none yet: create this one.
@@ -236,8 +236,8 @@ fn is_newer(existing: &Submission, incoming: &Incoming) -> bool {
         return created.is_some_and(|time| incoming.sent_ms >= time.0.as_millisecond() + 1000);
     };
     let is_same = matches!(&incoming.source, Source::Message(id) if *id == recorded.message);
-    // EvalAI notes the time of a resume before it sends the message. A swept row had kept its status for
-    // SWEEP_AGE_MS, so a message sent within that time belongs to the resume that the sweep has already served.
+    // EvalAI notes the time of a resume before it sends the message. A swept row had kept its status for SWEEP_AGE_MS. So a message sent
+    // within that time belongs to the resume that the sweep has already served.
     let grace = if recorded.message == SWEEP { SWEEP_AGE_MS } else { 0 };
     !is_same && incoming.sent_ms > recorded.sent.saturating_add(grace)
 }
@@ -281,7 +281,7 @@ fn new_submission(leaderboard: &str, incoming: &Incoming) -> Submission {
     }
 }
 
-/// What is noted of an attempt that this begins. A message begins the count anew; a first run needs none to be granted.
+/// The note of an attempt that begins. A message resets the list of attempts without a message; a first run needs no entry in it.
 fn record(existing: Option<&Submission>, incoming: &Incoming, attempt: Attempt) -> Ingested {
     let mut without_message = match incoming.source {
         Source::Message(_) => Vec::new(),
@@ -303,7 +303,7 @@ fn annotation(record: &Ingested) -> (String, String) {
     (names::ANNOTATION_INGESTED.to_owned(), json!(record).to_string())
 }
 
-/// What all lines about an incoming submission are written in, those of [`apply`] too.
+/// The span of all log lines about an incoming submission, those of [`apply`] included.
 pub fn span(namespace: &str, leaderboard: &str, submission: i64) -> Span {
     about::incoming(
         format_args!("{namespace}/{}", names::submission(submission)),
@@ -380,7 +380,7 @@ async fn rounds(
     Err(IngestError::Contended { name })
 }
 
-/// What is noted of an attempt that does not begin.
+/// The note of an attempt that does not begin.
 fn refusal(existing: Option<&Submission>, incoming: &Incoming, attempt: Attempt) -> Ingested {
     let at = incoming.sent_ms;
     Ingested {

@@ -27,11 +27,11 @@ use leaderboard_policy::intake::route::{self, DeadReason, Envelope, Later, Messa
 
 /// Longest time that one message may take; half of it is over when its visibility is extended.
 const MESSAGE_LIMIT: Duration = Duration::from_secs(20);
-/// What a visibility is extended to at least, in seconds.
+/// Shortest time by which a visibility is extended, in seconds.
 const EXTENSION: i32 = 30;
 /// The longest visibility that SQS allows, in seconds.
 const LONGEST_VISIBILITY: i32 = 43_200;
-/// A message that can be received again is, within so long: a receive looks into a part of the queue, and those before it come first.
+/// Time within which a free message is received again. A receive looks into a part of the queue, and earlier messages come first.
 const SEEN_AGAIN: Duration = Duration::from_mins(5);
 /// How soon the API server must answer about events and Leaderboards.
 const CALL_LIMIT: Duration = Duration::from_secs(5);
@@ -57,7 +57,7 @@ struct Readers {
     all: Vec<Arc<Leaderboard>>,
     rules: Rules,
     is_complete: bool,
-    /// The same read without a cache, when a message is about to be given up.
+    /// The Leaderboards, read without a cache when a message is about to be given up. None inside: that read failed.
     fresh: OnceCell<Option<Leaderboards>>,
 }
 
@@ -104,6 +104,10 @@ impl<S: Source> Poller<S> {
         *self.stop.borrow() || self.stop.has_changed().is_err()
     }
 
+    fn now_ms(&self) -> i64 {
+        self.shared.telemetry.clock.now().as_millisecond()
+    }
+
     /// Receives once and processes what came.
     async fn round(&mut self) -> Result<(), String> {
         let received = self.receive().await?;
@@ -115,7 +119,7 @@ impl<S: Source> Poller<S> {
         Ok(())
     }
 
-    /// What was received is in hand; what was to come back by now, and did not, is gone.
+    /// Notes the age of each received message, and forgets messages that did not come back in time.
     fn remember(&mut self, received: &[Received]) {
         let now = Instant::now();
         let until = now + self.source.visibility() + SEEN_AGAIN;
@@ -136,7 +140,7 @@ impl<S: Source> Poller<S> {
         let received = tokio::select! {
             biased;
             // A message that was handed out would wait until its time is over.
-            received = self.source.receive(self.each) => received?,
+            received = self.source.receive(self.each, &self.shared.telemetry.clock) => received?,
             _ = stop.wait_for(|stop| *stop) => return Ok(Vec::new()),
         };
         if !self.is_over() {
@@ -223,12 +227,12 @@ impl<S: Source> Poller<S> {
             hindrance: received.hindrance.clone(),
         };
         let rules = &readers.rules;
-        let outcome = match route::route(rules, &envelope, &readers.all, now_ms(), readers.is_complete) {
+        let outcome = match route::route(rules, &envelope, &readers.all, self.now_ms(), readers.is_complete) {
             // The watch may be behind: nothing is given up by its cache alone.
             MessageOutcome::Dead(DeadReason::Unknown(_)) => match self.fresh(readers).await {
                 Some(fresh) => {
                     let rules = self.source.rules(&fresh.all);
-                    route::route(&rules, &envelope, &fresh.all, now_ms(), fresh.is_complete)
+                    route::route(&rules, &envelope, &fresh.all, self.now_ms(), fresh.is_complete)
                 }
                 None => MessageOutcome::Lapse,
             },
@@ -240,7 +244,7 @@ impl<S: Source> Poller<S> {
                 let span = ingest::span(&namespace, &leaderboard, incoming.submission);
                 let ingested = self.ingest(&namespace, &leaderboard, &incoming).instrument(span).await;
                 ingested.map_or(MessageOutcome::Lapse, |ingested| {
-                    route::settle(&envelope, &ingested.map_err(Into::into), rules, now_ms())
+                    route::settle(&envelope, &ingested.map_err(Into::into), rules, self.now_ms())
                 })
             }
             (_, outcome) => outcome,
@@ -262,7 +266,7 @@ impl<S: Source> Poller<S> {
         };
         match &outcome {
             Ok(Outcome::Created | Outcome::Bumped(_)) => {
-                let waited = now_ms().saturating_sub(incoming.sent_ms);
+                let waited = self.now_ms().saturating_sub(incoming.sent_ms);
                 let waited = Duration::from_millis(u64::try_from(waited).unwrap_or_default());
                 self.shared
                     .telemetry
@@ -357,10 +361,6 @@ async fn extended<T>(work: impl Future<Output = T>, half: Duration, extend: impl
         () = tokio::time::sleep(half) => {}
     }
     join(work, extend).await.0
-}
-
-fn now_ms() -> i64 {
-    jiff::Timestamp::now().as_millisecond()
 }
 
 fn report(done: Result<(), String>) {

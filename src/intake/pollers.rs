@@ -25,7 +25,7 @@ const DRAIN: Duration = Duration::from_secs(20);
 /// Name of the readiness check.
 const CHECK: &str = "queues";
 
-/// What all pollers share.
+/// State that all pollers share.
 pub struct Shared {
     pub client: Client,
     pub scope: Scope,
@@ -121,7 +121,7 @@ impl<W: Clone + PartialEq> Pollers<W> {
     }
 }
 
-/// What keeps each queue from being read. The process is ready while at least one can be read, or there is none.
+/// The problem of each queue that cannot be read. The process is ready if it reads at least one queue, or has none to read.
 pub struct Problems {
     queues: Mutex<BTreeMap<String, Option<String>>>,
     readiness: Readiness,
@@ -136,7 +136,7 @@ impl Problems {
         }
     }
 
-    /// What a poller last met; None: its queue can be read.
+    /// Sets the last problem of a queue; None if the queue can be read.
     pub fn set(&self, url: &str, problem: Option<String>) {
         self.change(|queues| _ = queues.insert(url.to_owned(), problem));
     }

@@ -4,6 +4,7 @@ use std::sync::Arc;
 use std::time::Duration;
 
 use leaderboard_api::{Leaderboard, Reason};
+use leaderboard_base::clock::Clock;
 use leaderboard_policy::intake::route::{DeadReason, Hindrance, Rules};
 
 /// A message that was received and is ours until its visibility lapses.
@@ -11,7 +12,7 @@ use leaderboard_policy::intake::route::{DeadReason, Hindrance, Rules};
 pub struct Received {
     /// Names it whenever it is received.
     pub id: String,
-    /// What deletes this receive of it.
+    /// Handle that deletes this receive of the message.
     pub receipt: String,
     /// The body.
     pub body: String,
@@ -27,7 +28,7 @@ pub struct Received {
     pub hindrance: Option<Hindrance>,
 }
 
-/// What was done with a message that cannot be used, for an event.
+/// The event about a message that cannot be used, and was kept or dropped.
 pub struct SetAside {
     pub reason: Reason,
     pub note: String,
@@ -40,14 +41,14 @@ pub fn named(message: &Received, reason: &DeadReason) -> String {
 
 /// See the module's text. An error is one sentence for people.
 pub trait Source: Send + Sync + 'static {
-    /// The Leaderboards that read it, the oldest first. Those being deleted take nothing more.
+    /// The Leaderboards that read the queue, the oldest first. Leaderboards that are being deleted take nothing more.
     fn readers(&self, all: &[Arc<Leaderboard>]) -> Vec<Arc<Leaderboard>>;
 
-    /// What its readers want done with its messages.
+    /// The rules that its readers set for its messages.
     fn rules(&self, readers: &[Arc<Leaderboard>]) -> Rules;
 
-    /// Waits for as many messages as can be used in time, if each takes so long.
-    fn receive(&mut self, each: Duration) -> impl Future<Output = Result<Vec<Received>, String>> + Send;
+    /// Waits for as many messages as can be used in time, if each takes so long. One whose time is not known counts from now.
+    fn receive(&mut self, each: Duration, clock: &Clock) -> impl Future<Output = Result<Vec<Received>, String>> + Send;
 
     /// How long a received message is ours.
     fn visibility(&self) -> Duration;

@@ -1,6 +1,6 @@
 //! Submissions whose message was lost: each row that EvalAI's lists show becomes a Submission of the Leaderboard that serves it.
 //!
-//! Started by the controller's leader. What a row means for the object of its name is decided by `ingest`.
+//! Started by the controller's leader. `ingest` decides on the step that a row needs for the object of its name.
 
 use std::sync::Arc;
 
@@ -65,7 +65,7 @@ fn serves(board: &Leaderboard, row: &SweepRow) -> bool {
     is_of_server && board.serves(row.challenge, row.phase) && board.metadata.deletion_timestamp.is_none()
 }
 
-/// Where a queue of the phase leaves messages to another reader, that one may have the message of any row: no object is made of it.
+/// How a row counts. Another reader of the phase's queue may hold the message of any row, so then a row makes no object.
 fn kind(all: &[Arc<Leaderboard>], row: &SweepRow) -> Swept {
     let leaves = |board: &Leaderboard| board.spec.sqs().is_some_and(|q| q.foreign == Foreign::Leave);
     let is_shared = all.iter().any(|board| serves(board, row) && leaves(board));

@@ -38,8 +38,8 @@ impl CallError {
         }
     }
 
-    /// Answer of the API server, if that is no and stays no until somebody changes something: no right, a quota, or a webhook
-    /// or a policy of admission. Not a conflict, and not too many requests.
+    /// The API server's answer, if it is no until somebody changes something: no right, a quota, or a webhook or a policy of admission.
+    /// A conflict and too many requests are no refusal.
     pub fn refusal(&self) -> Option<&Status> {
         let is_refusal = |code: u16| (400..500).contains(&code) && ![408, 409, 429].contains(&code);
         self.status().filter(|status| is_refusal(status.code))

@@ -1,8 +1,7 @@
 //! Hands the changed objects of a watch to all subscribers, the newest state only.
 //!
-//! Filled by a watch's task. Never blocks the watch and loses nothing: what is not read
-//! yet is coalesced by UID, so that it takes no more memory than the objects do. A subscriber that comes late gets all
-//! objects that are there.
+//! Filled by a watch's task. It never blocks the watch and loses no object: unread changes are coalesced by UID, so it takes no more
+//! memory than the objects do. A subscriber that comes late gets all objects that are there.
 
 use std::collections::{HashMap, VecDeque};
 use std::pin::Pin;

@@ -1,4 +1,4 @@
-//! One object of a list or of a watch as it is decoded: straight from the bytes of the answer, without a generic value in between.
+//! Decodes one object of a list or of a watch: straight from the bytes of the answer, without a generic value in between.
 //!
 //! One object that cannot be read is an item of its own kind, and fails no list.
 

@@ -61,8 +61,7 @@ impl<K> Source<K> {
     }
 }
 
-/// A list under way. What it brings is cached at once, so that no second cache is needed, and is an event once the list is
-/// complete.
+/// A list under way. Its objects are cached at once, so that no second cache is needed. They become events once the list is complete.
 pub(super) struct Listing<K> {
     /// Names that this list has shown.
     pub shown: HashSet<Box<str>>,
@@ -91,7 +90,7 @@ impl<K> Listing<K> {
         self.unreadable.clear();
     }
 
-    /// One that has become unreadable stays as it was last read: it has not been deleted.
+    /// Notes an unreadable object. It stays as it was last read, because it has not been deleted.
     pub(super) fn unreadable(&mut self, key: Box<str>) {
         self.shown.insert(key.clone());
         self.unreadable.insert(key);

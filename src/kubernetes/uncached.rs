@@ -30,7 +30,7 @@ async fn hand_on<K: Watchable>(
     telemetry: Observability,
     mut take: impl FnMut(K),
 ) {
-    let metrics = telemetry.metrics.watch(&K::kind(&()));
+    let metrics = telemetry.metrics.watch(&K::kind(&()), &telemetry.clock);
     let of_namespace = |api: &Api<Item<K>>| match api.namespace() {
         Some(namespace) => telemetry.liveness.watch(&format!("{name} in {namespace}")),
         None => telemetry.liveness.watch(name),

@@ -1,8 +1,8 @@
 //! Watches: one task for each kind, a cache, and a feed of what has changed.
 //!
-//! One task each, because a shared backoff would let one broken watch hold up all others. A kind may be watched in several
-//! namespaces: each has a list and a backoff of its own (`source`), and the cache is complete once all of them are. Errors are logged,
-//! counted and retried here; readers only ever get objects.
+//! Each kind has its task, because a shared backoff would let one broken watch hold up all others. A kind may be watched in several
+//! namespaces: each has a list and a backoff of its own (`source`). The cache is complete once all of them are listed. This module logs,
+//! counts and retries errors; readers only ever get objects.
 
 use std::collections::{BTreeSet, HashSet};
 use std::sync::atomic::{AtomicBool, Ordering};
@@ -105,7 +105,7 @@ impl<K: Watchable> Watch<K> {
     /// All objects that exist now, then each that is added, changed or deleted. The store is at least as new as each event.
     pub fn subscribe(&self) -> WatchEvents<K> {
         self.feed.subscribe(|| {
-            // What a first list has brought so far comes once it is complete.
+            // The objects of an unfinished first list come once it is complete.
             if self.store.is_ready() {
                 self.store.state()
             } else {
@@ -140,7 +140,7 @@ pub fn spawn_watch<K: Watchable>(
     let task = Task {
         check: format!("{} synced", K::plural(&())),
         sources: apis.iter().map(source).collect(),
-        metrics: telemetry.metrics.watch(&kind),
+        metrics: telemetry.metrics.watch(&kind, &telemetry.clock),
         readiness: telemetry.readiness.clone(),
         kind,
         trim,
@@ -233,7 +233,7 @@ impl<K: Watchable> Task<K> {
         match before {
             // The end of an object that was replaced by another one of its name between two reads.
             Some(before) if before.uid() != after.uid() => self.tell(&before, true),
-            // Of a Pod most of what its kubelet and the Job controller write is read by nobody here.
+            // No code here reads most fields of a Pod that its kubelet and the Job controller write.
             Some(before) if after.is_same(&before) => return,
             _ => {}
         }
@@ -253,7 +253,7 @@ impl<K: Watchable> Task<K> {
         }
     }
 
-    /// Nobody learns of an object before the cache is complete, and of one that is gone by then nobody has to.
+    /// Sends an event once the cache is complete. Before that it keeps the name for the end of the list, unless the object is gone.
     fn tell(&mut self, object: &Arc<K>, is_gone: bool) {
         if self.is_complete {
             self.feed.push(object, is_gone);

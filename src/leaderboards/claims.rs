@@ -1,6 +1,6 @@
 //! The ResourceClaimTemplate of a Leaderboard whose workers claim their GPU: applied, never edited, and deleted when no Job needs it.
 //!
-//! Called by `tried_pods`. What stays of a Leaderboard that no longer claims is deleted with it.
+//! Called by `tried_pods`. The deletion of a Leaderboard also deletes a template that it no longer claims.
 
 use std::collections::BTreeSet;
 

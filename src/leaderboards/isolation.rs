@@ -21,6 +21,7 @@ use crate::runtime::stores::Stores;
 use crate::slots::Slots;
 use leaderboard_api::text::sentence;
 use leaderboard_api::{Enforcement, Leaderboard, PolicySource, Reason, conditions, names};
+use leaderboard_base::clock::Clock;
 use leaderboard_contract::verdict::{NotAVerdict, WorkspaceReason, WorkspaceVerdict};
 use leaderboard_pod_spec::network_policy::{is_in_place, network_policy};
 use leaderboard_policy::leaderboards::view::Policy;
@@ -28,9 +29,10 @@ use leaderboard_policy::leaderboards::view::Policy;
 /// Policies that are restored at once.
 const RESTORED_AT_ONCE: usize = 16;
 
-/// What keeps the policies in place.
+/// The parts that keep the policies in place.
 #[derive(Clone, Copy)]
 pub struct Policies<'a> {
+    pub clock: &'a Clock,
     pub client: &'a Client,
     pub stores: &'a Stores,
     pub state: &'a LeaderboardState,
@@ -39,7 +41,7 @@ pub struct Policies<'a> {
 }
 
 impl Policies<'_> {
-    /// Whether Jobs may be made: the watch shows the policy of the present spec, and the last apply did not fail.
+    /// True if Jobs may be made: the watch shows the policy of the present spec, and the last apply did not fail.
     pub fn is_in_place(&self, leaderboard: &Leaderboard) -> bool {
         let uid = uid_of(leaderboard);
         let has_failed = |entry: &Entry| entry.applied.as_ref().is_some_and(Applied::has_failed);
@@ -101,7 +103,7 @@ pub(super) async fn keep(policies: Policies<'_>, leaderboard: &Leaderboard, now:
     policy
 }
 
-/// What an answer means, given what the cache shows.
+/// The meaning of the API server's answer, given the cache.
 fn settled(answer: Policy, is_shown: bool, is_blind: bool) -> Policy {
     match answer {
         // It stands as it should; only the look at it failed, which is made again.
@@ -131,8 +133,8 @@ fn log(leaderboard: &Leaderboard, last: Option<&Applied>, new: &Applied) {
     }
 }
 
-/// Restores what somebody has edited or deleted, and applies what a new spec asks for, until the process stops: a task of its
-/// own, because the reconcile of a Leaderboard may wait for a bucket or a token meanwhile. `keep` is `keep_missing`.
+/// Restores edited and deleted policies, and applies those of a new spec, until the process stops. It is a task of its own, because the
+/// reconcile of a Leaderboard may wait for a bucket or a token meanwhile. `keep` is `keep_missing`.
 pub async fn restore<F: Future<Output = ()>>(
     policies: WatchEvents<NetworkPolicy>,
     leaderboards: WatchEvents<Leaderboard>,
@@ -163,7 +165,7 @@ pub async fn keep_missing(policies: Policies<'_>, reference: &ObjectRef<Leaderbo
     if policies.stores.shows_policy(&leaderboard) {
         policies.state.note_seen(&uid_of(leaderboard.as_ref()));
     } else {
-        keep(policies, &leaderboard, Timestamp::now()).await;
+        keep(policies, &leaderboard, policies.clock.now()).await;
     }
 }
 
@@ -195,8 +197,8 @@ async fn apply(client: &Client, leaderboard: &Leaderboard) -> Policy {
     }
 }
 
-/// What was measured last of this generation: by a Pod, as this process has seen it, else by one that is gone, as the condition shows;
-/// while the condition shows something else, as this process remembers it.
+/// The last measurement for this generation: that of a Pod which this process has seen, or else that of the condition. While the condition
+/// shows something else, the one that this process remembers. None if there is none, or the condition does not show any.
 pub(super) fn measured(state: &LeaderboardState, leaderboard: &Leaderboard) -> Option<WorkspaceVerdict> {
     let network = &leaderboard.spec.network;
     if network.policy == PolicySource::External || network.enforcement == Enforcement::Disabled {
@@ -254,7 +256,7 @@ fn is_pod_of(pod: &Pod, leaderboard: &Leaderboard) -> bool {
         && meta.namespace.as_deref() == leaderboard.metadata.namespace.as_deref()
 }
 
-/// What a Pod has found of its isolation, and when.
+/// The isolation that a Pod has found, and when; the time is None if the kubelet reports none.
 fn finding(pod: &Pod) -> Option<(Option<Timestamp>, WorkspaceVerdict)> {
     let mut containers = pod.status.init_container_statuses.iter();
     let end = containers.find(|c| &*c.name == names::CONTAINER_WORKSPACE)?.ended()?;
@@ -277,7 +279,7 @@ fn finding(pod: &Pod) -> Option<(Option<Timestamp>, WorkspaceVerdict)> {
     is_finding.then_some((end.finished_at.as_ref().map(|at| at.0), verdict))
 }
 
-/// What the condition shows that a Pod which is gone had found, for this generation.
+/// The condition's measurement for this generation, which a Pod made that is gone.
 fn known(leaderboard: &Leaderboard) -> Option<WorkspaceVerdict> {
     let known = leaderboard.condition(conditions::ISOLATED)?;
     if known.observed_generation != leaderboard.metadata.generation {

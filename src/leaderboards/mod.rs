@@ -43,10 +43,10 @@ use leaderboard_policy::leaderboards::view::Policy;
 use probe::{Asks, Looked};
 use state::{LeaderboardState, Made, RESYNC, SOONEST};
 
-/// The first look at a spec gets so long before the status shows that it is under way: mostly it takes less, and saves a write.
+/// Time that the first look at a spec gets before the status shows it as under way. Most take less, which saves a write.
 const FIRST_LOOK: Duration = Duration::from_secs(2);
 
-/// What a reconcile of a Leaderboard uses.
+/// The parts that a reconcile of a Leaderboard uses.
 #[derive(Clone, Copy)]
 pub struct Uses<'a> {
     pub policies: Policies<'a>,
@@ -58,7 +58,7 @@ pub struct Uses<'a> {
     pub asks: &'a Asks,
 }
 
-/// What a reconcile came to.
+/// The end of a reconcile.
 pub enum Reconciled {
     /// When to look again.
     Done(Duration),
@@ -88,7 +88,7 @@ pub async fn reconcile(leaderboard: Arc<Leaderboard>, uses: Uses<'_>) -> Result<
 
 /// One reconcile of a Leaderboard that this installation drives.
 async fn drive(leaderboard: Arc<Leaderboard>, uses: Uses<'_>) -> Result<Duration, CallError> {
-    let now = Timestamp::now();
+    let now = uses.policies.clock.now();
     let (writer, Policies { stores, state, .. }) = (uses.writer, uses.policies);
     // One that is being deleted keeps it too: its submissions may still run.
     let policy = isolation::keep(uses.policies, &leaderboard, now).await;
@@ -144,7 +144,7 @@ pub fn show_limits(samples: &mut Samples, uses: Uses<'_>, leaderboard: &Arc<Lead
     }
 }
 
-/// Hands the way to EvalAI to `external`. Of a Leaderboard that goes, or names what it may not, nothing more is sent there.
+/// Hands the way to EvalAI to `external`; takes it back if the Leaderboard is being deleted or names a place that it may not.
 fn serve(uses: Uses<'_>, view: &LeaderboardView, plan: &LeaderboardPlan, looked: &Looked) {
     let leaderboard = &view.leaderboard;
     if view.refusal.is_some() || plan.finalizer == Some(false) {

@@ -1,8 +1,8 @@
 //! Which installation of the operator drives a Leaderboard: `status.operator` names it, and every other one leaves that Leaderboard
 //! and its Submissions alone.
 //!
-//! An installation is named by its Lease, `<namespace>/<name>`. It claims a Leaderboard that has no name yet before it does anything
-//! else for it, by a write that fails if another one was faster. A person hands a Leaderboard over by removing the name.
+//! An installation is named by its Lease, `<namespace>/<name>`. It claims a Leaderboard without a name before it does anything else for
+//! it. The claim is a write that fails if another installation was faster. A person hands a Leaderboard over by removing the name.
 
 use std::sync::Arc;
 use std::time::Duration;
@@ -25,7 +25,7 @@ const OF_ANOTHER: Duration = Duration::from_mins(1);
 /// A Submission waits so long for the claim of its Leaderboard, which also wakes those that are pending.
 const UNCLAIMED: Duration = Duration::from_secs(2);
 
-/// Who drives a Leaderboard.
+/// The installation that drives a Leaderboard.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 enum Driver<'a> {
     Us,
@@ -45,7 +45,7 @@ fn driver<'a>(leaderboard: &'a Leaderboard, us: &str) -> Driver<'a> {
     }
 }
 
-/// Whether this installation drives a Leaderboard.
+/// True if this installation drives a Leaderboard.
 pub fn is_ours(leaderboard: &Leaderboard, us: &str) -> bool {
     driver(leaderboard, us) == Driver::Us
 }

@@ -17,7 +17,7 @@ use leaderboard_aws::queue::{self, QueueError, Reading};
 use leaderboard_aws::table::{Table, TableError};
 use leaderboard_policy::ask::Failure;
 
-/// A run that nobody has: the list below it is empty, and costs nothing.
+/// Prefix of a run that does not exist: the list below it is empty, and costs little.
 const NO_RUN: &str = "none/";
 
 /// The places that a Leaderboard names.
@@ -85,7 +85,7 @@ pub(super) async fn ask(aws: &Aws, place: &Place) -> Result<Seen, Failure> {
     answer
 }
 
-/// Whether the table takes rows. The right to describe it does not include that.
+/// Writes to the table, because the right to describe it does not include the right to write rows.
 async fn try_rows(aws: &Aws, table: &api::DynamoTable) -> Result<(), TableError> {
     Table::describe(aws, table).await?.try_write().await
 }

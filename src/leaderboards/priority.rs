@@ -1,6 +1,6 @@
 //! The PriorityClasses of a Leaderboard's Pods: they have to be there, and a run must not end another one.
 //!
-//! Asks the API server, where the operator may read them (`rbac.clusterRole`); what it may not read, nobody checks. `judge` is pure.
+//! Asks the API server for the classes if `rbac.clusterRole` allows it; otherwise the classes go unchecked. `judge` is pure.
 
 use std::collections::BTreeMap;
 
@@ -20,7 +20,7 @@ pub(super) struct Asked {
     is_of_track: bool,
 }
 
-/// What is wrong with the classes.
+/// Problems of the classes.
 #[derive(Clone, Debug, Default, PartialEq, Eq)]
 pub(super) struct Problems {
     /// No Pod could be made, or it would preempt against the rule of the field.

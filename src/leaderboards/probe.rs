@@ -69,7 +69,7 @@ pub struct Asks {
 }
 
 impl Asks {
-    /// Starts the tasks. What `wake` makes is called with each Leaderboard of which there is news.
+    /// Starts the tasks. Each task calls its own result of `wake` with each Leaderboard that has news.
     pub fn start(client: &Client, aws: &Aws, settings: &Settings, tasks: &Tasks, wake: impl Fn() -> Wake) -> Self {
         let place = |(resource, task)| {
             let aws = aws.clone();

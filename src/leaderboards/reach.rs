@@ -1,8 +1,7 @@
 //! A Leaderboard's bucket, table, queues and log group: which can be reached, and what is reported of the others.
 //!
-//! Pure: `places` asks, `decide` turns what is shown into the condition `Ready`. An answer counts at once. Silence counts
-//! when it has lasted for [`PATIENCE`], and then as `Unknown`: a service that is away for a minute makes nothing flap, and
-//! the cause of a silence is not known.
+//! Pure: `places` asks, `decide` makes the condition `Ready` of the answers. An answer counts at once. Silence counts as `Unknown`, once
+//! it has lasted for [`PATIENCE`]: its cause is not known. A service that is away for a minute makes nothing flap.
 
 use std::sync::Arc;
 use std::time::Duration;
@@ -21,7 +20,7 @@ const RETRY: Backoff = Backoff::new(Duration::from_secs(5), AGAIN);
 /// Time for which the last answer is held to be true while the service is silent.
 const PATIENCE: Duration = Duration::from_mins(2);
 
-/// What a Leaderboard names in AWS, the gravest first.
+/// Kinds of places in AWS that a Leaderboard names, the gravest first.
 #[derive(Clone, Copy, Debug, PartialEq, Eq, PartialOrd, Ord)]
 pub enum AwsResource {
     Bucket,
@@ -114,14 +113,14 @@ impl Reach {
         left.filter(|left| !left.is_zero()).min()
     }
 
-    /// What is to be shown at this moment; nothing if all is well, or may still be.
+    /// The places that cannot be reached, for the condition; None if all is well, or may still be.
     pub fn unreachable(&self) -> Option<Unreachable> {
         let mut said: Vec<_> = self
             .0
             .iter()
             .filter_map(|(place, lookup)| Some((place.resource.reason()?, said(place, lookup)?)))
             .collect();
-        // What is surely wrong comes before what nobody knows; among equals the gravest is first already.
+        // Known failures come before possible ones; among equals the gravest is first already.
         said.sort_by_key(|(_, (truth, _))| *truth != Truth::False);
         let (reason, (truth, _)) = said.first()?;
         Some(Unreachable {
@@ -135,7 +134,7 @@ impl Reach {
         })
     }
 
-    /// What a host should know of places that a Leaderboard can do without.
+    /// Sentences about places that a Leaderboard can do without.
     pub fn notes(&self) -> Vec<String> {
         let optional = self.0.iter().filter(|(place, _)| place.resource.reason().is_none());
         let said = optional.filter_map(|(place, lookup)| said(place, lookup));

@@ -62,7 +62,7 @@ fn silent(since: Timestamp, why: &str) -> String {
     )
 }
 
-/// Notes that are worth a line although results can be published: a server that is away, columns that stay empty, and a token that ends soon.
+/// Notes beside published results: a server that is away, columns that stay empty, and a token that ends soon. None if there is none.
 fn note(silence: Option<String>, labels: &Labels, of_token: Option<String>) -> Option<String> {
     let of_labels = labels.problems.iter().map(|problem| capitalized(&problem.to_string()));
     let notes: Vec<String> = silence.into_iter().chain(of_labels).chain(of_token).collect();

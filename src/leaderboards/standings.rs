@@ -1,4 +1,4 @@
-//! What EvalAI's client knows of the results in a Leaderboard's stored standings. Reads memory alone.
+//! The cancelled results in a Leaderboard's stored standings, as EvalAI's client knows them. Reads memory alone.
 
 use std::collections::BTreeSet;
 
@@ -6,7 +6,7 @@ use leaderboard_api::{Leaderboard, names};
 use leaderboard_base::object_key::ObjectKey;
 use leaderboard_evalai::Hub;
 
-/// Submissions of stored rows that EvalAI shows as cancelled. Those that retention has deleted are in no cache.
+/// Submissions of stored rows that EvalAI shows as cancelled, deleted ones included: retention takes those out of the cache.
 pub(super) fn cancelled(hub: &Hub, key: &ObjectKey, leaderboard: &Leaderboard) -> BTreeSet<String> {
     if leaderboard.spec.evalai.is_none() {
         return BTreeSet::new();

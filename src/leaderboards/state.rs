@@ -1,4 +1,4 @@
-//! What is remembered of each Leaderboard between two reconciles, by UID.
+//! Memory of each Leaderboard between two reconciles, by UID.
 
 use std::collections::{BTreeSet, HashMap};
 use std::sync::Mutex;
@@ -29,7 +29,7 @@ pub(super) const RESYNC: Duration = Duration::from_mins(1);
 #[derive(Clone, Debug)]
 pub(super) struct Applied {
     pub(super) at: Timestamp,
-    /// Of which spec.
+    /// Generation of the applied spec.
     pub(super) generation: Option<i64>,
     pub(super) policy: Policy,
     /// Since when applies are answered well and the cache does not show it.
@@ -42,7 +42,7 @@ impl Applied {
     }
 }
 
-/// What a Pod has found of its isolation, made from which generation, and when.
+/// A Pod's finding about its isolation, with the generation of the Leaderboard that the Pod was made from, and the time.
 #[derive(Clone, Debug)]
 pub(super) struct Found {
     pub(super) generation: i64,
@@ -50,13 +50,13 @@ pub(super) struct Found {
     pub(super) verdict: WorkspaceVerdict,
 }
 
-/// What standings are made of: as long as it is the same, they are.
+/// The sources of standings: equal sources make equal standings.
 #[derive(Clone, Debug, PartialEq)]
 pub(super) struct Made {
     /// The census's mark of the results.
     pub(super) results: u64,
     pub(super) named: Named,
-    /// Of the spec.
+    /// Generation of the spec.
     pub(super) generation: Option<i64>,
     pub(super) cancelled: BTreeSet<String>,
 }
@@ -69,19 +69,19 @@ pub struct LeaderboardState(Mutex<HashMap<String, Entry>>);
 pub(super) struct Entry {
     /// When its status was written, and the version of it that the API server has made.
     pub(super) written: Option<(Timestamp, u64)>,
-    /// What its stored standings were made of, and when they were written.
+    /// The sources of its stored standings, and the time of their write.
     pub(super) standings: (Option<Made>, Option<Timestamp>),
     pub(super) applied: Option<Applied>,
-    /// What was measured last, of which generation.
+    /// The last measurement, with the generation it is for.
     pub(super) measured: Option<(Option<i64>, WorkspaceVerdict)>,
-    /// What its Pods have found.
+    /// The last finding of its Pods.
     pub(super) found: Option<Found>,
     /// The other installation that drives it, once that was reported.
     pub(super) other: Option<String>,
 }
 
 impl LeaderboardState {
-    /// Whether the stored standings were made of other results than this mark is of. No before the first reconcile.
+    /// True if the stored standings were made of other results than those of this mark. False before the first reconcile.
     pub fn lacks_results(&self, uid: &str, mark: u64) -> bool {
         self.read(uid, |entry| {
             entry.standings.0.as_ref().is_some_and(|made| made.results != mark)
@@ -124,12 +124,12 @@ impl LeaderboardState {
         });
     }
 
-    /// Whether standings that are made of this may be others than the stored ones.
+    /// True if standings from these sources may differ from the stored ones.
     pub(super) fn is_news(&self, uid: &str, made: &Made) -> bool {
         self.read(uid, |entry| entry.standings.0.as_ref() != Some(made))
     }
 
-    /// How long a status that differs from the old one waits for its write. What is new of it decides: numbers wait, all else does not.
+    /// Time until a changed status is written: new numbers alone wait, any other change is written at once.
     pub(super) fn time_to_write(
         &self,
         uid: &str,
@@ -176,13 +176,13 @@ impl LeaderboardState {
         self.change(uid, |entry| entry.standings.0 = Some(made.clone()));
     }
 
-    /// Whether its status was not written for so long.
+    /// True if its status was not written within `age`.
     pub(super) fn is_older(&self, uid: &str, now: Timestamp, age: Duration) -> bool {
         self.read(uid, |entry| entry.written)
             .is_none_or(|(at, _)| now.duration_since(at).unsigned_abs() >= age)
     }
 
-    /// Whether the status that was written last may not be in the cache yet, which shows this version.
+    /// True if the cache, which shows the version `shown`, may lack the last write of the status.
     pub(super) fn awaits_write(&self, uid: &str, shown: u64, now: Timestamp) -> bool {
         let written = self.read(uid, |entry| entry.written);
         written.is_some_and(|(_, version)| shown < version) && !self.is_older(uid, now, SHOWS)

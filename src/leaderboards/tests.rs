@@ -10,7 +10,7 @@ use crate::fixtures::{self, Cluster, Surroundings, surroundings};
 use leaderboard_api::Reason;
 use leaderboard_pod_spec::network_policy::network_policy;
 
-/// Where nobody listens: each request is refused.
+/// A closed port: each request is refused.
 const NOBODY: &str = "http://127.0.0.1:1";
 
 /// Where no request is ever answered, for as long as the listener lives.

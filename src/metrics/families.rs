@@ -60,7 +60,7 @@ impl Families<'_> {
         self.family(name, labels, help, Gauge::default)
     }
 
-    /// From 1 ms to two minutes: a reconcile may take 90 s, a request to EvalAI about 65 s.
+    /// Histograms from 1 ms to two minutes: a reconcile may take 90 s, a request to EvalAI about 65 s.
     pub(super) fn timings<const N: usize>(&mut self, name: &str, labels: [&'static str; N], help: &str) -> Timings<N> {
         self.family(name, labels, help, || {
             Histogram::new([
@@ -69,7 +69,7 @@ impl Families<'_> {
         })
     }
 
-    /// From 1 s to two days: a full leaderboard runs for many hours.
+    /// Histograms from 1 s to two days: a full leaderboard runs for many hours.
     pub(super) fn hours<const N: usize>(&mut self, name: &str, labels: [&'static str; N], help: &str) -> Timings<N> {
         self.family(name, labels, help, || {
             Histogram::new([
@@ -79,7 +79,7 @@ impl Families<'_> {
         })
     }
 
-    /// From 100 ms to a day, without labels.
+    /// A histogram from 100 ms to a day, without labels.
     pub(super) fn days(&mut self, name: &str, help: &str) -> Histogram {
         let days = Histogram::new([0.1, 0.5, 1.0, 5.0, 15.0, 60.0, 300.0, 900.0, 3600.0, 14400.0, 86400.0]);
         self.0.register(name, help, days.clone());

@@ -127,17 +127,17 @@ impl Samples {
     }
 }
 
-/// What this process shows of the lead.
+/// The samples that this process shows while it leads.
 #[derive(Debug, Default)]
 pub(super) struct Leader(Mutex<(Option<i32>, Samples)>);
 
 impl Leader {
-    /// Of an earlier term nothing is shown.
+    /// Begins a term without samples, or ends it with None.
     pub(super) fn leads(&self, term: Option<i32>) {
         *lock(&self.0) = (term, Samples::default());
     }
 
-    /// Who does not lead shows nothing.
+    /// Shows the samples of a walk, if this process leads.
     pub(super) fn show(&self, samples: Samples) {
         let mut shown = lock(&self.0);
         if shown.0.is_some() {

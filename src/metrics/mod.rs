@@ -1,8 +1,8 @@
-//! Every metric of the operator: what is counted, with which labels.
+//! Every metric of the operator, with its labels.
 //!
-//! Parts count in these families; the health server asks for the text. Labels hold kinds, outcomes and other fixed values, the names of
-//! Leaderboards and queues, which are few, those of the first teams of each Leaderboard, and those of submissions as long as they hold
-//! GPUs: never those of an image, nor of what has ended.
+//! Parts count in these families; the health server asks for the text. Labels hold kinds, outcomes and other fixed values. They also
+//! hold names: of Leaderboards and queues, which are few, of the first teams of each Leaderboard, and of submissions that hold GPUs.
+//! No label names an image, or an object that has ended.
 
 mod families;
 pub mod leader;
@@ -13,7 +13,6 @@ use std::fmt;
 use std::sync::{Arc, Mutex};
 use std::time::Duration;
 
-use jiff::Timestamp;
 use prometheus_client::encoding::text;
 use prometheus_client::metrics::counter::Counter;
 use prometheus_client::metrics::gauge::Gauge;
@@ -26,6 +25,7 @@ use prometheus_client::registry::Registry;
 use crate::observability::REVISION;
 use families::{Counters, Families, Gauges, Timings};
 use leader::{Leader, Samples};
+use leaderboard_base::clock::Clock;
 use leaderboard_base::lock::lock;
 use leaderboard_base::meter::Meter;
 use process::Process;
@@ -96,7 +96,7 @@ impl Shared {
     }
 }
 
-/// What a controller does.
+/// Counts of a controller's work.
 #[derive(Debug)]
 pub struct Work {
     reconciles: Counters<2>,
@@ -132,7 +132,7 @@ impl Work {
     }
 }
 
-/// What has become of submissions while this process led.
+/// Counts of submissions since this process began to lead.
 #[derive(Debug)]
 pub struct Submissions {
     pub failures: Counters<3>,
@@ -246,7 +246,7 @@ impl Default for Metrics {
 }
 
 impl Metrics {
-    /// What counts the calls of clients here.
+    /// The meter that counts the calls of this process's clients.
     pub fn meter(self: &Arc<Self>) -> Meter {
         let metrics = Arc::clone(self);
         Meter::new(move |call| {
@@ -304,7 +304,7 @@ impl Metrics {
         self.shared.oldest_message.clear();
     }
 
-    /// What the leader shows, until the next walk.
+    /// Sets the leader's samples, which hold until the next walk.
     pub fn show(&self, samples: Samples) {
         self.leader.show(samples);
     }
@@ -324,30 +324,32 @@ impl Metrics {
         }
     }
 
-    /// What is counted of one kind's watch; it appears at once, at zero.
-    pub fn watch(&self, kind: &str) -> WatchMetrics {
+    /// The metrics of one kind's watch; they appear at once, at zero.
+    pub fn watch(&self, kind: &str, clock: &Clock) -> WatchMetrics {
         let kind = || [kind.to_owned()];
         WatchMetrics {
             errors: self.shared.watch_errors.of(kind()),
             unreadable: self.shared.watch_unreadable.of(kind()),
             last_event: self.shared.watch_last_event.of(kind()),
+            clock: clock.clone(),
         }
     }
 }
 
-/// Of one kind's watch.
+/// The metrics of one kind's watch.
 #[derive(Clone, Debug)]
 pub struct WatchMetrics {
     pub errors: Counter,
     /// Objects that cannot be read now.
     pub unreadable: Gauge,
     last_event: Gauge,
+    clock: Clock,
 }
 
 impl WatchMetrics {
     /// The watch brought something.
     pub fn event(&self) {
-        self.last_event.set(Timestamp::now().as_second());
+        self.last_event.set(self.clock.now().as_second());
     }
 }
 

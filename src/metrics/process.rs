@@ -10,6 +10,8 @@ use prometheus_client::encoding::{DescriptorEncoder, NoLabelSet};
 use prometheus_client::metrics::MetricType;
 use tokio::runtime::{Handle, RuntimeMetrics};
 
+use leaderboard_base::clock::Clock;
+
 /// Linux shows times to programs in hundredths of a second, whatever its kernel counts in.
 const TICKS_PER_SECOND: f64 = 100.0;
 
@@ -18,9 +20,10 @@ const TICKS_PER_SECOND: f64 = 100.0;
 pub(super) struct Process(f64);
 
 impl Process {
-    /// To be made at the start of the process.
+    /// To be made at the start of the process, by whose own clock it counts: all that is shown here is the kernel's.
     pub(super) fn begins() -> Self {
-        Self(Timestamp::now().duration_since(Timestamp::UNIX_EPOCH).as_secs_f64())
+        let now = Clock::system().now();
+        Self(now.duration_since(Timestamp::UNIX_EPOCH).as_secs_f64())
     }
 }
 
@@ -110,7 +113,7 @@ fn busy_seconds(runtime: &RuntimeMetrics) -> f64 {
     busy.sum::<Duration>().as_secs_f64()
 }
 
-/// Of `stat`: the fields 14 and 15. The second, the program's name, may hold anything up to its last bracket.
+/// User and system time, in seconds: the fields 14 and 15 of `stat`. The second field, a name, may hold anything up to its last bracket.
 fn cpu_seconds(stat: &str) -> Option<f64> {
     let (_, fields) = stat.rsplit_once(')')?;
     let mut times = fields.split_whitespace().skip(11);

@@ -20,7 +20,7 @@ fn all(program: Program) -> Metrics {
     metrics.work.reconcile_wait.of(["Submission", "urgent"]);
     metrics.work.lease_errors.of(["timeout"]).inc();
     metrics.work.spans.of(["sent"]).inc_by(12);
-    let watch = metrics.watch("Job");
+    let watch = metrics.watch("Job", &Clock::system());
     watch.errors.inc();
     watch.event();
     metrics.set_oldest_message("https://q/1", Some(1_800_000_000_500));

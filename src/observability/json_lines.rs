@@ -1,5 +1,5 @@
-//! A line of the log as one JSON object. The fields of this program's spans stand next to those of the event, so that a collector of
-//! logs finds a line by any of them; spans of libraries are a list of their own.
+//! A line of the log as one JSON object. The fields of this program's spans stand next to those of the event, so that a collector finds
+//! a line by any of them. Spans of libraries are a list of their own.
 
 use std::fmt::{self, Debug};
 
@@ -12,7 +12,7 @@ use tracing_subscriber::fmt::time::{FormatTime, SystemTime};
 use tracing_subscriber::fmt::{FmtContext, FormatEvent, FormatFields, FormattedFields};
 use tracing_subscriber::registry::{LookupSpan, Scope, SpanRef};
 
-/// What the crate `log` adds to its events, of which the target alone is of use.
+/// Fields that the crate `log` adds to its events. Only the target is of use.
 const OF_LOG: [&str; 4] = ["log.target", "log.module_path", "log.file", "log.line"];
 
 /// See the module's text.

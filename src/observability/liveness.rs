@@ -1,4 +1,4 @@
-//! Whether a restart would help: watches that stay broken while the API server answers.
+//! Detects a process that a restart would help: its watches stay broken while the API server answers.
 //!
 //! Kept by the watches themselves, read by the health server. An outage of the API server is no reason to restart, so a
 //! stuck watch counts only while other calls are answered. A task that ends needs no probe: it ends the process (`tasks`).
@@ -65,7 +65,7 @@ impl Liveness {
         }
     }
 
-    /// What a restart would fix, one sentence each. Empty: alive.
+    /// The problems that a restart would fix, one sentence each. Empty: alive.
     pub fn problems(&self) -> Vec<String> {
         let (state, now) = (self.lock(), Instant::now());
         if state.answered.is_none_or(|at| now - at >= ANSWERED_LATELY) {

@@ -13,7 +13,7 @@ use tracing_subscriber::util::SubscriberInitExt;
 
 use super::json_lines::JsonLines;
 
-/// What is logged by default. The libraries' own warnings are repeated by us as sentences.
+/// The default filter. It drops warnings of libraries that this program repeats as sentences.
 const DEFAULT_FILTER: &str = "info,kube_client=warn,kube_runtime=error,aws_config=warn,aws_smithy_runtime=warn,hyper=warn,hyper_util=warn,tower=warn,rustls=warn";
 
 /// The format of a line.
@@ -84,7 +84,7 @@ pub(crate) mod tests {
 
     use tracing::Dispatch;
 
-    /// What was logged, as the JSON lines of a program with the usual filter.
+    /// The collected log, as the JSON lines of a program with the usual filter.
     #[derive(Clone, Default)]
     pub(crate) struct Lines(Arc<Mutex<Vec<u8>>>);
 
@@ -99,19 +99,19 @@ pub(crate) mod tests {
             }
         }
 
-        /// What has come since the last time.
+        /// The text since the last call.
         pub(crate) fn take(&self) -> String {
             String::from_utf8(std::mem::take(&mut *self.0.lock().unwrap())).unwrap()
         }
 
-        /// The same, line by line.
+        /// The lines since the last call, each parsed.
         pub(crate) fn take_json(&self) -> Vec<serde_json::Value> {
             let text = self.take();
             text.lines().map(|line| serde_json::from_str(line).unwrap()).collect()
         }
     }
 
-    /// With a single subscriber in the process, a line that a thread of another test reaches first is off for good.
+    /// Guard of the collection. With a single subscriber in the process, a line that another test's thread reaches first is off for good.
     pub(crate) struct Collecting {
         _guard: tracing::subscriber::DefaultGuard,
         _second: Dispatch,

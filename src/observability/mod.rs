@@ -1,4 +1,4 @@
-//! What a running process shows, and how it is stopped: metrics, health, logs, the stop signal.
+//! The outside of a running process: metrics, health, logs, the stop signal.
 //!
 //! Called by every program that stays: `controller` and `bridge`. Knows no Kubernetes object and no policy; parts report
 //! what they do and what they miss.
@@ -13,6 +13,7 @@ pub mod traces;
 use std::sync::Arc;
 
 use crate::metrics::{Metrics, Program};
+use leaderboard_base::clock::Clock;
 use leaderboard_base::shutdown::Stop;
 use leaderboard_base::tasks::Tasks;
 use liveness::Liveness;
@@ -25,9 +26,10 @@ pub const REVISION: &str = match option_env!("LEADERBOARD_REVISION") {
     None => "",
 };
 
-/// What every part of a process is handed: where it counts, where it reports what it misses, and when it has to end.
+/// The parts that every task of a process gets: the time, its metrics, the checks of its health, and the signal to end.
 #[derive(Clone, Debug)]
 pub struct Observability {
+    pub clock: Clock,
     pub metrics: Arc<Metrics>,
     pub liveness: Liveness,
     pub readiness: Readiness,
@@ -37,14 +39,15 @@ pub struct Observability {
 }
 
 impl Observability {
-    /// Of a controller: empty registries around a process's stop signal.
+    /// Empty registries of a controller, around the process's stop signal, and the system's clock.
     pub fn new(stop: Stop) -> Self {
         Self::of(Program::Controller, stop)
     }
 
-    /// The same of any program.
+    /// Empty registries of any program, around the process's stop signal.
     pub fn of(program: Program, stop: Stop) -> Self {
         Self {
+            clock: Clock::system(),
             metrics: Arc::new(Metrics::new(program)),
             liveness: Liveness::default(),
             readiness: Readiness::default(),

@@ -1,7 +1,7 @@
-//! What a process still misses before it can do its work, by name.
+//! The parts that a process still lacks for its work, by name.
 //!
-//! Set by the parts, read by the health server. Standbys are ready: leading is no check. A process that has not registered
-//! all of its checks yet is not ready, so that a probe in its first moments does not read the empty list as "nothing is missing".
+//! Set by the parts, read by the health server. Standbys are ready: leading is no check. A process that has not registered all of its
+//! checks is not ready. So a probe in its first moments does not read the empty list as "nothing is missing".
 
 use std::collections::BTreeMap;
 use std::sync::{Arc, Mutex};
@@ -49,7 +49,7 @@ impl Readiness {
         lock(&self.0).remove(name);
     }
 
-    /// What is missing, one `name: sentence` each, in the order of names. Empty: ready.
+    /// The missing parts in the order of names, one `name: sentence` each. Empty: ready.
     pub fn missing(&self) -> Vec<String> {
         let checks = lock(&self.0);
         let failed = checks

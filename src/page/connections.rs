@@ -51,7 +51,7 @@ impl Listener for Bounded {
     async fn accept(&mut self) -> (Bound, SocketAddr) {
         let place = match Arc::clone(&self.places).acquire_owned().await {
             Ok(place) => place,
-            // Nobody closes it.
+            // This program never closes the semaphore.
             Err(_) => std::future::pending().await,
         };
         let (stream, address) = Listener::accept(&mut self.listener).await;

@@ -1,5 +1,5 @@
-//! Hands the view to those who look at it: made once for all of them, a second after a change at the soonest, and not at all
-//! while nobody looks.
+//! Hands the view to its viewers. All of them share one view. It is made a second after a change at the soonest, and not at all without
+//! a viewer.
 //!
 //! A viewer that reads slowly holds one old view and gets the newest one next; none waits for another.
 
@@ -14,19 +14,19 @@ use tokio::time::{sleep, timeout};
 
 use leaderboard_base::shutdown::Stop;
 
-/// So many may look at once. Each can hold one view that is no longer the newest.
+/// Most viewers at once. Each can hold one view that is no longer the newest.
 pub(super) const VIEWERS: usize = 32;
-/// Two views follow each other after so long at the soonest.
+/// Least time between two views.
 const PACE: Duration = Duration::from_secs(1);
-/// Without a change a view is made again after so long: failures grow old, and this replica may have begun to lead.
+/// Time until a view is made again without a change: failures grow old, and this replica may have begun to lead.
 const REFRESH: Duration = Duration::from_secs(15);
-/// What shows that an idle connection is not a dead one, to programs in between too.
+/// Time between two signs of life, which show viewers and programs in between that an idle connection is not a dead one.
 const KEEP_ALIVE: Duration = Duration::from_secs(15);
 const ALIVE: &[u8] = b":\n\n";
 
-/// What there is to show.
+/// The data that a page shows.
 pub(super) trait Source: Send + Sync + 'static {
-    /// Yields whenever the view may have changed. Asked for while somebody looks, and dropped when nobody does.
+    /// Yields whenever the view may have changed. The hub holds it only while there is a viewer.
     fn changes(&self) -> BoxStream<'static, ()>;
     /// The view as JSON in one line.
     fn view(&self) -> Vec<u8>;
@@ -42,7 +42,7 @@ struct Shared {
     places: Arc<Semaphore>,
     /// Somebody has come.
     come: Notify,
-    /// The newest view as an event; none while nobody looks.
+    /// The newest view as an event; None without a viewer.
     latest: watch::Sender<Option<Bytes>>,
 }
 
@@ -65,7 +65,7 @@ impl Hub {
     pub(super) fn join(&self) -> Option<Viewer> {
         let place = Arc::clone(&self.0.places).try_acquire_owned().ok()?;
         let mut views = self.0.latest.subscribe();
-        // What is there already is news to this one.
+        // The present view is news to this viewer.
         views.mark_changed();
         self.0.come.notify_one();
         Some(Viewer { views, _place: place })
@@ -87,13 +87,13 @@ impl Hub {
         }
     }
 
-    /// Until the last viewer has gone.
+    /// Makes views until the last viewer has gone.
     async fn show(&self, source: &dyn Source) {
         let latest = &self.0.latest;
         let mut changes = source.changes();
         let mut shown = Vec::new();
         while latest.receiver_count() > 0 {
-            // What has changed by now is in this view.
+            // This view has the changes so far.
             while changes.next().now_or_never().flatten().is_some() {}
             let view = source.view();
             if view != shown {
@@ -220,7 +220,7 @@ mod tests {
         }
         assert_eq!((source.made(), source.subscriptions()), (1, 1), "one for all viewers");
         drop(all);
-        // It notices that the last one has gone, and holds no subscription that would gather what nobody reads.
+        // It notices that the last viewer has gone, and drops the subscription, which would gather changes without a reader.
         sleep(Duration::from_millis(1)).await;
         assert!(hub.0.latest.borrow().is_none());
         source.change();

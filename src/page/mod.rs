@@ -25,7 +25,6 @@ use std::sync::Arc;
 
 use futures::StreamExt;
 use futures::stream::{self, BoxStream};
-use jiff::Timestamp;
 use kube::runtime::reflector::ObjectRef;
 use tokio::net::TcpListener;
 
@@ -35,6 +34,7 @@ use connections::Bounded;
 use detail::Detail;
 use hub::{Hub, Source};
 use leaderboard_api::{Leaderboard, Submission};
+use leaderboard_base::clock::Clock;
 use model::{PageView, Replica};
 
 /// Why there is no page.
@@ -56,11 +56,11 @@ pub struct Page {
     title: String,
 }
 
-/// What the page reads.
+/// The sources that the page reads.
 pub struct Reads {
     pub leaderboards: Watch<Leaderboard>,
     pub submissions: Watch<Submission>,
-    /// Whether this replica leads at present.
+    /// Returns true while this replica leads.
     pub leads: Box<dyn Fn() -> bool + Send + Sync>,
 }
 
@@ -82,7 +82,7 @@ impl Page {
         })
     }
 
-    /// The same page under the installation's title, such as the name of its cluster.
+    /// Sets the page's title, such as the name of its cluster.
     #[must_use]
     pub fn titled(mut self, title: &str) -> Self {
         title.clone_into(&mut self.title);
@@ -97,7 +97,12 @@ impl Page {
     /// Serves it until the stop.
     pub fn start(self, reads: Reads, telemetry: &Observability) {
         let (name, title) = (self.name, self.title);
-        let source: Arc<dyn Source> = Arc::new(Caches { reads, name, title });
+        let source: Arc<dyn Source> = Arc::new(Caches {
+            reads,
+            name,
+            title,
+            clock: telemetry.clock.clone(),
+        });
         let hub = Hub::new();
         let work = hub.clone().run(Arc::clone(&source), telemetry.stop.clone());
         telemetry.tasks.stay("page's view", work);
@@ -118,6 +123,7 @@ struct Caches {
     reads: Reads,
     name: String,
     title: String,
+    clock: Clock,
 }
 
 impl Source for Caches {
@@ -136,7 +142,7 @@ impl Source for Caches {
             is_complete: boards.is_complete() && submissions.is_complete(),
         };
         let (leaderboards, submissions) = (boards.store.state(), submissions.store.state());
-        let view = PageView::of(replica, &leaderboards, &submissions, Timestamp::now());
+        let view = PageView::of(replica, &leaderboards, &submissions, self.clock.now());
         // Names as keys and plain values: serde_json has no error for them.
         serde_json::to_vec(&view).unwrap_or_default()
     }

@@ -1,4 +1,4 @@
-//! What the page shows, made of the cached Submissions and Leaderboards. Pure: the time is handed in.
+//! The contents of the page, made of the cached Submissions and Leaderboards. Pure: the time is handed in.
 //!
 //! It has a bounded size however many objects there are: each list has its first so many, and how many there are in all.
 
@@ -125,7 +125,7 @@ struct Sorted<'a> {
     ended: Vec<(&'a Submission, State)>,
 }
 
-/// What is counted of a Leaderboard's submissions.
+/// Numbers of a Leaderboard's submissions.
 #[derive(Default)]
 struct Tally {
     in_use: usize,
@@ -190,7 +190,7 @@ impl<'a> Sorted<'a> {
             let waiting = one.status.as_ref().and_then(|status| status.waiting.as_ref());
             waiting.map_or(i32::MAX, |waiting| waiting.position)
         };
-        // Those who stand in a line come first, each line in one piece.
+        // Submissions in a line come first, each line in one piece.
         sorted.waiting.sort_by_cached_key(|one| {
             let place = place(one);
             (place == i32::MAX, key(one), place, created(one), one.name_any())
@@ -296,7 +296,7 @@ fn trouble(leaderboard: &Leaderboard) -> Option<String> {
     (ready.status != "True").then(|| one_line(&text, LONGEST_MESSAGE))
 }
 
-/// Those that ended lately, the latest first.
+/// The submissions that failed lately, the latest first.
 fn failures<'a>(ended: impl Iterator<Item = &'a Submission>, now: Timestamp) -> Failures {
     let limit = SignedDuration::from_hours(RECENT_HOURS);
     let recent = ended.take_while(|one| end(one).is_some_and(|at| now.duration_since(at) <= limit));

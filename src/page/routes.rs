@@ -19,9 +19,9 @@ use futures::StreamExt;
 use super::hub::{Hub, Source};
 use leaderboard_base::shutdown::Stop;
 
-/// What the browser may load and run: our own files. Texts never become markup.
+/// Content policy: the browser loads and runs our own files alone, and no text becomes markup.
 const POLICY: &str = include_str!("web/policy.txt");
-/// What one gets for whom there is no place; the browser asks again after this time.
+/// The answer to a viewer without a place; the browser asks again after this time, in milliseconds.
 const FULL: &str = "retry: 15000\nevent: full\ndata: {}\n\n";
 
 const HTML: &str = "text/html; charset=utf-8";
@@ -113,7 +113,7 @@ fn host(headers: &HeaderMap) -> Option<&str> {
     host.to_str().ok()
 }
 
-/// Whether a Host is this machine by a name that no other can have.
+/// True if a Host names this machine by a name that no other machine can have.
 fn is_loopback(host: &str) -> bool {
     let name = match host.rsplit_once(':') {
         Some((name, port)) if port.bytes().all(|byte| byte.is_ascii_digit()) => name,

@@ -29,7 +29,7 @@ pub(super) struct Who {
     pub is_check: bool,
 }
 
-/// One that waits.
+/// A submission that waits.
 #[derive(Serialize, Clone, Debug, PartialEq, Eq)]
 #[serde(rename_all = "camelCase")]
 pub(super) struct Waits {
@@ -44,7 +44,7 @@ pub(super) struct Waits {
     pub since: Option<i64>,
 }
 
-/// One that runs.
+/// A submission that runs.
 #[derive(Serialize, Clone, Debug, PartialEq, Eq)]
 #[serde(rename_all = "camelCase")]
 pub(super) struct Runs {
@@ -77,11 +77,11 @@ pub(super) struct Worker {
     pub total: i32,
     pub crashes: i32,
     pub state: WorkerState,
-    /// What ended its last round, after a crash.
+    /// Cause of the end of its last round, after a crash.
     pub last: Option<EndReason>,
 }
 
-/// One that has ended.
+/// A submission that has ended.
 #[derive(Serialize, Clone, Debug, PartialEq, Eq)]
 #[serde(rename_all = "camelCase")]
 pub(super) struct Ended {
@@ -102,7 +102,7 @@ pub(super) struct Ended {
     pub phases: Phases,
 }
 
-/// One that has failed.
+/// A submission that has failed.
 #[derive(Serialize, Clone, Debug, PartialEq, Eq)]
 #[serde(rename_all = "camelCase")]
 pub(super) struct Failed {
@@ -144,7 +144,7 @@ pub(super) fn message(text: &str) -> String {
     one_line(&sentence(text), MESSAGE)
 }
 
-/// What the status shows, or nothing before there is one.
+/// Reads the status; an empty one before there is any.
 fn with_status<T>(submission: &Submission, read: impl FnOnce(&SubmissionStatus) -> T) -> T {
     match &submission.status {
         Some(status) => read(status),

@@ -1,4 +1,4 @@
-//! Who leads: the best result of each team, of one track. Pure.
+//! The ranking of one track: the best result of each team. Pure.
 
 use kube::ResourceExt;
 use leaderboard_api::{Leaderboard, Order, Standing, TrackStatus};
@@ -16,7 +16,7 @@ pub(super) struct Table {
     namespace: String,
     leaderboard: String,
     track: String,
-    /// What ranks; none before the first result.
+    /// Name of the metric that ranks; None before the first result.
     metric: Option<String>,
     /// A lower score is better.
     ascending: bool,

@@ -23,10 +23,12 @@ use crate::submissions::observe::causes::Causes;
 use crate::submissions::observe::workers::Workers;
 use crate::submissions::{act, observe};
 use leaderboard_api::Leaderboard;
+use leaderboard_base::clock::Clock;
 use leaderboard_base::object_key::ObjectKey;
 
 /// Shared by all reconciles.
 pub struct Context {
+    pub clock: Clock,
     pub client: Client,
     pub writer: Writer,
     pub settings: Settings,
@@ -47,6 +49,7 @@ pub struct Context {
 impl Context {
     pub fn for_observe(&self) -> observe::Uses<'_> {
         observe::Uses {
+            clock: &self.clock,
             stores: &self.stores,
             memory: &self.memory,
             workers: &self.workers,
@@ -86,6 +89,7 @@ impl Context {
     /// Part that keeps the policies in place.
     pub fn policies(&self) -> Policies<'_> {
         Policies {
+            clock: &self.clock,
             client: &self.client,
             stores: &self.stores,
             state: &self.leaderboards,

@@ -28,8 +28,7 @@ use leaderboard_evalai::Changed;
 /// Objects that something has happened to, and how urgent that is.
 pub(super) type Events<K> = BoxStream<'static, (ObjectRef<K>, Class)>;
 
-/// Every Submission that something has happened to. What concerns its Leaderboard is added to that one's queue, after it was
-/// counted.
+/// Every Submission with an event, and how urgent it is. Events that concern its Leaderboard wake that as well.
 pub(super) fn of_submissions(
     watches: &Watches,
     evalai: mpsc::UnboundedReceiver<Changed>,

@@ -1,4 +1,4 @@
-//! What the leader shows of what is there: one walk over the caches every 15 s. It wakes each Leaderboard whose status has other counts or
+//! The leader's samples of all objects: one walk over the caches every 15 s. It wakes each Leaderboard whose status has other counts, or
 //! standings of other results.
 
 use std::collections::{BTreeMap, HashMap};
@@ -109,7 +109,7 @@ fn standing(submission: &Submission) -> [&'static str; 3] {
     [state.as_str(), reason, class.map_or("", FailureClass::as_str)]
 }
 
-/// What is summed up of the Submissions of a Leaderboard.
+/// The sums over the Submissions of a Leaderboard.
 #[derive(Default)]
 struct OfBoard {
     census: Census,
@@ -168,7 +168,8 @@ impl OfBoard {
         *oldest = [*oldest, stands_since(submission)].into_iter().flatten().min();
     }
 
-    /// Until its Pod was lost, where that is known: what the next Pod brings is counted from that one's node on.
+    /// Adds the GPU seconds of a submission that holds GPUs. They end with the loss of its Pod, if that is known: those of the next Pod
+    /// count from its node on.
     fn add_holder(&mut self, submission: &Submission, now: Timestamp) {
         let live = submission.status.as_ref().filter(|status| !status.has_ended());
         let Some((status, since)) = live.and_then(|status| Some((status, status.times.scheduled.as_ref()?.0))) else {

@@ -21,7 +21,6 @@ use crate::intake::sweep;
 use std::sync::Arc;
 use std::time::Duration;
 
-use jiff::Timestamp;
 use kube::Client;
 use kube::runtime::events::Recorder;
 use kube::runtime::reflector::ObjectRef;
@@ -186,7 +185,7 @@ impl Parts {
         });
         self.keep_policies(&shared.context);
         let walked = Arc::clone(&shared);
-        let walk = move || gauges::walk(&walked, Timestamp::now());
+        let walk = move || gauges::walk(&walked, walked.telemetry.clock.now());
         let gauges = gauges::keep(gauges::EVERY, walk, self.telemetry.clone());
         self.telemetry.tasks.stay("gauges", gauges);
         let of_submissions = events::of_submissions(&self.watches, changed, &shared);
@@ -206,7 +205,7 @@ impl Parts {
         queues: &Queues,
     ) -> ExternalSystems {
         let telemetry = &self.telemetry;
-        let payloads = payloads::reader(self.aws.clone());
+        let payloads = payloads::reader(self.aws.clone(), telemetry.clock.clone());
         let hub = hub(fence, evalai, self.sweep(), payloads, telemetry);
         let inbox = inbox::read(self.inbox(), hub.clone(), self.settings.operator.clone());
         telemetry.tasks.stay("inbox", inbox);
@@ -258,6 +257,7 @@ impl Parts {
             Box::new(move |board: ObjectRef<Leaderboard>| boards.add(&board, Class::Refresh))
         };
         let context = Context {
+            clock: self.telemetry.clock.clone(),
             client: client.clone(),
             writer: Writer::new(client.clone(), move || fence.may_write()),
             settings: self.settings.clone(),

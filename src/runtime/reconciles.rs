@@ -1,5 +1,5 @@
-//! The reconciles: one queue for Submissions, one for Leaderboards; each object by one reconcile at a time, a bounded number
-//! at once, each as a task of its own.
+//! The reconciles: one queue for Submissions, one for Leaderboards. Each object has one reconcile at a time, and each reconcile is a task
+//! of its own. The number at once is bounded.
 
 use std::future::Future;
 use std::panic::AssertUnwindSafe;

@@ -17,7 +17,7 @@ use crate::runtime::settings::Settings;
 use crate::runtime::stores::{Stores, owner_uid};
 use leaderboard_api::{Leaderboard, Submission};
 
-/// The cache of policies is waited for so long at the start: without a right to them nothing starts, but runs are watched.
+/// Wait for the cache of policies at the start. It may never come: without a right to policies no Job starts, but runs are watched.
 const POLICIES_LIMIT: Duration = Duration::from_secs(5);
 
 /// Watches a kind in all namespaces that are served.

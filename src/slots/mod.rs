@@ -1,8 +1,8 @@
-//! Who may start: the slots of each Leaderboard, worked out from the caches.
+//! The slots of each Leaderboard, worked out from the caches: they decide which submissions may start.
 //!
-//! A submission joins the line of its Leaderboard when all but the slot is settled (`Action::JoinLine`), and the answer wakes
-//! it. Remembered is only who stands in line, and whom a slot is reserved for until the cache shows its Job; all else is read anew
-//! from the caches (`line`). A reservation ends also with its submission, with a plan that creates no Job, and with a pause or other limits.
+//! A submission joins the line of its Leaderboard when all but the slot is settled (`Action::JoinLine`), and the answer wakes it. The
+//! memory here is small: the line, and the submission of each reserved slot until the cache shows its Job. All else is read anew from the
+//! caches (`line`). A reservation ends also with its submission, with a plan that creates no Job, and with a pause or other limits.
 //! No call here waits for anything: the next in line does not depend on a bucket, a token or another Leaderboard. The order of the line is
 //! `turns`, which is pure.
 
@@ -45,7 +45,7 @@ impl Slots {
         }
     }
 
-    /// Grants slots. Before the caches have listed all, nobody knows which are free.
+    /// Grants slots, once the caches have listed all objects: before that the free slots are not known.
     pub async fn keep(&self) {
         let (submissions, jobs) = (&self.stores.submissions, &self.stores.jobs);
         if tokio::try_join!(submissions.wait_until_ready(), jobs.wait_until_ready()).is_err() {
@@ -84,7 +84,7 @@ impl Slots {
         lines.retain(|_, line| !line.is_empty());
     }
 
-    /// Whether a submission without a Job may start now. Grants nothing.
+    /// The place of a submission without a Job. Grants nothing.
     pub fn turn(&self, submission: &Submission, leaderboard: Option<&Leaderboard>) -> Turn {
         let Some(limits) = leaderboard.map(limits) else {
             return Turn::NotInLine;
@@ -101,7 +101,7 @@ impl Slots {
         })
     }
 
-    /// A submission waits for nothing but a slot. It is woken by the answer, and by each change of it.
+    /// Adds a submission that lacks only a slot to the line. The answer wakes it, and each change of the answer.
     pub fn join(&self, submission: &Submission, place: InLine) {
         self.change(submission, |line| line.join(submission.present_attempt(), place));
     }

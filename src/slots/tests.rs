@@ -130,7 +130,7 @@ impl World {
         self.turn(submission)
     }
 
-    /// Whom the next round wakes.
+    /// Names of the submissions that the next round wakes, sorted.
     fn woken(&self) -> Vec<String> {
         self.slots.allocate();
         let mut names = std::mem::take(&mut *lock(&self.woken));

@@ -37,7 +37,7 @@ use leaderboard_policy::view::View;
 /// Kubernetes refuses notes above 1 kB.
 const LONGEST_NOTE: usize = 900;
 
-/// What carrying a plan out uses.
+/// The parts that carry a plan out.
 #[derive(Clone, Copy)]
 pub struct Uses<'a> {
     pub writer: &'a Writer,
@@ -55,7 +55,7 @@ pub struct Uses<'a> {
 /// A create that an admission webhook holds up keeps a permit that others wait for.
 const CREATE_LIMIT: Duration = Duration::from_secs(10);
 
-/// What a reconcile could not carry out.
+/// Why a reconcile could not carry its plan out.
 #[derive(thiserror::Error, Debug)]
 pub enum ActError {
     #[error(transparent)]
@@ -91,7 +91,7 @@ pub async fn act(uses: Uses<'_>, view: &View, plan: Plan) -> Result<Option<Durat
     for event in &plan.events {
         actor.publish(event).await;
     }
-    let ended = view.ended_at();
+    let ended = view.ended_at().unwrap_or(view.now);
     uses.workers
         .demand_report(&view.submission, &plan.status, ended, plan.report);
     // Last comes what the API server may refuse for as long as a quota is used up: it keeps nothing else from being done.
@@ -124,7 +124,7 @@ impl Actor<'_> {
         Writes::new(self.uses.writer, &self.namespace)
     }
 
-    /// Carries one action out. What others do is only handed on: to the slots, the workers of S3, EvalAI and the table.
+    /// Carries one action out, or hands it on: to the slots, the workers of S3, EvalAI or the table.
     async fn carry_out(&self, action: Action, status: &SubmissionStatus) -> Result<(), ActError> {
         let (uses, workers, submission) = (self.uses, self.uses.workers, self.submission());
         match action {
@@ -211,8 +211,8 @@ impl Actor<'_> {
         Ok(None)
     }
 
-    /// One line for each change of the state, its reason or the attempt, written when it is stored: what a submission went
-    /// through can be read from the log without anything else.
+    /// Logs one line for each change of the state, its reason or the attempt, once it is stored. So the log alone shows the whole way
+    /// of a submission.
     fn log_transition(&self, new: &SubmissionStatus) {
         let old = self.submission().status.as_ref();
         let standing =
@@ -401,7 +401,7 @@ impl Actor<'_> {
     }
 }
 
-/// What other systems have of an end is a line as well: it changes no state.
+/// Logs that EvalAI or the table has an end: this changes no state, so it has a line of its own.
 fn log_delivery(new: &SubmissionStatus, ended: &Ended) {
     let by = match ended.phase {
         Phase::Record => "the table has the end",

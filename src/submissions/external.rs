@@ -64,7 +64,7 @@ impl ExternalSystems {
         lock(&self.targets).get(uid(leaderboard)).cloned()
     }
 
-    /// What EvalAI is known to show of a submission.
+    /// The last known state of a submission in EvalAI. None for a submission that is not of EvalAI.
     pub fn evalai_view(&self, leaderboard: Option<&Leaderboard>, submission: &Submission) -> Option<EvalaiView> {
         let evalai = submission.spec.evalai?;
         let writes_from = self.hub.writes_from();
@@ -87,7 +87,7 @@ impl ExternalSystems {
         })
     }
 
-    /// What is known of a submission's row. None without a table.
+    /// The last known state of a submission's row. None without a table.
     pub fn record_view(&self, leaderboard: &Leaderboard, submission: &Submission) -> Option<RecordView> {
         leaderboard.spec.dynamo_table()?;
         if let Some(refusal) = self.refusal(leaderboard) {
@@ -199,7 +199,7 @@ fn final_update(workers: &Workers, view: &View, status: &SubmissionStatus, outco
     DesiredUpdate::Final(outcome, Arc::new(outline))
 }
 
-/// Whether it is run only with an image that EvalAI names.
+/// True if a submission names no image and has not ended, so that it needs the image that EvalAI names.
 fn wants_image(submission: &Submission) -> bool {
     let status = submission.status.as_ref();
     let has_ended = status.is_some_and(SubmissionStatus::has_ended);

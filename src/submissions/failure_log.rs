@@ -1,5 +1,5 @@
-//! The tail of the log that explains a failure: read while it can be had, remembered until every system has the end, and
-//! stored in S3 for people.
+//! The tail of the log that explains a failure. It is read while it can be had, remembered until every system has the end, and stored in
+//! S3 for people.
 //!
 //! `decide` asks for it; `external` hands the text on to EvalAI's hosts. A log may hold private parts of the challenge, so it never gets into status,
 //! events or our own log.
@@ -99,17 +99,17 @@ pub struct Tail {
     pub attempt: Attempt,
     /// Where all of it is, below the run's prefix, if it is stored.
     pub key: Option<String>,
-    /// With the first line for hosts at most 10,000 characters.
+    /// The lines, at most 10,000 characters with the first line for hosts.
     pub text: String,
 }
 
 impl Tail {
-    /// Whether the participant's own program wrote it.
+    /// True if the participant's own program wrote it.
     pub fn is_agents(&self) -> bool {
         names::is_agent_container(&self.container)
     }
 
-    /// With a first line that shows whose log it is, and where all of it is.
+    /// The text with a first line that names the container, the attempt and the key of the whole log.
     pub fn for_hosts(&self) -> String {
         format!(
             "{}{}",
@@ -118,7 +118,7 @@ impl Tail {
         )
     }
 
-    /// With a first line that names no file which only hosts can read.
+    /// The text with a first line that names no file which only hosts can read.
     pub fn for_participants(&self) -> String {
         format!(
             "The end of {}'s log in attempt {}:\n{}",
@@ -127,11 +127,11 @@ impl Tail {
     }
 }
 
-/// What came of looking for a log.
+/// Result of the search for a log.
 #[derive(Clone, Debug, PartialEq)]
 pub struct LogAnswer {
     pub tail: Option<Tail>,
-    /// One that may have it did not answer, or storing failed.
+    /// True if a place that may have the log did not answer, or if storing it failed.
     pub is_unclear: bool,
 }
 
@@ -257,7 +257,7 @@ async fn store(archive: &Archive, tail: &Tail) -> bool {
 /// is left.
 fn tail(room: usize, bytes: &[u8]) -> Option<String> {
     let clean = plain(&String::from_utf8_lossy(bytes));
-    // What was read may begin in the middle of a character.
+    // The bytes may begin in the middle of a character.
     let clean = clean.trim_start_matches(char::REPLACEMENT_CHARACTER).trim();
     if clean.is_empty() {
         return None;
@@ -354,7 +354,7 @@ mod tests {
         }
     }
 
-    /// What a node's answer of this status and body is taken for, and what was asked.
+    /// How an answer of a node with this status and body is read, and the path that was asked for.
     async fn asked(code: u16, body: &'static str, previous: bool) -> (Result<Option<Vec<u8>>, String>, String) {
         let (service, mut handle) = tower_test::mock::pair::<Request<Body>, Response<Body>>();
         let client = Client::new(service, "default");

@@ -1,4 +1,4 @@
-//! What the leader remembers between two reconciles of one object: above all the status it last wrote.
+//! The leader's memory between two reconciles of one object: above all the status it last wrote.
 //!
 //! Needed because a cache may lag behind our own writes: a reconcile must never decide on a status older than its own.
 
@@ -30,7 +30,7 @@ struct Entry {
     job: Option<(String, Instant)>,
     /// The Job that the API server refuses to make, and why.
     refused: Option<Box<(String, String)>>,
-    /// Of which attempt EvalAI has been asked whether it is to run, and since when.
+    /// The attempt about which EvalAI has been asked if it is to run, and since when.
     asked: Option<(Attempt, Instant)>,
     /// When its place may be written, until its status is.
     place_at: Option<Instant>,
@@ -42,7 +42,7 @@ const JOB_SHOWS: Duration = Duration::from_secs(15);
 struct Written {
     version: u64,
     at: Instant,
-    /// Until the cache is as new.
+    /// The written status; None once the cache is as new.
     status: Option<Box<SubmissionStatus>>,
 }
 
@@ -139,7 +139,7 @@ impl Memory {
         }
     }
 
-    /// Whether the cache may not show yet that the Job of this name was created.
+    /// True if the Job of this name was created so lately that the cache may not show it yet.
     pub fn awaits_job(&self, submission: &Submission, name: &str) -> bool {
         let entries = lock(&self.entries);
         let job = entries.get(uid(submission)).and_then(|entry| entry.job.as_ref());

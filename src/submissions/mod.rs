@@ -1,8 +1,8 @@
 //! The reconcile of a Submission.
 //!
-//! It observes (`observe`: caches and memory), decides (`decide`: pure) and acts (`act`). What it needs of S3, nodes and tables is asked
-//! next to it: `reports`, `fences`, `failure_log`, `rows`, `records`.
-//! `job_spec` and `pod_overlay` build what is created in the cluster; they know no client and no clock.
+//! It observes (`observe`: caches and memory), decides (crates/policy: pure) and acts (`act`). Tasks next to it read S3, nodes and
+//! tables: `reports`, `fences`, `failure_log`, `rows`, `records`. The objects that are created in the cluster are built by
+//! crates/pod-spec, which knows no client and no clock.
 
 pub mod act;
 pub mod external;

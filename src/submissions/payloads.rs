@@ -11,6 +11,7 @@ use sha2::{Digest, Sha256};
 
 use leaderboard_aws::archive::Archive;
 use leaderboard_aws::clients::Aws;
+use leaderboard_base::clock::Clock;
 use leaderboard_contract::keys::{METADATA, STDOUT};
 use leaderboard_contract::report::{ContentId, MAX_BYTES, REPORT_KEY, Report, StoredFile};
 use leaderboard_evalai::{Outline, Payload, PayloadProblem, PayloadReader, StoredResult};
@@ -20,12 +21,12 @@ use leaderboard_policy::report_digest::MAX_TEXT;
 const LIMIT: Duration = Duration::from_secs(10);
 
 /// The reader of the runs' buckets.
-pub fn reader(aws: Aws) -> PayloadReader {
+pub fn reader(aws: Aws, clock: Clock) -> PayloadReader {
     Arc::new(move |outline| {
-        let aws = aws.clone();
+        let (aws, now) = (aws.clone(), clock.now());
         async move {
             match &outline.stored {
-                Some(stored) => read(&aws, &outline, stored).await,
+                Some(stored) => read(&aws, &outline, stored, now).await,
                 None => Ok(Payload::bare(&outline)),
             }
         }
@@ -33,12 +34,12 @@ pub fn reader(aws: Aws) -> PayloadReader {
     })
 }
 
-async fn read(aws: &Aws, outline: &Outline, stored: &StoredResult) -> Result<Payload, PayloadProblem> {
+async fn read(aws: &Aws, outline: &Outline, stored: &StoredResult, now: Timestamp) -> Result<Payload, PayloadProblem> {
     let archive = Archive::of_storage(aws, &stored.storage).at_prefix(stored.prefix.clone());
     let (bare, patience) = (Payload::bare(outline), stored.patience);
     let report = match report(&archive, stored.report).await {
         Ok(report) => report,
-        Err(problem) => return left_out_after(bare, problem, patience.report),
+        Err(problem) => return left_out(bare, problem, now < patience.report),
     };
     let so_far = report.partial_results.filter(|_| stored.so_far);
     let found = Payload {
@@ -52,14 +53,14 @@ async fn read(aws: &Aws, outline: &Outline, stored: &StoredResult) -> Result<Pay
             metadata,
             ..found
         }),
-        Err(problem @ PayloadProblem::Unread(_)) => left_out_after(found, problem, patience.unread),
-        Err(problem @ PayloadProblem::Unfit(_)) => left_out_after(found, problem, patience.unfit),
+        Err(problem @ PayloadProblem::Unread(_)) => left_out(found, problem, now < patience.unread),
+        Err(problem @ PayloadProblem::Unfit(_)) => left_out(found, problem, now < patience.unfit),
     }
 }
 
-/// What is there, once the rest has been waited for long enough.
-fn left_out_after(found: Payload, problem: PayloadProblem, until: Timestamp) -> Result<Payload, PayloadProblem> {
-    if Timestamp::now() < until {
+/// The payload without the part that has the problem; the problem itself while that part is awaited.
+fn left_out(found: Payload, problem: PayloadProblem, is_awaited: bool) -> Result<Payload, PayloadProblem> {
+    if is_awaited {
         return Err(problem);
     }
     let (PayloadProblem::Unread(why) | PayloadProblem::Unfit(why)) = problem;

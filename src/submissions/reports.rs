@@ -1,6 +1,6 @@
 //! The report of a run in its bucket. It is read for each demand of `decide`, and once a period while the run goes on.
 //!
-//! An end is decided only on a report that was asked for after the end was seen, so the stage that was known is part of the question.
+//! An end is decided only on a report that was requested after the end was seen, so the known stage is part of the question.
 
 use std::sync::Arc;
 use std::time::Duration;
@@ -53,8 +53,8 @@ impl RunFiles {
 #[derive(Clone, Debug)]
 pub struct Report {
     pub demand: ReportDemand,
-    /// When the run ended: of several that have, the oldest end is read first.
-    pub ended: Option<Timestamp>,
+    /// When the run ended, or was seen to have ended: of several that have, the oldest end is read first.
+    pub ended: Timestamp,
     pub files: Arc<RunFiles>,
 }
 
@@ -105,7 +105,7 @@ impl Ask for Report {
     fn rank(&self) -> Rank {
         match self.demand.stage {
             Stage::Live => (1, 0),
-            Stage::RunEnded | Stage::JobEnded => (0, self.ended.unwrap_or_else(Timestamp::now).as_second()),
+            Stage::RunEnded | Stage::JobEnded => (0, self.ended.as_second()),
         }
     }
 
@@ -177,8 +177,8 @@ pub fn seen(lookup: &Lookup<Report>, job: JobNumber, pod: Option<&str>) -> Repor
     }
 }
 
-/// The report as that of an attempt. `is_former`: what is read is of the time before the object was restored from a backup, and may be
-/// of a later attempt than the object knows of. Its own Pods store reports of its attempt alone.
+/// The report as that of an attempt. `is_former`: the report is older than the object, which was restored from a backup. It may be of a
+/// later attempt than the object knows. Its own Pods store reports of its attempt alone.
 fn shown(stored: &Stored, wanted: Attempt, is_former: bool) -> ObservedReport {
     match stored {
         Stored::Nothing => ObservedReport::Absent,

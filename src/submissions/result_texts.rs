@@ -13,8 +13,8 @@ use leaderboard_policy::view::View;
 /// Most columns of a result whose metrics its host names: DynamoDB takes an expression of 4 KB.
 const MAX_COLUMNS: usize = 128;
 
-/// What the result in the view is sent with: nothing of a bucket where none is stored. `so_far`: with the metrics over what is done so
-/// far, else with the original's zeros.
+/// Where the parts of the result come from; without stored results, none comes from a bucket. `so_far`: with the metrics of the units
+/// done so far, else with the original's zeros.
 pub(super) fn outline(view: &View, status: &SubmissionStatus, so_far: bool, patience: Patience) -> Outline {
     let stored = view
         .report
@@ -40,7 +40,7 @@ pub(super) fn phase(view: &View) -> i64 {
     view.submission.spec.evalai.map_or(0, |e| e.phase)
 }
 
-/// What the participant reads of a failure: class, sentence and a next step that a participant can do, in our words only.
+/// A failure for the participant, in our own words: reason, class, and a sentence with a next step that a participant can do.
 pub(super) fn stderr(status: &SubmissionStatus) -> String {
     let Some(failure) = &status.failure else {
         return String::new();
@@ -53,7 +53,7 @@ pub(super) fn stderr(status: &SubmissionStatus) -> String {
     format!("{} ({class}): {text}", failure.reason)
 }
 
-/// Who may read the log of a failure.
+/// The people who may read the log of a failure.
 pub(super) fn log_readers(view: &View) -> LogTail {
     let leaderboard = view.leaderboard.as_ref();
     let evalai = leaderboard.and_then(|l| l.spec.evalai.as_ref());
@@ -70,8 +70,8 @@ pub(super) fn add_log(payload: &mut Outline, tail: Option<Tail>, readers: LogTai
     payload.environment_log = tail.for_hosts();
 }
 
-/// The row of a submission as it stands; none before it has a team. Only a finished one has metrics, those of its report, as in
-/// the original's table: of every other the columns are absent, whatever an earlier operator has written there.
+/// The present row of a submission; None before it has a team. Only a finished one has metrics, those of its report, as in the
+/// original's table. In every other row their columns are absent, also if an earlier operator has written them.
 pub(super) fn row(report: Option<&ReportDigest>, status: &SubmissionStatus) -> Option<Row> {
     let team = status.team.as_ref()?;
     let plan = status.plan.as_ref()?;
@@ -97,7 +97,7 @@ pub(super) fn row(report: Option<&ReportDigest>, status: &SubmissionStatus) -> O
     })
 }
 
-/// What the submission has used, of one that has ended: before, each Job would cost a write more.
+/// GPU seconds of a submission that has ended, as text; empty before, because each Job would cost a further write.
 fn gpu_seconds(status: &SubmissionStatus) -> String {
     let used = status
         .usage
@@ -113,7 +113,7 @@ pub(super) fn attempt_of_run(status: &SubmissionStatus) -> i64 {
     status.attempt.unwrap_or_default().0.saturating_add(earlier)
 }
 
-/// Whether its results count.
+/// True if its results count.
 pub(super) fn is_finished(status: &SubmissionStatus) -> bool {
     status.state_of_conditions() == State::Finished
 }

@@ -9,7 +9,7 @@ use leaderboard_base::tasks::Tasks;
 use leaderboard_policy::ask::Failure;
 use leaderboard_policy::questions::{ForeignRun, Row};
 
-/// What the old pipeline's row shows of a run that has not ended.
+/// Words of the old pipeline's row for a run that has not ended.
 const UNDER_WAY: [&str; 2] = ["SUBMITTED", "RUNNING"];
 
 /// Starts the task that reads.

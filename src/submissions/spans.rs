@@ -1,7 +1,7 @@
 //! The spans of phases that are over. Pure.
 //!
-//! A trace has one root, the intake, and below it an attempt for each that the submission had, with the phases of that attempt. What
-//! other systems take after the end of an attempt is below the root. No attribute holds a text that a participant has chosen.
+//! A trace has one root, the intake. Below it is an attempt for each that the submission had, with the phases of that attempt. The time
+//! that other systems take after the end of an attempt is below the root. No attribute holds a text that a participant has chosen.
 
 use sha2::{Digest, Sha256};
 
@@ -71,7 +71,7 @@ fn common(submission: &Submission, new: &SubmissionStatus) -> Vec<(&'static str,
     ]
 }
 
-/// What is worth knowing of one phase.
+/// The attributes of one phase.
 fn particular(submission: &Submission, new: &SubmissionStatus, phase: Phase) -> Vec<(&'static str, Value)> {
     let old = submission.status.as_ref();
     match phase {

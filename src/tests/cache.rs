@@ -1,4 +1,4 @@
-//! What an object of real size takes in a cache.
+//! Memory that an object of real size takes in a cache.
 
 use kube::ResourceExt;
 use serde_json::{Value, json};
@@ -26,7 +26,7 @@ fn uid(number: usize) -> String {
     format!("{}{number:06}", &UID[..30])
 }
 
-/// What the API server adds to what is written.
+/// An object as the API server stores it, with the fields that the server adds.
 fn stored(mut object: Value, number: usize) -> Value {
     let meta = &mut object["metadata"];
     meta["uid"] = json!(uid(number));

@@ -1,5 +1,5 @@
-//! A controller's surroundings without a cluster, for the tests of this module: caches that a test fills, an API server that takes
-//! everything, AWS wherever the test puts it.
+//! A controller's surroundings without a cluster, for the tests of this crate. They are caches that a test fills, an API server that
+//! takes every request, and AWS at the test's endpoint.
 
 use std::collections::HashMap;
 use std::sync::Arc;
@@ -37,6 +37,7 @@ use crate::submissions::records;
 use leaderboard_api::{Attempt, JobNumber, Leaderboard, State, Submission, SubmissionStatus, Times, effective, names};
 use leaderboard_aws::clients::Aws;
 use leaderboard_aws::table::Tables;
+use leaderboard_base::clock::Clock;
 use leaderboard_base::shutdown::Stop;
 use leaderboard_base::tasks::Tasks;
 use leaderboard_evalai::{Hub, Options};
@@ -50,7 +51,7 @@ const VERSION: &str = "2";
 /// The installation that drives every Leaderboard here.
 const OPERATOR: &str = "system/operator";
 
-/// What the caches show.
+/// The objects in the caches.
 #[derive(Default)]
 pub struct Cluster {
     pub leaderboards: Vec<Leaderboard>,
@@ -71,10 +72,10 @@ pub struct Arrived {
     pub body: Value,
 }
 
-/// What is to be kept while a context is used.
+/// The context, and the parts that must live as long as it is used.
 pub struct Surroundings {
     pub context: Context,
-    /// What the API server gets.
+    /// The requests that the API server gets.
     pub requests: mpsc::UnboundedReceiver<Arrived>,
     /// The Leaderboards that were woken.
     pub woken: mpsc::UnboundedReceiver<String>,
@@ -113,6 +114,7 @@ pub async fn surroundings(cluster: Cluster, endpoint: &str) -> Surroundings {
     let (turning, _) = mpsc::unbounded_channel();
     let tables = Arc::new(Tables::new(aws.clone()));
     let context = Context {
+        clock: Clock::system(),
         writer: Writer::new(client.clone(), || true),
         settings: settings(),
         slots: Arc::new(Slots::new(stores.clone(), noting(&turning))),
@@ -179,7 +181,7 @@ pub fn stores(cluster: Cluster) -> Stores {
     }
 }
 
-/// Services that nobody listens to.
+/// Services without a listener.
 fn external(tables: Arc<Tables>, tasks: &Tasks) -> ExternalSystems {
     let hub = Hub::new(Options::unheard(tasks, || true));
     let records = records::start(tables, || true, tasks, Box::new(|_| {}));

@@ -1,4 +1,4 @@
-//! What the tests of this module share, and what the caches hold.
+//! Parts that the tests of this crate share, and the size of cached objects.
 
 mod cache;
 pub(crate) mod fixtures;

@@ -1,4 +1,4 @@
-//! What a Leaderboard names and may not: shown in `Ready`, and nothing of it is used, until it names what it may.
+//! A Leaderboard that names a place it may not: `Ready` shows it, and the controller uses no place of it until that is corrected.
 #![cfg(test)]
 
 use kube::Api;

@@ -1,5 +1,5 @@
-//! What a Leaderboard's status shows while its places in AWS and its token are missing, silent or there, and what the
-//! controller's metrics show of the calls.
+//! The status of a Leaderboard while its places in AWS and its token are missing, silent or there. The controller's metrics show the
+//! calls.
 
 use std::time::Duration;
 
@@ -188,7 +188,7 @@ async fn what_is_missing_is_named_until_it_is_there() {
     }
     assert!(said.message.contains("Create the bucket"), "{}", said.message);
     world.make_bucket().await;
-    // Nobody edits anything here: it is asked again by itself.
+    // Without an edit here the controller asks again by itself.
     let said = world.says("False", Reason::TableUnreachable).await;
     assert!(said.message.contains("check table.dynamoDB.name"), "{}", said.message);
     world.make_table().await;
@@ -326,7 +326,7 @@ async fn the_priority_class_of_a_track_has_to_be_there_and_must_not_preempt() {
         let class: PriorityClass = serde_json::from_value(class).unwrap();
         classes.create(&PostParams::default(), &class).await.unwrap();
     }
-    // Nobody edits anything: it is asked again by itself.
+    // Without an edit the controller asks again by itself.
     world.says("True", Reason::Ready).await;
     let patch = Patch::Merge(json!({"spec": {"tracks": tracks(class("preempts"))}}));
     let boards = world.boards().await;

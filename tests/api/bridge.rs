@@ -184,7 +184,7 @@ impl Bridge {
             .find_map(|line| line.strip_prefix(start).map(str::to_owned))
     }
 
-    /// What /readyz shows.
+    /// The text of /readyz.
     fn missing(&self) -> String {
         self.telemetry.readiness.missing().join("; ")
     }

@@ -1,5 +1,5 @@
-//! The ResourceClaimTemplate of a Leaderboard that claims its GPUs, by the whole controller on an API server that serves
-//! `resource.k8s.io/v1`; and what an API server answers that does not.
+//! The ResourceClaimTemplate of a Leaderboard that claims its GPUs. The whole controller runs on an API server that serves
+//! `resource.k8s.io/v1`, and on one that does not.
 
 use k8s_openapi::api::batch::v1::Job;
 use kube::api::{DeleteParams, DynamicObject, ListParams, Patch, PatchParams, PostParams};
@@ -133,7 +133,7 @@ async fn a_template_is_applied_named_by_jobs_and_kept_as_long_as_one_needs_it() 
     world.jobs().delete("sub-1", &params).await.unwrap();
     let gone = await_condition(world.jobs(), "sub-1", |job: Option<&Job>| job.is_none());
     timeout(LIMIT, gone).await.expect("the Job is gone").unwrap();
-    // Of another Leaderboard, or of a person.
+    // A template of another Leaderboard, or of a person.
     let stranger = DynamicObject {
         metadata: k8s_openapi::apimachinery::pkg::apis::meta::v1::ObjectMeta {
             name: Some("stranger".into()),

@@ -1,4 +1,4 @@
-//! What `kubectl get` shows, from the table that the API server sends.
+//! The columns of `kubectl get`, from the table that the API server sends.
 
 use std::fmt::Write as _;
 

@@ -1,8 +1,8 @@
-//! What one submission costs, counted where the machine makes no difference: requests to the API server, S3, EvalAI and DynamoDB,
+//! Cost of one submission, counted where the machine makes no difference: requests to the API server, S3, EvalAI and DynamoDB,
 //! reconciles, and allocations. The table is `counts/expected.json`; `UPDATE_COUNTS=1` writes it anew.
 //!
-//! The whole controller runs on the real API server; Job controller, kubelet and logcopy are played, so that nothing but the
-//! controller decides what is asked and written.
+//! The whole controller runs on the real API server. Job controller, kubelet and logcopy are played, so that the controller alone decides
+//! on each request and write.
 
 pub mod lifecycle;
 pub mod rest;
@@ -19,12 +19,12 @@ use rest::Rest;
 
 const TABLE: &str = "tests/api/counts/expected.json";
 const UPDATE: &str = "UPDATE_COUNTS";
-/// What depends on a moment, such as reads of a report while a run ends, may differ by this part of the expected, and by one.
+/// Tolerated part of each expected count, besides one. Counts that depend on a moment vary, such as reads of a report while a run ends.
 const TOLERANCE: f64 = 0.25;
 /// On a busy machine a write can be refused as a conflict and sent again. A real change is there each time.
 const TRIES: usize = 3;
 
-/// What one submission costs from its creation until nothing more comes of its end.
+/// Cost of one submission from its creation until its end causes no further request.
 #[derive(Debug, Clone, Default, PartialEq, Serialize, Deserialize)]
 #[serde(rename_all = "camelCase", deny_unknown_fields)]
 pub struct Cost {
@@ -148,7 +148,7 @@ fn differences(expected: &Table, seen: &Table) -> Vec<String> {
     found
 }
 
-/// What a minute at rest has too much or too little. A Leaderboard's own looks may fall into it.
+/// Differences of a minute at rest from the expected one, a sentence each. A Leaderboard's own looks may fall into that minute.
 fn unrest(expected: &BTreeMap<String, Rest>, seen: &BTreeMap<String, Rest>) -> Vec<String> {
     let sum = |requests: &BTreeMap<String, u64>| requests.values().sum();
     let mut found = Vec::new();

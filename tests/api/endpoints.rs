@@ -23,7 +23,7 @@ use super::bridge::{LIMIT, StandIn};
 use super::objects::{Kind, create};
 use crate::support::apiserver::server;
 
-/// An AWS that nobody should ask: it notes each request and refuses it.
+/// An AWS that no program should ask: it notes each request and refuses it.
 pub(super) struct Elsewhere {
     pub(super) endpoint: String,
     asked: Arc<Mutex<Vec<String>>>,
@@ -45,7 +45,7 @@ impl Elsewhere {
         Self { endpoint, asked }
     }
 
-    /// What was asked here.
+    /// The requests that came here.
     pub(super) fn asked(&self) -> Vec<String> {
         self.asked.lock().unwrap().clone()
     }
@@ -137,7 +137,7 @@ impl Scene {
         }
     }
 
-    /// What both programs have logged.
+    /// The logs of both programs.
     fn logs(&self) -> String {
         let read = |program: &str| std::fs::read_to_string(self.folder.path().join(program)).unwrap_or_default();
         format!("controller:\n{}\nbridge:\n{}", read("controller"), read("bridge"))

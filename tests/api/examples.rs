@@ -141,7 +141,7 @@ fn number(quantities: Option<&Quantities>, name: &str) -> f64 {
     text.trim_end_matches("Gi").parse().unwrap()
 }
 
-/// What is left for Pods on a g5.12xlarge: 47.8 CPUs, some 180 GiB, and 4 GPUs that are shown as 8.
+/// Room for Pods on a g5.12xlarge: 47.8 CPUs, some 180 GiB, and 4 GPUs that are shown as 8.
 #[test]
 fn a_run_of_the_examples_takes_the_gpus_of_one_node_and_fits_it() {
     for name in [

@@ -26,7 +26,7 @@ use crate::support::apiserver::{Request, server};
 const PERIOD: Duration = Duration::from_millis(250);
 /// The audit log of the API server is read this often.
 const LOOK: Duration = Duration::from_millis(100);
-/// What a process does that does not lead, too.
+/// Resources that a process writes also without the lead.
 const OF_THE_PROCESS: [&str; 1] = ["leases"];
 const READS: [&str; 3] = ["get", "list", "watch"];
 
@@ -84,7 +84,7 @@ impl Replica {
         at
     }
 
-    /// What it has written as a leader.
+    /// Writes that it has made as a leader.
     async fn writes(&self) -> Vec<Request> {
         let all = server().await.requests(&self.user).into_iter();
         let is_write = |request: &Request| {

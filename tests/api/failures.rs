@@ -1,5 +1,5 @@
-//! Failures as the whole controller meets them: an agent that prints the private routes and crashes, whose log hosts find and
-//! participants don't; and a node that falls silent.
+//! Failures as the whole controller meets them. An agent prints the private routes and crashes: hosts find its log, and participants
+//! don't. A node falls silent.
 //!
 //! The real controller against a real API server and both stand-ins; the test plays the Job controller, the kubelet and
 //! logcopy.
@@ -164,7 +164,7 @@ async fn a_silent_node_is_replaced_before_the_grace_and_costs_no_attempt() {
     timeout(LIMIT, is_told("running"))
         .await
         .expect("EvalAI hears of the run");
-    // As the eviction by the node's taint does it. Nobody is there to end the Pod; its grace is ten minutes.
+    // The eviction by the node's taint deletes the Pod like this. No kubelet is there to end it; its grace is ten minutes.
     let deleted = world.api::<Pod>().delete(&pod, &DeleteParams::default()).await.unwrap();
     assert!(deleted.left().unwrap().metadata.deletion_timestamp.is_some());
     let next = world.job(&name, 1).await;

@@ -1,5 +1,5 @@
-//! `kubectl leaderboard import` as a person runs it: what it prints is applied to the API server, alone and with the decisions of the
-//! documents laid over it.
+//! `kubectl leaderboard import` as a person runs it. Its manifests are applied to the API server, alone and with the decisions of the
+//! documents laid over them.
 #![cfg(test)]
 
 use std::collections::BTreeMap;
@@ -22,7 +22,7 @@ fn entries() -> BTreeMap<&'static str, Value> {
     serde_json::from_str(file).unwrap()
 }
 
-/// What `aws secretsmanager get-secret-value --output json` prints of them.
+/// The output of `aws secretsmanager get-secret-value --output json` for these entries.
 fn answers(entries: &BTreeMap<&str, Value>) -> String {
     let answer = |(name, entry): (&&str, &Value)| {
         let arn = format!("arn:aws:secretsmanager:us-west-2:123456789012:secret:{name}-Ab12Cd");
@@ -59,7 +59,7 @@ fn texts(output: &Output) -> (String, String) {
     (text(&output.stdout), text(&output.stderr))
 }
 
-/// What kubectl answers to a file of manifests: the objects that it names.
+/// The objects of a file of manifests, as kubectl prints them after a dry run.
 async fn dry_run(file: &Path) -> Vec<String> {
     let mut command = server().await.kubectl();
     command.args([

@@ -68,7 +68,7 @@ impl World {
         found.unwrap_or_else(|_| panic!("left: {:?}", self.queues.messages(QUEUE)));
     }
 
-    /// What the operator has asked for, as methods and paths that hold this.
+    /// The operator's requests whose paths hold `part`, as a method and a path each.
     fn asked(&self, part: &str) -> Vec<String> {
         let all = self.evalai.requests().into_iter();
         let of_us = all.filter(|entry: &Entry| entry.token.as_deref() == Some(HOST) && entry.path.contains(part));
@@ -128,7 +128,7 @@ async fn a_message_becomes_a_submission_once_and_a_resume_raises_its_attempt() {
     let asked = world.asked("/jobs/queues/");
     assert_eq!(asked, [format!("POST /api/jobs/queues/{QUEUE}/")]);
 
-    // The same message again: its deletion was lost.
+    // A repeat of the message, as after a lost deletion.
     let body = json!({"challenge_pk": "1", "phase_pk": "1", "submission_pk": pk, "submitted_image_uri": "r/team-a:1"});
     world.send(body.clone()).await;
     world.left(0).await;
@@ -166,7 +166,7 @@ async fn a_message_of_no_use_is_named_and_deleted_and_another_challenges_stays()
         "{note}"
     );
     world.left(1).await;
-    // What follows is read all the same.
+    // Later messages are read all the same.
     let pk = world.push_and_send().await;
     world.made(pk).await;
     world.left(1).await;

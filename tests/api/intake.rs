@@ -1,5 +1,5 @@
-//! Many messages at once, some of them twice and some of no use, while the controller and a bridge are killed again and again:
-//! each submission is made once, and what cannot be used is dead-lettered with its reason.
+//! Many messages at once, while the controller and a bridge are killed again and again. Some come twice, and some are of no use. Each
+//! submission is made once, and each useless message is dead-lettered with its reason.
 //!
 //! The programs are the real ones, as child processes. The small size belongs to the tests, the full one measures:
 //! `make measure-intake`.
@@ -54,7 +54,7 @@ struct Size {
     visibility: u32,
     /// Submissions that are made by hand first, to know what the API server can do.
     raw: usize,
-    /// Whether all are waited for until the controller has accepted them.
+    /// True if the test waits until the controller has accepted all.
     accepts: bool,
     /// Longest time for the intake, and for what follows.
     limit: Duration,
@@ -154,7 +154,7 @@ impl Programs {
         victim.start_again();
     }
 
-    /// What has ended by itself is started again if that is allowed.
+    /// Starts programs again that have ended by themselves, if that is allowed.
     fn keep(&mut self) {
         for program in [&mut self.controller, &mut self.bridge, &mut self.steady] {
             program.keep();

@@ -1,5 +1,5 @@
-//! The NetworkPolicy of a Leaderboard, as the whole controller keeps it: there before any Job, back when it is edited or
-//! deleted, shown when it is refused, and measured by the Pods. The test plays the kubelet.
+//! The NetworkPolicy of a Leaderboard, as the whole controller keeps it. It is there before any Job, and comes back when it is edited or
+//! deleted. A refusal is shown, and Pods measure its effect. The test plays the kubelet.
 
 use std::time::{Duration, Instant};
 
@@ -69,7 +69,7 @@ impl World {
             .unwrap();
     }
 
-    /// What the operator with few rights may do to policies from now on.
+    /// Sets the verbs that the operator with few rights has on policies from now on.
     async fn set_rights(&self, policies: &[&str]) {
         let patch = Patch::Merge(role(policies));
         let roles = self.api::<Role>();
@@ -154,12 +154,12 @@ fn egress(policy: &NetworkPolicy) -> Value {
     serde_json::to_value(&policy.spec.as_ref().unwrap().egress).unwrap()
 }
 
-/// What a Pod receives about its isolation.
+/// The isolation in the run of a Pod's `workspace`.
 fn told(job: &Job) -> Value {
     run(job, "workspace").unwrap()["isolation"].clone()
 }
 
-/// What a container knows of its run; none if it gets nothing.
+/// The run that a container gets, as JSON; None if it gets none.
 pub(super) fn run(job: &Job, container: &str) -> Option<Value> {
     let pod = job.spec.as_ref().unwrap().template.spec.as_ref().unwrap();
     let mut all = pod.init_containers.iter().flatten().chain(&pod.containers);

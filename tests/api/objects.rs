@@ -88,7 +88,7 @@ pub fn merge(target: &mut Value, patch: &Value) {
     }
 }
 
-/// What the API server found wrong, one text for each cause.
+/// Faults that the API server found, one text for each cause.
 pub fn causes(error: &kube::Error) -> Vec<String> {
     let kube::Error::Api(status) = error else {
         panic!("not an answer of the API server: {error}");

@@ -24,7 +24,7 @@ const END_LIMIT: Duration = Duration::from_mins(3);
 /// Name of the Lease, in the operator's own namespace.
 pub const LEASE_NAME: &str = "operator";
 
-/// Nobody else wants its Lease.
+/// No other process wants its Lease.
 const LEASE: Duration = Duration::from_mins(4);
 
 /// A controller that leads, or will.
@@ -63,12 +63,12 @@ impl Operator {
         }
     }
 
-    /// Whether it goes on; one that has ended by itself is the end of a test.
+    /// True while it runs. A test fails if it has ended by itself.
     pub fn is_running(&self) -> bool {
         !self.task.is_finished()
     }
 
-    /// What Prometheus would get.
+    /// The metrics, as Prometheus gets them.
     pub fn metrics(&self) -> String {
         self.telemetry.metrics.text().unwrap()
     }
@@ -120,7 +120,7 @@ fn lease(namespace: &str) -> leader::Settings {
     }
 }
 
-/// What the command line would set, for an operator that serves a namespace.
+/// The settings that the command line makes for an operator that serves one namespace.
 pub fn settings(namespace: &str) -> Settings {
     Settings {
         own: OwnImage {

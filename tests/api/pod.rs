@@ -1,5 +1,5 @@
-//! The programs in the Pod against a stand-in for AWS: what they store, restore and report, and what they do when S3 is away
-//! or another Pod has taken over.
+//! The programs in the Pod against a stand-in for AWS: the objects that they store and restore, and their reports. In some tests S3 is
+//! away, or another Pod has taken over.
 
 mod archives;
 mod checksums;
@@ -111,7 +111,7 @@ impl Pod {
         }
     }
 
-    /// The same prefix seen by the Pod that replaces this one.
+    /// The Pod that replaces this one, with the same prefix.
     async fn replaced(&self, uid: &str) -> Self {
         let bucket = &self.setting.run.plan.storage.s3.bucket;
         let mut next = Self::on(&server().await.endpoint(), bucket, self.setting.run.clone()).await;
@@ -139,7 +139,7 @@ impl Pod {
         file.unwrap().write_all(bytes).unwrap();
     }
 
-    /// What the agent of a pair would write.
+    /// Writes the checkpoint of a pair's agent.
     fn checkpoint(&self, pair: u32, done: u32) {
         let text = checkpoint((pair - 1) * 2, done, 2);
         self.put(&format!("agent/agent{pair}/agent_results.json"), text.as_bytes());
@@ -165,7 +165,7 @@ impl Pod {
         self.archive.get(key, LIMIT).await.unwrap().map(|object| object.bytes)
     }
 
-    /// Whose writes count.
+    /// UID of the Pod whose writes count.
     async fn owner(&self) -> String {
         Owner::parse(&self.stored(OWNER_KEY).await.unwrap()).unwrap().owner
     }

@@ -1,5 +1,5 @@
-//! The Pods that the controller makes, in front of the API server's own admission: Pod Security's levels, and the fields by which a host
-//! isolates them further.
+//! The Pods that the controller makes, in front of the API server's own admission. It covers Pod Security's levels, and the fields by
+//! which a host isolates Pods further.
 
 use k8s_openapi::api::batch::v1::Job;
 use k8s_openapi::api::core::v1::{Namespace, Pod};

@@ -6,7 +6,7 @@ use std::process::Stdio;
 
 use tokio::process::Command;
 
-/// The command of a program in a Pod of this name. What it prints is appended to the file `log`.
+/// The command of a program in a Pod of this name. Its output is appended to the file `log`.
 pub fn operator(program: &str, name: &str, namespace: &str, kubeconfig: &Path, log: &Path) -> Command {
     let log = File::options().create(true).append(true).open(log).unwrap();
     // A killed test drops nothing; the kernel ends its children all the same.

@@ -1,4 +1,4 @@
-//! A real Prometheus: it scrapes two controllers and a bridge while submissions come, run, fail and end, with the alerts and the dashboard
+//! A real Prometheus scrapes two controllers and a bridge while submissions come, run, fail and end. It has the alerts and the dashboard
 //! of the chart, which renders both as they are (`local/lab chart-test`).
 #![cfg(test)]
 
@@ -26,7 +26,7 @@ use server::{Prometheus, Target};
 const FILES: &str = "charts/leaderboard-operator/files";
 const PAGE: &str = "docs/metrics.md";
 
-/// What can be seen of two lives.
+/// Queries about two lives, with their answers.
 const SEEN: [(&str, &str); 8] = [
     (r#"max(leaderboard_submissions{state="Finished"})"#, "1"),
     (r#"max(leaderboard_submissions{state="Failed"})"#, "1"),
@@ -41,7 +41,7 @@ const SEEN: [(&str, &str); 8] = [
     ),
 ];
 
-/// What a standby shows of itself: of messages that none has waited.
+/// Prefixes of the metrics of a standby; the wait of messages shows that none has waited.
 const OF_STANDBY: [&str; 6] = [
     "leaderboard_build_",
     "leaderboard_is_leader",
@@ -51,8 +51,8 @@ const OF_STANDBY: [&str; 6] = [
     "leaderboard_watch_",
 ];
 
-/// What two lives may leave no sample of, with the reason. Everything else in docs/metrics.md must be there, and every other query of the
-/// dashboard must have an answer.
+/// Metrics of which two lives may leave no sample, with the reason. Everything else in docs/metrics.md must be there, and every other
+/// query of the dashboard must have an answer.
 const ABSENT: [(&str, &str); 8] = [
     (
         "leaderboard_evalai_token_expiry_timestamp_seconds",

@@ -8,6 +8,7 @@ use aws_credential_types::provider::{ProvideCredentials, SharedCredentialsProvid
 use aws_sdk_sqs::types::MessageSystemAttributeName;
 use leaderboard_aws::clients::Aws;
 use leaderboard_aws::fault::Fault;
+use leaderboard_base::clock::Clock;
 use leaderboard_base::meter::Meter;
 use leaderboard_operator::bridge::queue::Reader;
 use leaderboard_operator::intake::source::Received;
@@ -23,7 +24,7 @@ async fn receive(reader: &Reader, count: usize) -> Vec<Received> {
     let mut all = Vec::new();
     let take = async {
         while all.len() < count {
-            all.extend(reader.receive(10).await.unwrap());
+            all.extend(reader.receive(10, &Clock::system()).await.unwrap());
         }
     };
     tokio::time::timeout(LIMIT, take).await.expect("messages arrive");
@@ -137,7 +138,7 @@ async fn a_queue_that_cannot_be_used_is_named_with_what_to_do() {
     let anonymous = Aws::from_config(anonymous).sqs(None, Some(&stand_in.endpoint));
     // Without the attribute the usual visibility is assumed; the receive then fails.
     let reader = Reader::open(anonymous, &missing, Meter::default()).await.unwrap();
-    let error = reader.receive(1).await.err().unwrap();
+    let error = reader.receive(1, &Clock::system()).await.err().unwrap();
     assert_eq!(error.fault, Fault::Denied, "{error}");
     assert!(
         error.to_string().ends_with("and that they allow sqs:ReceiveMessage"),

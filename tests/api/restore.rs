@@ -27,7 +27,7 @@ use crate::support::player::{self, ROUTES};
 /// Routes that what still runs has done.
 const DONE: u32 = 12;
 
-/// What was there before the disaster, by what became of it.
+/// The submissions before the disaster, by their state.
 struct Season {
     world: World,
     table: String,
@@ -36,7 +36,7 @@ struct Season {
     cancelled: (u64, String),
     /// It runs.
     running: (u64, String),
-    /// It has ended, and nobody has read that.
+    /// It has ended, and the controller has not read that.
     unread: (u64, String),
     /// It waits for its turn.
     pending: (u64, String),
@@ -90,7 +90,7 @@ impl Season {
         world.until(&pending.1, "it is held", is_held).await;
         drop(controller);
         until_released(&world).await;
-        // The Pod ends while nobody looks.
+        // The Pod ends while no controller runs.
         report(&world, &unread.0.to_string(), &unread.1, ROUTES).await;
         Self {
             world,
@@ -185,7 +185,7 @@ async fn begin(world: &World, run: &str, name: &str) {
     world.until(name, "its report is read", is_read).await;
 }
 
-/// What logcopy stores of a run; the last report of one that is complete.
+/// Stores the report of a run as logcopy does; the last one if `done` is all routes.
 async fn report(world: &World, run: &str, name: &str, done: u32) {
     let uid = world.api::<Submission>().get(name).await.unwrap().uid().unwrap();
     let job = names::job(name, JobNumber::first(Attempt(1)));
@@ -263,7 +263,7 @@ kubectl --namespace $NS create --filename $BACKUP.new";
 /// The command that gives them their statuses.
 const STATUSES: &str = "kubectl --namespace $NS apply --server-side --force-conflicts --subresource=status \
                         --field-manager=leaderboard-operator/status --filename $BACKUP.new";
-/// What a tool does that writes statuses under a name of its own.
+/// The command of a tool that writes statuses under a name of its own.
 const STATUSES_OF_A_TOOL: &str = "kubectl --namespace $NS replace --subresource=status --filename $BACKUP.new";
 /// The commands after such a tool.
 const HAND_OVER: &str = r#"kubectl --namespace $NS get submissions --output json --show-managed-fields \
@@ -309,13 +309,13 @@ fn ends_since(season: &Season, pk: u64, before: usize) -> usize {
     since.iter().filter(is_end).count()
 }
 
-/// What the objects and other systems show right before the objects are lost.
+/// The objects and other systems right before the objects are lost.
 struct Before {
-    /// Of what is over, by name.
+    /// Statuses of submissions that are over, by name.
     statuses: Vec<(String, SubmissionStatus)>,
-    /// Of what is over in EvalAI, by key.
+    /// Rows of submissions that are over in EvalAI, and the writes to EvalAI about them, by key.
     outside: Vec<(u64, (String, Vec<String>))>,
-    /// Writes to EvalAI about the one whose end nobody has read.
+    /// Number of writes to EvalAI about the submission with an unread end.
     unread: usize,
 }
 
@@ -340,7 +340,7 @@ impl Season {
     /// A run that was under way has a Job again, with the progress of before.
     async fn assert_goes_on(&self, name: &str) {
         self.world.job(name, 0).await;
-        // What the present Job has not reached is no longer shown: all fields are this operator's.
+        // Times of the lost Job are no longer shown: all fields are this operator's.
         let is_renewed = |status: &SubmissionStatus| status.recreated == 1 && status.times.scheduled.is_none();
         self.world.until(name, "its Job is made again", is_renewed).await;
         let status = self.status(name).await;
@@ -353,7 +353,7 @@ impl Season {
         );
     }
 
-    /// What was over is as it was, in all systems, and only what was under way runs.
+    /// Fails unless all that was over is unchanged in all systems, and only unfinished submissions run.
     async fn assert_rest_is_as(&self, before: Before) {
         for (name, before) in before.statuses {
             assert_eq!(of_any_generation(self.status(&name).await), before, "{name}");

@@ -79,7 +79,7 @@ async fn what_has_ended_is_deleted_after_its_time_and_only_a_resume_runs_again()
     assert_eq!(in_evalai(), Status::Failed);
     assert_eq!(row(&world, &table).await, ("1".to_owned(), "FAILED".to_owned()));
 
-    // The same message once more: EvalAI shows the end, so nothing is run and nothing is written.
+    // A repeat of the message: EvalAI shows the end, so no Job is made and no write is sent.
     let image = json!("r/team-a:1");
     world.object("short", 1, pk, &image).await;
     let uid = uid_of(&world, &name).await;

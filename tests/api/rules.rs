@@ -11,7 +11,7 @@ use super::rule_cases::{self, Case, Step};
 use crate::support::apiserver::server;
 
 const SCHEMA: &str = "/spec/versions/0/schema/openAPIV3Schema";
-/// What one rule must stay under, as a part of what the API server allows one rule.
+/// Each rule must cost less than the API server's limit of one rule divided by this.
 const PART: usize = 10;
 
 /// A rule and where it stands.
@@ -100,7 +100,7 @@ fn every_rule_compiles_is_in_scope_and_is_estimated_below_a_tenth_of_the_limit()
     }
 }
 
-/// The analysis takes the variable of `all(t, …)` for one that nobody set.
+/// True for a false warning: the analysis takes the variable of `all(t, …)` for one without a value.
 fn macro_variables(rule: &str, warning: &str) -> bool {
     let name = warning.split('\'').nth(1).unwrap_or_default();
     !name.is_empty() && rule.contains(&format!("({name}, "))
@@ -141,7 +141,7 @@ async fn dry_run(api: &Api<CustomResourceDefinition>, definition: Value) -> kube
     api.create(&params, &definition).await.map(drop)
 }
 
-/// The definition under a group that nobody serves, as if it came new.
+/// The definition under a group that is not served, as if it came new.
 fn under_another_group(definition: &Value, change: impl FnOnce(&mut Value)) -> Value {
     let mut copy = definition.clone();
     let name = copy["spec"]["names"]["plural"].as_str().unwrap();

@@ -1,5 +1,5 @@
-//! Many submissions at once, on a real API server with a played cluster: the budget of requests to EvalAI holds, every result
-//! is published, a cancellation in EvalAI reaches the Pod.
+//! Many submissions at once, on a real API server with a played cluster. The budget of requests to EvalAI holds, every result is
+//! published, and a cancellation in EvalAI reaches the Pod.
 //!
 //! The small size belongs to the tests. The full one measures, and takes a quarter of an hour: `make measure-scale`.
 
@@ -166,7 +166,7 @@ struct World {
     changes: std::pin::Pin<Box<dyn futures::Stream<Item = Submission> + Send>>,
 }
 
-/// What the Submissions' statuses have shown.
+/// The Submissions as their statuses have shown them.
 #[derive(Default)]
 struct Seen {
     states: BTreeMap<String, State>,
@@ -391,7 +391,7 @@ impl World {
         );
         let throttled = log.iter().filter(|entry| entry.status == Some(429)).count();
         assert_eq!(throttled, 0, "EvalAI throttled us");
-        // What leaves in time may arrive a little closer together.
+        // Requests that leave in time may arrive a little closer together.
         let limit = size.requests_per_minute;
         assert!(most_within(&times, 59_000) <= limit, "{minute} requests in a minute");
         assert!(
@@ -419,7 +419,7 @@ impl World {
         println!("{partials} partial results");
     }
 
-    /// What was stopped is Cancelled in EvalAI too, also where a write that was on its way just then had undone that.
+    /// Fails unless each stopped submission is Cancelled in EvalAI too, also if a write that was on its way had undone that.
     fn check_cancelled<'a>(&self, pks: impl Iterator<Item = &'a u64>, log: &[Entry]) {
         let state = self.evalai.state();
         let mut sent_again = 0;

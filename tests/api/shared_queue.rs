@@ -17,7 +17,7 @@ use crate::support::apiserver;
 
 /// EvalAI's limit of a token, a minute.
 const LIMIT: usize = 60;
-/// What each of the two may ask for.
+/// Requests a minute of each of the two operators.
 const HALF: u32 = 27;
 
 /// An operator: its namespace, its phase, and its controller, which runs until this is dropped.

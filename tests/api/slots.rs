@@ -1,5 +1,5 @@
-//! Slots of a Leaderboard as the whole controller grants them: no more Jobs than slots, places in line, and a new leader that
-//! counts what the old one started.
+//! Slots of a Leaderboard as the whole controller grants them: there are no more Jobs than slots, and waiting submissions show their
+//! place. A new leader counts the Jobs that the old one started.
 
 use k8s_openapi::api::batch::v1::Job;
 use kube::ResourceExt;
@@ -91,7 +91,7 @@ impl World {
 async fn one_slot_is_one_job_also_after_a_takeover() {
     let world = World::new().await;
     let operator = world.operator().await;
-    // Those of one second stand in the order of their names.
+    // Submissions of one second stand in the order of their names.
     world.submit("first").await;
     world.has_job("first").await;
     world.submit("second").await;

@@ -1,4 +1,5 @@
-//! Who leads each track: in the Leaderboard's status, by EvalAI's metric, without what EvalAI has cancelled, and also after retention.
+//! The standings of each track in the Leaderboard's status: by EvalAI's metric, without results that EvalAI has cancelled, and after
+//! retention.
 #![cfg(test)]
 
 use std::time::Duration;

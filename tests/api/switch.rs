@@ -16,7 +16,7 @@ use super::world::World;
 /// Id of the team that submits.
 const TEAM: &str = "1";
 
-/// What the old pipeline writes of a submission.
+/// Writes the old pipeline's row of a submission.
 async fn write_row(world: &World, table: &str, pk: u64, status: &str) {
     let text = |text: &str| AttributeValue::S(text.into());
     let client = world.aws.aws.dynamodb(None, Some(&world.aws.endpoint));
@@ -69,7 +69,7 @@ fn is_foreign(status: &SubmissionStatus) -> bool {
     status.shows(Reason::Foreign)
 }
 
-/// What the agent of a Job gets as RESUME.
+/// The value of RESUME for the agent of a Job.
 fn resume(job: &Job) -> String {
     let pod = job.spec.as_ref().unwrap().template.spec.as_ref().unwrap();
     let agent = pod.containers.iter().find(|c| c.name == "agent-1").unwrap();
@@ -115,7 +115,7 @@ async fn what_the_old_pipeline_runs_is_left_alone_until_it_has_ended_there() {
     assert_eq!(of(finishes.0), Status::Finished);
 }
 
-/// What has changed a submission in EvalAI.
+/// Number of requests that have changed a submission in EvalAI.
 fn written(world: &World) -> usize {
     let all = world.evalai.requests();
     all.into_iter().filter(|entry| entry.method != "GET").count()
@@ -157,7 +157,7 @@ async fn a_submission_that_nobody_has_begun_starts_with_one_look() {
     let _controller = world.controller();
     let (_, name) = world.submit("lb", 1).await;
     assert_eq!(resume(&world.job(&name, 0).await), "");
-    // A Leaderboard whose table does not exist yet: nobody's row is there, and its status names the fault.
+    // The table of this Leaderboard does not exist yet: it has no row of another program, and the status names the fault.
     let gone = json!({"table": {"dynamoDB": {"name": world.aws.name("gone"), "endpoint": world.aws.endpoint}}});
     world.leaderboard_with("other", 2, "Hosts", &gone).await;
     let (_, name) = world.submit("other", 2).await;

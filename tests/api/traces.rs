@@ -1,4 +1,4 @@
-//! What is left of one submission's life outside the cluster: its trace at an OpenTelemetry Collector, and its lines in the log.
+//! Traces of one submission's life outside the cluster: its trace at an OpenTelemetry Collector, and its lines in the log.
 
 mod collector;
 
@@ -59,7 +59,7 @@ impl Lines {
         String::from_utf8(self.0.borrow().clone()).unwrap()
     }
 
-    /// Those that name a submission.
+    /// The lines that name a submission.
     fn of_submissions(&self) -> Vec<Value> {
         let text = self.text();
         let lines = text.lines().map(|line| serde_json::from_str::<Value>(line).unwrap());

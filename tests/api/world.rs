@@ -113,7 +113,7 @@ impl World {
         Api::namespaced(self.client.clone(), &self.namespace)
     }
 
-    /// What is around the controller in its namespace, for a test to play.
+    /// The parts of the cluster around the controller, for a test to play.
     pub(super) fn cluster(&self) -> Cluster {
         Cluster::new(&self.client, &self.namespace)
     }
@@ -134,7 +134,7 @@ impl World {
         self.installation("operator", "operator:1")
     }
 
-    /// The same, with a watch of the nodes.
+    /// A controller that also watches the nodes.
     pub(super) fn controller_with_nodes(&self) -> tokio::sync::watch::Sender<bool> {
         let settings = Settings {
             has_cluster_rights: true,
@@ -143,7 +143,7 @@ impl World {
         self.start("operator", settings, None)
     }
 
-    /// The same with this Lease and this image.
+    /// A controller with this Lease and this image.
     pub(super) fn installation(&self, lease: &str, image: &str) -> tokio::sync::watch::Sender<bool> {
         self.replica(lease, image, None)
     }
@@ -189,7 +189,7 @@ impl World {
         self.leaderboard_with(name, phase, log_tail, &json!({})).await;
     }
 
-    /// The same with more of its spec.
+    /// Makes a Leaderboard with more of its spec.
     pub(super) async fn leaderboard_with(&self, name: &str, phase: i64, log_tail: &str, more: &Value) {
         let mut leaderboard = json!({
             "apiVersion": "leaderboard.carla.org/v1alpha1", "kind": "Leaderboard", "metadata": {"name": name},
@@ -220,7 +220,7 @@ impl World {
         self.submit_image(leaderboard, phase, &image, &image).await
     }
 
-    /// The same with these images in the uploaded file and in the object.
+    /// Submits with these images in the uploaded file and in the object.
     pub(super) async fn submit_image(
         &self,
         leaderboard: &str,
@@ -371,8 +371,8 @@ pub(super) fn ago(seconds: i64) -> String {
     at.strftime("%Y-%m-%dT%H:%M:%SZ").to_string()
 }
 
-/// The status of a Pod after its agent's crash. What the agent leaves as its last message is no verdict of a runner; its
-/// simulator's runner has followed it.
+/// The status of a Pod after its agent's crash. The agent's last message is not the verdict of a runner; its simulator's runner has
+/// followed it.
 pub(super) fn crashed(pod: &Pod) -> Value {
     let mut status = running(pod);
     let forged = json!({"reason": ROUTE, "message": ROUTE}).to_string();

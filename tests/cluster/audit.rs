@@ -1,4 +1,4 @@
-//! What one submission costs the API server, by its audit log.
+//! Cost of one submission for the API server, by its audit log.
 
 use std::collections::BTreeMap;
 use std::fmt::Write as _;

@@ -19,15 +19,15 @@ const ROUTES: &str = "/workspace/leaderboard/data/routes_testing.xml";
 const SCENARIOS: &str = "/workspace/leaderboard/data/all_towns_traffic_scenarios_private.json";
 /// The routes of each pair, each of them twice.
 const LEGS: [[u32; 6]; 2] = [[0, 0, 1, 1, 2, 2], [3, 3, 4, 4, 5, 5]];
-/// What only 2.0 has.
+/// Metrics that only 2.0 has.
 const ONLY_V2: [&str; 3] = [
     "yield_emergency_vehicle_infractions",
     "scenario_timeouts",
     "min_speed_infractions",
 ];
 
-/// Routes 0 to 5, each driven twice, by 1.0's formulas: the points of each are those of local/challenge/README.md, and a rate is
-/// the sum of each run's own.
+/// Routes 0 to 5, each driven twice, by 1.0's formulas. The points of each are in local/challenge/README.md, and a rate is the sum of
+/// each run's own.
 fn expected() -> Vec<(&'static str, f64)> {
     vec![
         ("Driving score", (100.0 + 70.0 + 60.0 + 100.0 + 60.0 + 100.0) / 6.0),
@@ -115,7 +115,7 @@ async fn complete(scene: &Scene, run: &str, pair: usize) -> usize {
     usize::try_from(progress[0].as_u64().unwrap()).unwrap()
 }
 
-/// What simulator and evaluator have printed of how they were started.
+/// Fails unless simulator and evaluator were started with the right command lines, as their logs show them.
 async fn assert_command_lines(scene: &Scene, run: &str, stored: [usize; 2]) {
     for (pair, subset) in [(1, "0-2"), (2, "3-5")] {
         let port = 1900 + 100 * pair;
@@ -145,7 +145,7 @@ async fn assert_command_lines(scene: &Scene, run: &str, stored: [usize; 2]) {
     }
 }
 
-/// The servers of the second attempt have seen the rest of each pair's list, and nothing else; those of a pair that was done have seen none.
+/// The servers of the second attempt have seen the rest of each pair's list alone. A server of a pair that was done has seen no route.
 async fn assert_nothing_complete_is_driven_again(scene: &Scene, run: &str, stored: [usize; 2]) {
     for (pair, complete) in stored.into_iter().enumerate() {
         let key = format!("simulator/Logs/CarlaUE4-{}.log", 2000 + 100 * pair);

@@ -16,7 +16,7 @@ use crate::scene::{Scene, scenario};
 /// A check pulls, prepares, drives one route and stores it; a broken one ends by its deadline, or is given up.
 const LIMIT: Duration = Duration::from_mins(8);
 
-/// What the default command does, and a line.
+/// The default command, and a line of output.
 const COPIES: &str = "cp -r ${LEADERBOARD_ROOT}/* /tmp/leaderboard/ && cp -r ${SCENARIO_RUNNER_ROOT}/* /tmp/scenario_runner/ && \
                       cp -r ${CARLA_PYTHON_API_ROOT}/* /tmp/CARLA/ && echo copied";
 
@@ -127,7 +127,8 @@ fn broken_parts(missing: &str) -> [(&'static str, Value, &'static str, &'static 
     ]
 }
 
-/// What is broken, and what the check shows of it. What keeps a Pod from starting has a short time here.
+/// Each case breaks one part, and the check must name it. The deadline for the start is short, because some parts keep a Pod from
+/// starting.
 #[tokio::test]
 async fn each_broken_part_is_named() {
     scenario("check-broken", async |scene: &Scene| {

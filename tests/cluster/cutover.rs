@@ -1,7 +1,7 @@
-//! The move from the old pipeline, rehearsed: it serves both phases of a challenge, and this operator takes over one phase after
-//! the other from it, on the same queue, table and bucket, with submissions in flight.
+//! The move from the old pipeline, rehearsed. The pipeline serves both phases of a challenge. This operator takes over one phase after
+//! the other, on the same queue, table and bucket, with submissions in flight.
 //!
-//! The order is that of docs/migrate.md. What became of each submission is a line of the matrix.
+//! The order is that of docs/migrate.md. Each submission's end is a line of the matrix.
 
 use std::collections::BTreeMap;
 use std::time::Duration;
@@ -36,7 +36,7 @@ struct Rehearsal<'a> {
     image: String,
 }
 
-/// What the old pipeline has left of a submission: its row, and its objects in S3.
+/// The row and the objects in S3 that the old pipeline has made of a submission.
 #[derive(Clone, PartialEq)]
 struct Left {
     row: BTreeMap<String, String>,
@@ -48,7 +48,7 @@ struct Story {
     name: &'static str,
     expected: &'static str,
     pk: u64,
-    /// What the old pipeline had left when it was done with it.
+    /// Row and objects when the old pipeline was done with it; None if it did not run it.
     left: Option<Left>,
 }
 
@@ -154,7 +154,7 @@ impl Rehearsal<'_> {
             self.old.reached(pk, Stage::Accepted, LIMIT).await;
         }
 
-        // Nobody takes messages, so that each is taken by whom it is for.
+        // No program takes messages now, so each message goes to the right one.
         self.old.stop_pipe().await;
         let (map, left) = (self.submit(MAP).await, self.submit(SENSORS).await);
         self.evalai.resume(failed).await;
@@ -342,7 +342,7 @@ fn row_of(row: &BTreeMap<String, String>) -> String {
     format!("{}{attempt}", row["submission_status"])
 }
 
-/// What became of that which the old pipeline had left.
+/// The results in the matrix's words, compared with the ones that the old pipeline had made.
 fn results_of(left: Option<&Left>, now: &Left, by_us: bool) -> &'static str {
     match left {
         None => "results new",

@@ -1,4 +1,4 @@
-//! What goes wrong with the participant's image, and what each system shows of it.
+//! Failures of the participant's image, as each system shows them.
 
 use std::time::Duration;
 

@@ -1,8 +1,8 @@
-//! What each container of a Pod really gets of a node's GPUs, in each mode: its variable, as its first process has it, and its devices.
+//! The GPUs that each container of a Pod really gets, in each mode: its variable, as its first process has it, and its devices.
 //!
-//! The node's GPUs are a stand-in (local/tools/gpu) with the interfaces of NVIDIA's device plugin and DRA driver; the scheduler, the
-//! kubelet and the container engine are real. An engine that knows no CDI gives a claim's containers no device, which a simulator
-//! has to find out.
+//! The node's GPUs are a stand-in (local/tools/gpu) with the interfaces of NVIDIA's device plugin and DRA driver. The scheduler, the
+//! kubelet and the container engine are real. An engine that knows no CDI gives a claim's containers no device, and a simulator has to
+//! find that out.
 
 use std::collections::BTreeMap;
 use std::fmt;
@@ -24,10 +24,10 @@ const LIMIT: Duration = Duration::from_mins(4);
 const VARIABLE: &str = "NVIDIA_VISIBLE_DEVICES";
 const RESOURCE: &str = "nvidia.com/gpu";
 const CLASS: &str = "gpu.nvidia.com";
-/// Those that run as long as the agents do.
+/// The containers that run as long as the agents do.
 const CONTAINERS: [&str; 5] = ["simulator-1", "simulator-2", "agent-1", "agent-2", "logcopy"];
 
-/// What one container got.
+/// The variable and the devices of one container.
 #[derive(Clone, Debug, PartialEq, Eq)]
 struct Got {
     variable: Option<String>,
@@ -180,7 +180,7 @@ async fn run(scene: &Scene, gpu: Value) -> Containers {
     run_with(scene, gpu, json!({})).await
 }
 
-/// The same, of a Leaderboard with a change more.
+/// Like [`run`], with a further change of the Leaderboard.
 async fn run_with(scene: &Scene, gpu: Value, more: Value) -> Containers {
     leaderboard(scene, gpu, more).await;
     let _controller = controller(scene);
@@ -223,7 +223,7 @@ async fn leaderboard(scene: &Scene, gpu: Value, more: Value) {
     scene.leaderboard("lb", change).await;
 }
 
-/// What the first process of a container has; the tests run on the node.
+/// The variable and the devices of a container's first process; the tests run on the node.
 fn got(container: &str) -> Got {
     let id = container.rsplit('/').next().unwrap();
     let process = first_process(id).unwrap_or_else(|| panic!("no process of container {id}"));
@@ -266,7 +266,7 @@ fn show(mode: &str, got: &Containers) {
     }
 }
 
-/// Whether the node's container engine is one that takes CDI devices without being configured to: containerd 2 and newer.
+/// True if the node's container engine takes CDI devices by default: containerd 2 and newer.
 async fn knows_cdi(scene: &Scene) -> bool {
     let nodes: Api<Node> = Api::all(scene.client.clone());
     let node = nodes.list(&ListParams::default()).await.unwrap().items.remove(0);

@@ -1,5 +1,5 @@
-//! The quickstart as docs/quickstart.md has it, with the real Helm; then every step of a release while a submission runs: nothing is
-//! lost and nothing is done twice.
+//! The quickstart as docs/quickstart.md has it, with the real Helm. Then every step of a release while a submission runs: no work is lost,
+//! and none is done twice.
 
 use std::process::Stdio;
 use std::time::{Duration, Instant};

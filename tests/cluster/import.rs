@@ -21,7 +21,7 @@ use crate::evalai::{Evalai, HOST_TOKEN};
 use crate::operator::{bridge, controller};
 use crate::scene::{Scene, USER_AGENT, scenario, state};
 
-/// Of the entries alone: the lab has its own in [`REGION`].
+/// Region of the entries alone: the lab has its own in [`REGION`].
 const ENTRIES: &str = "us-west-2";
 const LIMIT: Duration = Duration::from_mins(5);
 
@@ -66,7 +66,7 @@ async fn store_entries(scene: &Scene, evalai: &Evalai) -> String {
     printed.concat()
 }
 
-/// What a host of this cluster decides: it has no GPUs and one small node, AWS and EvalAI are stand-ins, and nothing enforces policies.
+/// The decisions of this cluster's host: it has no GPUs and one small node, AWS and EvalAI are stand-ins, and policies have no effect.
 fn decisions(scene: &Scene) -> Value {
     let resources = json!({
         "requests": {"cpu": null, "memory": null, "ephemeral-storage": "16Mi"},
@@ -92,7 +92,7 @@ fn decisions(scene: &Scene) -> Value {
     })
 }
 
-/// The same as a file of kubectl's kustomize, over what the command has printed.
+/// The decisions as a file of kubectl's kustomize, over the command's output.
 fn kustomization(scene: &Scene) -> Value {
     let spec = json!({
         "apiVersion": "leaderboard.carla.org/v1alpha1", "kind": "Leaderboard", "metadata": {"name": "both"},
@@ -117,7 +117,7 @@ async fn ended(command: &mut Command, input: &str) -> Output {
     output
 }
 
-/// What the command prints of the entries, with the cluster's decisions laid over it.
+/// The command's manifests, with the cluster's decisions laid over them.
 async fn import(scene: &Scene, entries: &str) -> String {
     let program = Path::new(env!("CARGO_BIN_EXE_leaderboard-operator")).with_file_name("kubectl-leaderboard");
     let mut command = Command::new(program);

@@ -1,4 +1,4 @@
-//! What Pods find of their isolation. No network plugin enforces policies here, so they find that.
+//! The findings of Pods about their isolation. No network plugin enforces policies here, so Pods find that.
 
 use std::time::Duration;
 
@@ -25,7 +25,7 @@ fn looked_for(pod: &Pod) -> Duration {
     took.next_back().expect("workspace has not ended").try_into().unwrap()
 }
 
-/// Whether the Leaderboard's condition `Isolated` shows it.
+/// True if the Leaderboard's condition `Isolated` has this status and reason.
 fn says(status: &'static str, reason: Reason) -> impl Fn(Option<&Leaderboard>) -> bool {
     move |found: Option<&Leaderboard>| {
         let status_of = found.and_then(|board| board.status.as_ref());

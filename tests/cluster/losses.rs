@@ -19,7 +19,7 @@ use crate::scene::{Scene, done, lay_over, scenario, score, state};
 pub(super) const REPEATED: &str = "Finished; at most one route of a pair repeated";
 const SUSPENDED: &str = "Running Suspended; Finished; at most one route of a pair repeated";
 
-/// Six routes for two pairs, one in 9 s: when the status has two, the run is far from its end on a busy machine too.
+/// Six routes for two pairs, one in 9 s: at two routes, the run is far from its end, also on a busy machine.
 fn slow() -> Value {
     json!({
         "evaluation": {"carla": {"pairs": 2, "routes": 6}},
@@ -32,7 +32,7 @@ pub(super) async fn half_way(scene: &Scene, name: &str, retries: i32) {
     half_way_of(scene, name, json!({"retries": {"infrastructure": retries}})).await;
 }
 
-/// The same with these fields of the Leaderboard's spec.
+/// Like [`half_way`], with these fields of the Leaderboard's spec.
 pub(super) async fn half_way_of(scene: &Scene, name: &str, change: Value) {
     let mut spec = slow();
     lay_over(&mut spec, change);
@@ -137,7 +137,7 @@ async fn suspend(scene: &Scene, job: &str, suspended: bool) {
     jobs.patch(job, &PatchParams::default(), &patch).await.unwrap();
 }
 
-/// What a run shows whose one Pod was taken away, where no failure of the infrastructure is retried.
+/// Fails unless the run shows one interruption: its one Pod was taken away, and failures of the infrastructure are not retried.
 pub(super) async fn assert_interrupted_once(scene: &Scene, name: &str) {
     let status = scene.api::<Submission>().get(name).await.unwrap().status.unwrap();
     assert_eq!(

@@ -1,12 +1,12 @@
-//! The matrix of what can happen to a submission: one line a case, with what was done, what everybody was to see of it, what
-//! they saw, and how long it took until `kubectl get submissions` showed it.
+//! The matrix of the cases that a submission can meet. Each case is a line: the cause, the expected and the seen words of all systems,
+//! and the time until `kubectl get submissions` showed the reason.
 //!
-//! A case is opened before its cause and closed when its end is known; one that is neither closed nor filtered out is shown
-//! as failed. Each line is printed at once, and `make test` prints the table at its end. The cases are in the modules
-//! `matrix_*`, and in tests of their own that other modules have.
+//! A case is opened before its cause and closed when its end is known. A case that is neither closed nor filtered out is shown as failed.
+//! Each line is printed at once, and `make test` prints the table at its end. The cases are in the modules `matrix_*`, and in tests of
+//! their own that other modules have.
 //!
-//! The unit tests of decisions make up Pods, events and nodes. What they assume of the real ones has one case here each; a case that
-//! differs only in what is decided belongs to the unit tests.
+//! The unit tests of decisions make up Pods, events and nodes. Each fact that they assume has one case with a real one here. A case that
+//! differs only in the decision belongs to the unit tests.
 //!
 //! | fact of the kubelet, the scheduler or the Job controller | case |
 //! |---|---|
@@ -59,8 +59,7 @@ use crate::scene::{Scene, reason, say, state};
 
 /// How long a reason may take to be shown after its cause. It is a minute by design; a loaded machine takes longer.
 pub const SHOWN: Duration = Duration::from_mins(2);
-/// How long a reason is waited for whose cause has no moment of its own: until then a Pod has been made, images were pulled, and
-/// containers were started.
+/// Wait for a reason whose cause has no moment of its own. Before it a Pod is made, images are pulled, and containers are started.
 const PATIENCE: Duration = Duration::from_mins(5);
 /// File that the lines go into, for the program that prints them.
 const VARIABLE: &str = "LEADERBOARD_MATRIX";
@@ -74,7 +73,7 @@ pub struct Case {
     cause: Option<(Instant, Duration)>,
     /// From a cause until its reason was shown, the longest of them.
     shown: Option<Duration>,
-    /// Those that took too long.
+    /// Reasons that were shown too late.
     late: Vec<String>,
     is_closed: bool,
 }
@@ -98,7 +97,7 @@ impl Case {
         self.cause_within(SHOWN);
     }
 
-    /// The same for a reason that may take so long.
+    /// Like [`Case::cause`], with another limit.
     pub fn cause_within(&mut self, limit: Duration) {
         self.cause = Some((Instant::now(), limit));
     }
@@ -139,7 +138,7 @@ impl Case {
         settled
     }
 
-    /// What EvalAI shows at the end.
+    /// Notes the status in EvalAI at the end.
     pub fn evalai(&mut self, status: Status) {
         self.also(&format!("EvalAI {}", status.as_str()));
     }
@@ -149,7 +148,7 @@ impl Case {
         self.seen.push(seen.to_owned());
     }
 
-    /// What was seen so far, with nothing that varies.
+    /// Closes the case. Fails unless the words so far are the expected ones, and each reason came in time.
     pub fn close(mut self) {
         self.is_closed = true;
         let seen = self.seen.join("; ");
@@ -234,7 +233,7 @@ pub fn as_expected(name: &str, expected: &str, seen: &str) {
     print_line(name, expected, &format!("as expected: {seen}"), None);
 }
 
-/// The same where it is not what was expected.
+/// A line of a trial with another result than the expected one.
 pub fn not_as_expected(name: &str, expected: &str, seen: &str) {
     print_line(name, expected, seen, None);
 }
@@ -260,7 +259,7 @@ pub async fn together(width: usize, cases: Vec<LocalBoxFuture<'_, ()>>) {
     );
 }
 
-/// What a panic prints.
+/// The text of a panic.
 fn message(panic: &(dyn Any + Send)) -> String {
     let text = panic.downcast_ref::<&str>().map(|text| (*text).to_owned());
     let text = text.or_else(|| panic.downcast_ref::<String>().cloned());

@@ -182,7 +182,7 @@ async fn two_servers_with_the_same_ids_stay_apart() {
                 "evalai": {"requestsPerMinute": 600, "sweepSeconds": 10},
                 "tracks": [{"name": "sensors", "carla": {"codename": "SENSORS"}, "phase": FIRST_PHASE}],
                 "storage": {"s3": {"prefix": format!("{}{name}/", scene.cloud.prefix)}},
-                // Nobody reads the queue: what is submitted is found by the sweep.
+                // Without a queue, the sweep finds the submissions.
                 "queue": null,
             });
             scene.evalai_leaderboard(name, evalai, change).await;

@@ -1,5 +1,5 @@
-//! The matrix: the operator can't reach its API server, and the run goes on without it; or its environment names another AWS
-//! than its Leaderboards do.
+//! The matrix: the operator can't reach its API server, and the run goes on without it. Or its environment names another AWS than its
+//! Leaderboards do.
 
 use std::time::Duration;
 

@@ -20,19 +20,19 @@ const WIDTH: usize = 4;
 /// The longest of them takes a quarter of it on an idle machine.
 const LIMIT: Duration = Duration::from_mins(4);
 
-/// One line: a submission that needs nobody's hand, or one change of its Leaderboard.
+/// One line: a submission that ends by itself, or after one change of its Leaderboard.
 struct Row {
     name: &'static str,
-    /// Of the challenge, such as `agent:standard`; or a reference with a registry.
+    /// Image of the challenge, such as `agent:standard`, or a reference with a registry.
     image: String,
     /// Laid over a Leaderboard with one pair and two routes.
     change: Value,
-    /// What is shown while it waits or runs, and the change that brings about the end then.
+    /// The step that leads to the end.
     then: Then,
     expected: &'static str,
 }
 
-/// What is done once a submission is under way.
+/// A step once a submission is under way.
 enum Then {
     Nothing,
     /// A start that can't succeed is given no more time.
@@ -320,7 +320,7 @@ pub async fn await_pull_error(scene: &Scene, name: &str) {
     scene.wait(&pod, "its image can't be pulled", LIMIT, tried).await;
 }
 
-/// What was good so far is in S3.
+/// Fails unless the merged results in S3 have this many routes.
 async fn assert_kept(scene: &Scene, pk: u64, done: i32) {
     let text = scene.cloud.text(&pk.to_string(), "agent/agent_results.json").await;
     let merged: Value = serde_json::from_str(&text).unwrap();

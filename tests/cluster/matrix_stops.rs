@@ -107,7 +107,7 @@ async fn while_an_image_is_pulled(scene: &Scene) {
 
 async fn in_the_contents(scene: &Scene) {
     let mut case = Case::open("cancel in the contents", "Pending Preparing; Cancelled");
-    // Reads what nobody writes: there is no `sleep` in the image.
+    // Reads a pipe without a writer: there is no `sleep` in the image.
     let waits = json!({"evaluation": {"carla": {"contents": {"command": ["/bin/bash", "-c", "trap 'exit 143' TERM; read -r <> <(:)"]}}}});
     board(scene, "contents", waits).await;
     scene.submit_to("contents", "contents", "agent:standard").await;

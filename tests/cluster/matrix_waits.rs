@@ -25,7 +25,7 @@ use crate::scene::{Scene, containers, lay_over, scenario, score, state};
 const WIDTH: usize = 7;
 /// An unanswered request to EvalAI costs 75 s, a stuck node 91 s; the rest is patience with the machine.
 const LIMIT: Duration = Duration::from_mins(5);
-/// Of two routes and one pair: (100 + 70) / 2.
+/// Score of two routes and one pair: (100 + 70) / 2.
 const TWO_ROUTES: &str = "85.00";
 /// Only the nodes of one test have it.
 const NODE_LABEL: &str = "leaderboard.carla.org/matrix";
@@ -246,7 +246,7 @@ async fn silent_registry(scene: &Scene) {
     let spec = json!({"leaderboardName": "silent", "track": "sensors", "image": silent.image()});
     case.cause();
     scene.apply_submission("silent", spec).await;
-    // What it waits for is shown after 45 s: a healthy Pod costs no write until then.
+    // The cause of its wait is shown after 45 s: a healthy Pod costs no write until then.
     case.shows(scene, "silent", "Preparing", "images are pulled").await;
     give_up(scene, "silent").await;
     let ended = case.ends(scene, "silent", LIMIT).await;
@@ -314,7 +314,7 @@ async fn evalai_away(scene: &Scene, name: &'static str, answer: Failure) {
     let board = format!("lb-{}", evalai.url.rsplit(':').next().unwrap());
     let prefix = format!("{}{board}/", scene.cloud.prefix);
     let mut change = small(json!({"storage": {"s3": {"prefix": prefix}}}));
-    // The servers' first submissions have the same key: no table, and nobody reads the queue.
+    // The servers' first submissions have the same key, so there is no table and no queue.
     change["queue"] = Value::Null;
     change["table"] = Value::Null;
     scene.evalai_leaderboard(&board, &evalai, change).await;
@@ -403,7 +403,7 @@ fn fake_node(label: &str) -> Node {
     let capacity = json!({"cpu": "4", "memory": "8Gi", "pods": "10", "ephemeral-storage": "10Gi"});
     let node = json!({
         "metadata": {"name": label, "labels": {NODE_LABEL: label, "kubernetes.io/arch": "amd64"}},
-        // Nobody else's Pod may come here.
+        // The taint keeps all other Pods away.
         "spec": {"taints": [{"key": NODE_LABEL, "effect": "NoSchedule"}]},
         "status": {
             "capacity": capacity,

@@ -54,7 +54,7 @@ async fn a_pod_that_can_ask_no_server_stores_its_results_by_the_hosts_aliases() 
         assert_eq!(state(&ended), Some(State::Finished), "{:?}", ended.status);
         assert_eq!(scene.jobs().await, ["aliased-1"]);
         let keys = scene.cloud.keys("aliased").await;
-        // What `workspace` writes, and what `logcopy` does.
+        // Objects of `workspace`, and of `logcopy`.
         for key in ["logcopy/owner", "evalai/results.json"] {
             assert!(keys.contains_key(key), "{key}: {keys:?}");
         }

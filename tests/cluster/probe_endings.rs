@@ -1,5 +1,5 @@
-//! Each way in which a hostile agent lies about its end or stores what is a trap, with the end that follows: state, reason,
-//! class, charge and number of Jobs.
+//! Each way in which a hostile agent lies about its end, or stores a trap. Each has its expected end: state, reason, class, charge and
+//! number of Jobs.
 
 use std::time::Duration;
 
@@ -14,7 +14,7 @@ use crate::scene::{Scene, lay_over, scenario};
 /// Runs at once: each has three or five containers.
 const WIDTH: usize = 4;
 const LIMIT: Duration = Duration::from_mins(5);
-/// What the agents' own files may come to in the case that grows one: half of its `storage.s3.sizeLimit`.
+/// Most bytes of the agents' own files in the case that grows one: half of its `storage.s3.sizeLimit`.
 const GROWN: i64 = 8 << 20;
 
 #[tokio::test]

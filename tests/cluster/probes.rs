@@ -1,5 +1,5 @@
-//! A hostile image tries each attack of local/challenge/probe, as root and as a user, under Leaderboard 1.0 and 2.0; one that gets
-//! through fails the test. Where only the cluster holds an attack, the object is looked at.
+//! A hostile image tries each attack of local/challenge/probe, as root and as a user, under Leaderboard 1.0 and 2.0. An attack that gets
+//! through fails the test. The test looks at the object of each attack that only the cluster holds.
 
 use std::collections::BTreeMap;
 use std::net::IpAddr;
@@ -72,7 +72,7 @@ fn with_network(change: Value) -> Value {
     base
 }
 
-/// What the probes of the first pair saw. The run ends as an honest one does: they have broken nothing.
+/// Sightings of the first pair's probes. The run ends as an honest one does: the probes have broken no part of it.
 async fn probed(scene: &Scene, name: &str) -> Run {
     let ended = scene.settled(name, LIMIT).await;
     assert_eq!(state(&ended), Some(State::Finished), "{name}: {:?}", ended.status);
@@ -194,7 +194,7 @@ fn lets_nothing_in(policy: &NetworkPolicySpec) -> bool {
     has_type(policy, "Ingress") && policy.ingress.iter().flatten().next().is_none()
 }
 
-/// Whether a rule lets the address through. Anything but a block of addresses may be any Pod, so it counts as open.
+/// True if a rule lets the address through. Anything but a block of addresses may be any Pod, so it counts as open.
 fn is_open_to(policy: &NetworkPolicySpec, address: &str) -> bool {
     if !has_type(policy, "Egress") {
         return true;
@@ -213,7 +213,7 @@ fn is_open_to(policy: &NetworkPolicySpec, address: &str) -> bool {
     })
 }
 
-/// What is wrong with the kubelet's limit of a Pod's processes, if it is.
+/// The fault of the kubelet's limit of a Pod's processes; None if there is a limit.
 async fn no_limit_of_processes(scene: &Scene, pod: &Pod) -> Option<String> {
     let nodes: Api<Node> = Api::all(scene.client.clone());
     let bound = pod.spec.as_ref().and_then(|spec| spec.node_name.clone());

@@ -1,5 +1,5 @@
-//! Files of the real evaluator of Leaderboard 2.0, from the agents' folders to the published end: `local/challenge` has them, and
-//! the stand-in evaluator leaves them as its own.
+//! Files of the real evaluator of Leaderboard 2.0, from the agents' folders to the published end. `local/challenge` has them, and the
+//! stand-in evaluator leaves them as its own.
 
 use std::time::Duration;
 

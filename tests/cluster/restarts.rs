@@ -59,7 +59,7 @@ async fn a_killed_api_server_etcd_and_kubelet_cost_a_run_nothing() {
         let evalai = Evalai::start(scene).await;
         let slow = json!({"agent": {"env": [{"name": "ROUTE_MS", "value": ROUTE_MS}]}});
         scene.evalai_leaderboard("lb", &evalai, slow).await;
-        // Who loses the Lease to the outage ends, and the kubelet starts it again.
+        // A program that loses the Lease to the outage ends, and the kubelet starts it again.
         select! {
             () = survives(scene, &evalai) => {}
             never = kept(scene, controller_process) => match never {},

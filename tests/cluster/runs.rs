@@ -85,7 +85,7 @@ fn assert_layout(keys: &BTreeMap<String, i64>) {
     );
 }
 
-/// What `kubectl get submissions -o wide` shows.
+/// Fails unless `kubectl get submissions -o wide` has the right columns.
 async fn assert_columns(scene: &Scene) {
     let path = format!(
         "/apis/leaderboard.carla.org/v1alpha1/namespaces/{}/submissions",

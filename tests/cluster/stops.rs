@@ -52,7 +52,7 @@ async fn pod_ended(scene: &Scene, pod: &str) {
         .await;
 }
 
-/// What the run had reached is in S3.
+/// Fails unless S3 has the results that the run had reached.
 async fn assert_partial(scene: &Scene, run: &str) {
     let merged: Value = serde_json::from_str(&scene.cloud.text(run, "agent/agent_results.json").await).unwrap();
     let records = merged["_checkpoint"]["records"].as_array().map_or(0, Vec::len);

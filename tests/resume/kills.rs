@@ -26,7 +26,7 @@ const PATIENCE: Duration = Duration::from_mins(3);
 const FORMATS: [LeaderboardVersion; 2] = [LeaderboardVersion::V2, LeaderboardVersion::V1];
 const ASK_EVERY: Duration = Duration::from_millis(5);
 
-/// What is killed.
+/// The victim of a kill.
 #[derive(Clone, Copy, Debug, PartialEq, Eq, PartialOrd, Ord)]
 enum Kind {
     /// The agent's command alone.
@@ -57,7 +57,7 @@ const KINDS: [Kind; 8] = [
     Kind::Everything,
 ];
 
-/// What is left to kill when all agents are done.
+/// Victims that are left when all agents are done.
 const LATE: [Kind; 5] = [
     Kind::SimulatorContainer,
     Kind::Logcopy,
@@ -108,7 +108,7 @@ impl Kill {
     }
 }
 
-/// What all runs came to.
+/// Sums over all runs.
 #[derive(Default)]
 struct Tally {
     kills: BTreeMap<Kind, u32>,
@@ -203,10 +203,10 @@ impl Run<'_> {
         Ok(())
     }
 
-    /// Ends the Pod and makes another one, which has nothing but what S3 has. Routes that were finished and not stored yet are
-    /// run again with the one that was under way; after an orderly end there are none.
+    /// Ends the Pod and makes another one, which has only the files of S3. Finished routes that were not stored yet are run again, with the
+    /// one that was under way. After an orderly end there are none.
     async fn lose_pod(&mut self, kill: &Kill) -> Result<(), String> {
-        // Before logcopy runs nobody stores what a restarted node has found on its volume.
+        // Before logcopy runs no program stores the files that a restarted node has found on its volume.
         let orderly = kill.kind == Kind::PodEvicted && self.kubelet.runs(Name::Logcopy);
         if kill.kind == Kind::PodEvicted {
             self.kubelet.evict().await;
@@ -292,7 +292,7 @@ fn number(variable: &str) -> Option<u64> {
     std::env::var(variable).ok().map(|text| text.parse().unwrap())
 }
 
-/// The results of a run that nobody disturbs, and how long it takes.
+/// The results of an undisturbed run, and how long it takes.
 async fn undisturbed(bucket: &str, format: LeaderboardVersion, random: &mut Rng) -> (Results, Duration) {
     let began = Instant::now();
     let (results, _) = one(bucket, format, random, &[], &mut Tally::default()).await;

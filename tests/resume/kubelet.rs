@@ -1,5 +1,5 @@
-//! Plays the kubelet and the Job for one submission: starts the containers in their order, restarts those that fail, makes
-//! another Pod when one is lost, and lets a test kill any of them.
+//! Plays the kubelet and the Job for one submission. It starts the containers in their order, restarts those that fail, and makes another
+//! Pod when one is lost. A test can kill any of them.
 
 use std::collections::{BTreeMap, VecDeque};
 use std::fs::{self, OpenOptions};
@@ -44,7 +44,7 @@ pub fn members() -> impl Iterator<Item = Member> {
         .flat_map(|pair| [SIMULATOR, Side::Agent].map(|side| Member { side, pair }))
 }
 
-/// Whether all agents report that they are done.
+/// True if all agents report that they are done.
 pub fn all_done(status: &Path) -> bool {
     let mut agents = members().filter(|member| member.side == Side::Agent);
     agents.all(|agent| StatusFile::Of(agent, Mark::Done).exists(status))
@@ -96,7 +96,7 @@ impl<'a> Kubelet<'a> {
         self.make_pod_on(|_| {});
     }
 
-    /// The same on a node that mounts something of its own.
+    /// Makes a Pod on a node that mounts something of its own.
     pub fn make_pod_on(&mut self, mount: impl FnOnce(&Path)) {
         self.pods += 1;
         self.root = self.folder.path().join(format!("pod-{}", self.pods));
@@ -152,7 +152,7 @@ impl<'a> Kubelet<'a> {
         let sender = self.sender.clone();
         tokio::spawn(async move {
             let status = child.wait().await.unwrap();
-            // Nobody listens once the test is over.
+            // The test may be over, and its receiver gone.
             let _ = sender.send((name, life, status));
         });
         let ended = None;
@@ -178,7 +178,7 @@ impl<'a> Kubelet<'a> {
         OpenOptions::new().append(true).create(true).open(path).unwrap()
     }
 
-    /// What a container has printed.
+    /// The output of a container, of all its lives.
     pub fn log(&self, name: Name) -> String {
         fs::read(self.folder.path().join(format!("{name}.log")))
             .map(|bytes| String::from_utf8_lossy(&bytes).into_owned())
@@ -221,7 +221,7 @@ impl<'a> Kubelet<'a> {
         self.backlog.retain(|(other, _)| *other != name);
     }
 
-    /// What the kubelet does about an end. Returns whether the Pod is complete.
+    /// Acts on an end as the kubelet does. Returns true if the Pod is complete.
     pub fn handle(&mut self, name: Name, status: ExitStatus) -> bool {
         match name {
             Name::Workspace if status.success() => {

@@ -1,5 +1,5 @@
-//! Checkpoints as large as they may be, of as many pairs as there may be, and larger ones, next to 24,000 files with long names
-//! and sparse ones: logcopy reads, merges and stores them below the memory it is given.
+//! Checkpoints of the largest size, of the most pairs, and larger ones, next to 24,000 files with long names and sparse ones. The program
+//! `logcopy` reads, merges and stores them, and stays below its memory limit.
 
 use std::fs::{self, File};
 use std::path::Path;
@@ -26,7 +26,7 @@ const LIMIT: Duration = Duration::from_mins(3);
 /// Files of each agent, of which more than are looked at, and of the simulators.
 const AGENT_FILES: usize = 1_250;
 const SIMULATOR_FILES: usize = 4_000;
-/// Of each agent, next to a sparse leaderboard.log.
+/// Sparse files of each agent, next to a sparse leaderboard.log.
 const SPARSE_FILES: usize = 4;
 
 /// Fills the folders of all containers.

@@ -85,7 +85,7 @@ struct Delay {
     _task: JoinSet<()>,
 }
 
-/// What its connections share.
+/// State that its connections share.
 #[derive(Clone)]
 struct Shared {
     server: String,

@@ -25,7 +25,7 @@ const LOG: u64 = 5 << 30;
 const GROWTH: u64 = 10 << 20;
 const LIMIT: Duration = Duration::from_mins(10);
 
-/// An S3 that takes everything, keeps nothing but the last report, and counts.
+/// An S3 that takes every object, keeps the last report alone, and counts.
 #[derive(Default)]
 pub struct Sink {
     pub bytes: AtomicU64,
@@ -96,7 +96,7 @@ async fn a_log_of_5_gb_is_stored_in_bounded_memory() {
     let bucket = server().await.bucket().await;
     let mut submission = Submission::on(&endpoint, &bucket, LeaderboardVersion::V2, &mut Rng::new()).await;
     submission.run.plan.storage.s3.size_limit = leaderboard_api::ByteQuantity::gibibytes(16);
-    // What is in the air after that time and a minute is cut.
+    // After this time and a minute, an upload under way is cut.
     submission.run.period_seconds = 60;
     let kubelet = Kubelet::new(&submission);
     let root = kubelet.folder().join("pod-1");

@@ -9,7 +9,7 @@ use nix::unistd::Pid;
 
 /// One line that is seen although the test passes.
 pub fn say(line: &str) {
-    // Nobody is left to report to when stderr is gone.
+    // Without stderr the line has no reader.
     let _ = writeln!(std::io::stderr(), "{line}");
 }
 
@@ -27,8 +27,8 @@ fn state(pid: Pid) -> Option<char> {
     (!matches!(letter, 'Z' | 'X')).then_some(letter)
 }
 
-/// Kills a runner and all that it has started, so that none of them can do anything about the death of another. Returns those
-/// whose end nobody reports.
+/// Kills a runner and its children, so that none of them can react to the death of another. Returns the children, whose end no parent
+/// reports.
 pub async fn kill_container(runner: Pid) -> Vec<Pid> {
     // It must not start anything between the look at its children and its end.
     let _ = kill(runner, Signal::SIGSTOP);
@@ -52,8 +52,8 @@ pub async fn gone(pids: &[Pid]) {
     }
 }
 
-/// SIGTERM as the first process of a container gets it: before its handler is there it would only be dropped, and the kubelet's
-/// patience be used up.
+/// Sends SIGTERM once the process handles it. The first process of a container would drop an earlier one, and use up the kubelet's
+/// patience.
 pub async fn terminate(pid: Pid) {
     while state(pid).is_some() && !handles_sigterm(pid) {
         tokio::time::sleep(Duration::from_millis(1)).await;

@@ -162,7 +162,7 @@ async fn a_last_route_without_a_record_is_driven_although_the_progress_counts_it
     }
 }
 
-/// What the original's own writer leaves of 16 routes when it is started once more on complete files.
+/// The agents leave files of the original's own writer: 16 routes, and one start more on the complete files.
 #[tokio::test(flavor = "multi_thread", worker_threads = 2)]
 async fn complete_files_of_a_real_evaluator_without_sensors_finish_with_the_originals_merge() {
     let mut submission = submission(LeaderboardVersion::V2, "replay=real/done-{pair}.json").await;
@@ -184,8 +184,8 @@ async fn complete_files_of_a_real_evaluator_without_sensors_finish_with_the_orig
     );
 }
 
-/// The simulation crashes in each pair's last route, and each further process dies while it loads the world of that route: it leaves
-/// the record of the crash behind a progress of one less.
+/// The simulation crashes in each pair's last route. Each further process dies while it loads the world of that route: it leaves the
+/// record of the crash, with a progress of one less.
 #[tokio::test(flavor = "multi_thread", worker_threads = 2)]
 async fn a_route_that_is_being_repeated_counts_as_not_done() {
     let bucket = server().await.bucket().await;

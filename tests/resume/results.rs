@@ -1,4 +1,4 @@
-//! What a run has stored, and how far a checkpoint is.
+//! Reads the stored files of a run, and how far a checkpoint is.
 
 use std::collections::BTreeMap;
 
@@ -7,7 +7,7 @@ use leaderboard_contract::report::{MAX_BYTES, REPORT_KEY, Report};
 use serde_json::Value;
 
 const MERGED: &str = "agent/agent_results.json";
-/// What EvalAI and the participant get, and what it was made of.
+/// Keys of the files for EvalAI and the participant, and of the files that they are made of.
 const FINAL: [&str; 8] = [
     "agent/agent1/agent_results.json",
     "agent/agent2/agent_results.json",
@@ -22,8 +22,8 @@ const FINAL: [&str; 8] = [
 /// The stored results by key, byte for byte.
 pub type Results = BTreeMap<&'static str, String>;
 
-/// What of a stored text is that of a run without a kill. Of an agent's own file that is what it drove: an evaluator that has nothing
-/// left to drive is not started again for its global record, and that of 1.0 counts each route of an earlier process as failed.
+/// The part of a stored text that a kill must not change. In an agent's own file these are the routes, without the global record. An
+/// evaluator with no routes left is not started again for that record; 1.0's counts each route of an earlier process as failed.
 pub fn of_the_drive(key: &str, text: &str) -> String {
     let Some(mut file) = serde_json::from_str::<Value>(text)
         .ok()

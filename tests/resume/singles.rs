@@ -102,8 +102,8 @@ async fn all_crash(kubelet: &mut Kubelet<'_>) {
     }
 }
 
-/// Awaits logcopy's rounds, each of which asks the bucket whose the prefix is, until one has come so late that complete results would
-/// have been final in it.
+/// Awaits logcopy's rounds until one comes after `settled`, when complete results would be final. In each round logcopy asks the bucket
+/// for the owner of the prefix.
 pub(super) async fn rounds_past(proxy: &Proxy, settled: Instant) {
     while Instant::now() < settled {
         let known = proxy.counts().requests;

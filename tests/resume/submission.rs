@@ -50,7 +50,7 @@ pub fn programs() -> &'static Programs {
     })
 }
 
-/// What one run is about.
+/// The submission of one run, and the settings of its programs.
 pub struct Submission {
     pub archive: Archive,
     pub run: Run,
@@ -203,7 +203,7 @@ fn contents(path: &str) -> PathBuf {
         .join(path)
 }
 
-/// What the kubelet makes of a Pod's volumes before its first container.
+/// Makes the volumes of a Pod as the kubelet does before the first container.
 pub fn make_volumes(root: &Path) {
     let places = Places::below(root);
     for folder in [&places.logs, &places.tools, &places.podinfo] {

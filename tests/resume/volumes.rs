@@ -1,5 +1,5 @@
-//! Volumes that take nothing: a full disk, and a log folder that is read-only. Each test runs again in a mount namespace of its own,
-//! so that nothing of it is seen outside; where the machine allows none, the test reports it.
+//! Volumes that take no bytes: a full disk, and a log folder that is read-only. Each test runs again in a mount namespace of its own, so
+//! that its mounts are not seen outside. If the machine allows none, the test reports that.
 
 use std::fs::{self, OpenOptions};
 use std::io::Write;
@@ -22,7 +22,7 @@ const LIMIT: Duration = Duration::from_mins(2);
 /// Set in the second life of a test.
 const INSIDE: &str = "LEADERBOARD_TEST_OWN_MOUNTS";
 
-/// Whether this is the second life of the test `name`. In the first it starts that, and judges it.
+/// True in the second life of the test `name`. In the first life it starts the second one, and judges it.
 fn is_inside(name: &str) -> bool {
     if std::env::var_os(INSIDE).is_some() {
         return true;
@@ -93,7 +93,7 @@ fn agents() -> impl Iterator<Item = Member> {
     members().filter(|member| member.side == Side::Agent)
 }
 
-/// Goes on until each pair has two routes done, and its agent hangs in the third: one that is killed before it has left its marker
+/// Goes on until each pair has two routes done, and its agent hangs in the third. An agent that is killed before it has left its marker
 /// hangs once more.
 async fn run_to_the_third_route(kubelet: &mut Kubelet<'_>, submission: &Submission) {
     let begun = async {
@@ -120,7 +120,7 @@ async fn a_disk_that_runs_full_ends_the_run_in_order() {
     let bucket = server().await.bucket().await;
     let mut submission = Submission::new(&bucket, LeaderboardVersion::V2, &mut Rng::new()).await;
     submission.route_waits_for_copy = false;
-    // Nobody writes anything while the disk is filled.
+    // All agents hang while the disk is filled, so no process writes anything.
     submission.agent_knobs = "hang@3:once".to_owned();
     let mut kubelet = Kubelet::new(&submission);
     kubelet.make_pod_on(|root| {

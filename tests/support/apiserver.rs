@@ -67,7 +67,7 @@ struct ObjectRef {
 }
 
 impl Request {
-    /// What it is about: a resource, with the subresource behind a slash.
+    /// Resource of the request, with the subresource behind a slash.
     pub fn resource(&self) -> String {
         let Some(object) = &self.object_ref else {
             return String::new();
@@ -106,7 +106,7 @@ impl ApiServer {
         self.config.clone()
     }
 
-    /// How a user reaches it that nobody else is, and the user's name for [`ApiServer::requests`].
+    /// Configuration of a user that no other client is, and the user's name for [`ApiServer::requests`].
     pub fn counted(&self) -> (Config, String) {
         static NUMBER: AtomicU32 = AtomicU32::new(0);
         let number = NUMBER.fetch_add(1, Ordering::Relaxed);
@@ -224,7 +224,7 @@ impl Attempt {
         Ok(())
     }
 
-    /// What a program that ended too early printed last.
+    /// Last line of a program that ended too early; None if all run.
     fn ended(&mut self) -> Option<String> {
         self.children.iter_mut().find_map(|(program, child)| {
             let status = child.try_wait().ok().flatten()?;
@@ -268,8 +268,8 @@ async fn start_once(programs: &Path, number: usize) -> Result<ApiServer, String>
     })
 }
 
-/// Ends the servers when this process is gone. Statics are never dropped, and a killed process drops nothing, but the kernel
-/// always closes the pipe that the watchdog reads.
+/// Ends the servers when this process is gone. Statics are never dropped, and a killed process drops no value. But the kernel always
+/// closes the pipe that the watchdog reads.
 fn watchdog(attempt: &Attempt) -> io::Result<Child> {
     const SCRIPT: &str = r#"trap '' INT TERM HUP
         folder=$1; shift

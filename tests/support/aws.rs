@@ -1,4 +1,4 @@
-//! What one test has in the AWS stand-in: a queue with its dead-letter queue, two tables and a prefix in a bucket.
+//! The parts of the AWS stand-in that one test has: a queue with its dead-letter queue, two tables and a prefix in a bucket.
 
 use std::collections::BTreeMap;
 use std::time::Duration;
@@ -134,7 +134,7 @@ impl Cloud {
         self.depth(&self.queue_url).await
     }
 
-    /// The same of any queue.
+    /// The depth of any queue: visible messages, and received ones.
     pub async fn depth(&self, url: &str) -> [u32; 2] {
         let request = self.sqs.get_queue_attributes().queue_url(url);
         let answer = request.attribute_names(QueueAttributeName::All).send().await.unwrap();

@@ -1,5 +1,5 @@
-//! A scene: one test's namespace on the lab's cluster, with its own things in AWS; how it waits for what happens in it, and
-//! what it shows of itself when the test fails.
+//! A scene: one test's namespace on the lab's cluster, with its own things in AWS. It waits for events, and shows its objects when the
+//! test fails.
 //!
 //! Knows the API server and the nodes' containers; the operator's programs are in `operator`, EvalAI is in `evalai`.
 
@@ -42,7 +42,7 @@ pub const USER_AGENT: &str = "leaderboard-tests";
 /// Marks the tests' namespaces, where no service account may write.
 pub const LABEL: &str = "leaderboard.carla.org/test";
 
-/// What the environment has about the cluster.
+/// The cluster, as the environment describes it.
 pub struct Lab {
     /// The machine's address, from Pods too.
     pub host: String,
@@ -91,7 +91,7 @@ pub struct Scene {
     pub gate: Gate,
     /// Folder of the operator's logs.
     pub logs: PathBuf,
-    /// What was seen of the operator's programs that ended by themselves.
+    /// Lines about the operator's programs that ended by themselves.
     pub ended: Arc<Mutex<Vec<String>>>,
 }
 
@@ -168,7 +168,7 @@ impl Scene {
         scene
     }
 
-    /// What a failed wait adds: without the operator nothing happens.
+    /// Words for a failed wait about ended programs: without the operator nothing happens.
     fn ended_programs(&self) -> String {
         let ended = self.ended.lock().unwrap();
         ended.iter().flat_map(|line| ["; ", line]).collect()

@@ -14,7 +14,7 @@ use serde_json::{Value, json};
 /// The key that signs the tokens of service accounts.
 const KEY: &str = "service-accounts.key";
 
-/// Ports that nobody listens on now, all different.
+/// Free ports, all different.
 pub fn free_ports<const N: usize>() -> io::Result<[u16; N]> {
     let mut listeners = Vec::new();
     let mut ports = [0; N];
@@ -73,7 +73,7 @@ pub fn apiserver_arguments(folder: &Path, etcd: u16, port: u16) -> Vec<String> {
         format!("--etcd-servers=http://127.0.0.1:{etcd}"),
         "--bind-address=127.0.0.1".into(),
         "--advertise-address=127.0.0.1".into(),
-        // It refuses to write a loopback address to the Service `kubernetes`, which nobody here asks for.
+        // It refuses to write a loopback address to the Service `kubernetes`, which no test uses.
         "--endpoint-reconciler-type=none".into(),
         format!("--secure-port={port}"),
         format!("--cert-dir={}", file("certificates")),
@@ -81,7 +81,7 @@ pub fn apiserver_arguments(folder: &Path, etcd: u16, port: u16) -> Vec<String> {
         format!("--audit-policy-file={}", file("audit-policy.json")),
         format!("--audit-log-path={}", file("audit.log")),
         "--authorization-mode=RBAC".into(),
-        // Nobody makes the namespaces' service accounts.
+        // No controller makes the namespaces' service accounts.
         "--disable-admission-plugins=ServiceAccount".into(),
         "--allow-privileged=true".into(),
         "--service-cluster-ip-range=10.0.0.0/24".into(),

@@ -127,7 +127,7 @@ impl Evalai {
         });
     }
 
-    /// What is worked on is saved.
+    /// Lets EvalAI save the final results that it works on.
     pub fn release_puts(&self) {
         self.handle.set_knobs(Knobs::default());
     }
@@ -219,7 +219,7 @@ impl Evalai {
         rows.filter(|row| row.submission == pk).collect()
     }
 
-    /// What everybody sees on the leaderboard of a phase: its entries, best first.
+    /// The public leaderboard of a phase: its entries, best first.
     pub async fn leaderboard(&self, phase: u64) -> Vec<Value> {
         let path = format!("/api/jobs/challenge_phase_split/{phase}/leaderboard/");
         let board = self.call(reqwest::Method::GET, &path, &Value::Null).await;
@@ -232,7 +232,7 @@ impl Evalai {
         String::from_utf8(file.unwrap_or_default()).unwrap()
     }
 
-    /// What the operator has asked for, oldest first.
+    /// The operator's requests, oldest first.
     pub fn requests(&self) -> Vec<Entry> {
         let all = self.handle.requests().into_iter();
         all.filter(|entry| entry.token.as_deref() == Some(HOST_TOKEN)).collect()

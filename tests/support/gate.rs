@@ -1,7 +1,7 @@
-//! A gate between the operator and a server that a test can shut: S3 or the API server is away, SQS takes no deletion, or
-//! DynamoDB gives no right to write.
+//! A gate between the operator and a server that a test can shut. S3 or the API server is away, SQS takes no deletion, or DynamoDB gives
+//! no right to write.
 //!
-//! Bytes pass through it unread but for the search for a word. Of HTTP it has one answer.
+//! Bytes pass through it unread, but for the search for a word. It knows one answer of HTTP.
 
 use std::time::Duration;
 
@@ -12,7 +12,7 @@ use tokio::sync::watch;
 use tokio::task::JoinSet;
 use tokio::time::timeout;
 
-/// What passes.
+/// The traffic that passes.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 enum Mode {
     Open,
@@ -24,7 +24,7 @@ enum Mode {
     Denied(&'static str),
 }
 
-/// What AWS answers to who has no right.
+/// AWS's answer to a client without the right.
 const NO_RIGHT: &str =
     r#"{"__type":"com.amazon.coral.service#AccessDeniedException","Message":"not authorized to perform this action"}"#;
 
@@ -119,7 +119,7 @@ async fn pass(client: TcpStream, server: String, mut mode: watch::Receiver<Mode>
     };
     tokio::select! {
         () = through => {}
-        // What was under way hangs until the gate opens, and is then broken off.
+        // A connection under way hangs until the gate opens, and is then broken off.
         () = async { _ = mode.wait_for(|mode| *mode == Mode::Shut).await; } => {
             _ = mode.wait_for(|mode| *mode != Mode::Shut).await;
         }

@@ -1,5 +1,4 @@
-//! A stand-in for AWS on a free loopback port, one for the whole test program, and a proxy before it that can go away and
-//! counts bytes.
+//! A stand-in for AWS on a free loopback port, one for the whole test program. A proxy before it can go away and counts bytes.
 //!
 //! It ends with the test program, however that ends: a shell holds it until its standard input is closed. Buckets are
 //! the tests' own; nothing is shared between them.
@@ -158,7 +157,7 @@ async fn is_healthy(address: SocketAddr) -> bool {
     matches!(answer, Ok(Ok(answer)) if answer.starts_with(b"HTTP/1.1 200"))
 }
 
-/// What a proxy has seen.
+/// Counts of a proxy.
 #[derive(Clone, Copy, Debug, Default)]
 pub struct Counts {
     /// Bytes that clients have sent.

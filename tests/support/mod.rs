@@ -1,5 +1,5 @@
-//! What the tests share, one module for each thing that a test starts. Each is started by the first test that wants it,
-//! serves the whole test program and ends with it, however that ends.
+//! Servers and helpers that the tests share, one module each. The first test that wants a server starts it. It serves the whole test
+//! program and ends with it, however that ends.
 
 pub mod apiserver;
 pub mod files;

@@ -1,9 +1,9 @@
 //! The pipeline that a host moves away from: an EventBridge Pipe, a Step Function and a Job's scripts, as far as others see them.
 //!
-//! Its Pipe deletes each message that it receives, also one that its filter does not match. A submission that it takes gets its
-//! row as `SUBMITTED`, and `RUNNING` once its Job runs; EvalAI shows `submitted` until the first partial results, however long
-//! a node takes to come. Results are stored as the run goes on, in the places and formats of the original. What is under way goes
-//! on when the Pipe stops. No route ends before the test lets it: see [`OldPipeline::drive`].
+//! Its Pipe deletes each message that it receives, also one that its filter does not match. A submission that it takes gets its row as
+//! `SUBMITTED`, and `RUNNING` once its Job runs. EvalAI shows `submitted` until the first partial results, however long a node takes to
+//! come. Results are stored as the run goes on, in the places and formats of the original. Runs under way go on when the Pipe stops. No
+//! route ends before the test lets it: see [`OldPipeline::drive`].
 
 use std::collections::BTreeMap;
 use std::sync::{Arc, Mutex};
@@ -47,7 +47,7 @@ pub enum Stage {
     Ended,
 }
 
-/// What its agents may do.
+/// The routes that its agents may drive, and if they then crash.
 #[derive(Clone, Copy, Debug, Default)]
 struct Allowed {
     routes: usize,
@@ -101,7 +101,7 @@ impl OldPipeline {
         assert!(earlier.is_none(), "the Pipe runs already");
     }
 
-    /// Stops the Pipe, and waits until it has done with what it received. What it has begun goes on.
+    /// Stops the Pipe, and waits until it has handled its received messages. Its runs go on.
     pub async fn stop_pipe(&self) {
         let running = self.pipe.lock().unwrap().take();
         let (stop, pipe) = running.expect("the Pipe does not run");
@@ -109,7 +109,7 @@ impl OldPipeline {
         pipe.await.unwrap();
     }
 
-    /// What it has begun to run, in this order; what it has begun twice is there twice.
+    /// The submissions that it has begun to run, in this order; one that it has begun twice is there twice.
     pub fn taken(&self) -> Vec<u64> {
         self.shared.taken.lock().unwrap().clone()
     }
@@ -155,7 +155,7 @@ impl Drop for OldPipeline {
     }
 }
 
-/// What the rest of an execution needs of the row in EvalAI.
+/// The parts of EvalAI's row that the rest of an execution needs.
 struct Submitted {
     pk: u64,
     phase: u64,

@@ -1,5 +1,5 @@
-//! The operator's programs as child processes of a test: each is limited to the test's namespace and has its own Lease, so
-//! that it can be killed, stopped and started again without anybody else's notice.
+//! The operator's programs as child processes of a test. Each is limited to the test's namespace and has its own Lease. So a test can
+//! kill, stop and start it without a disturbance of other tests.
 
 use std::convert::Infallible;
 use std::ffi::{OsStr, OsString};
@@ -19,7 +19,7 @@ use tokio::time::{sleep, timeout};
 use super::gate::Gate;
 use super::scene::{Scene, say};
 
-/// What the programs log, unless `LEADERBOARD_TEST_LOG` sets it otherwise.
+/// Log filter of the programs, unless `LEADERBOARD_TEST_LOG` sets another.
 const LOG: &str = "info,leaderboard=debug";
 /// Name of each test's Lease, in its namespace.
 pub const LEASE: &str = "operator";
@@ -29,7 +29,7 @@ const BACK_OFF: Duration = Duration::from_secs(1);
 /// The words of a shell that starts a program with a file in place of `/etc/hosts`.
 const MOUNT_HOSTS: &str = r#"mount --bind "$0" /etc/hosts && exec "$@""#;
 
-/// What the controller writes last when it ends because its Lease could not be renewed.
+/// Last words of a controller that could not renew its Lease.
 const LOST_LEASE: &str = "this process no longer leads";
 
 /// A running program. It is killed when this is dropped.
@@ -39,9 +39,8 @@ pub struct Process {
     log: PathBuf,
 }
 
-/// A program that is started again when it has lost its Lease, as the kubelet would: an API server that is busy for 10 s
-/// costs it, and is nothing that these tests are about. Any other end is final, and part of a failed wait's message. It is
-/// killed when this is dropped.
+/// A program that is started again when it has lost its Lease, as the kubelet would. An API server that is busy for 10 s costs the Lease,
+/// and these tests are not about that. Any other end is final, and part of a failed wait's message. It is killed when this is dropped.
 pub struct Kept(JoinHandle<()>);
 
 impl Drop for Kept {
@@ -58,7 +57,7 @@ struct Start {
     logs: PathBuf,
     arguments: Vec<String>,
     variables: Vec<(&'static str, OsString)>,
-    /// What it sees as `/etc/hosts`.
+    /// File that it sees as `/etc/hosts`.
     hosts: Option<PathBuf>,
 }
 
@@ -175,7 +174,7 @@ impl Start {
         let mut command = Command::new("setpriv");
         command.args(["--pdeathsig", "KILL"]);
         if let Some(hosts) = &self.hosts {
-            // A mount that nobody else on this machine sees.
+            // A mount that no other process on this machine sees.
             command.args(["unshare", "--mount", "sh", "-c", MOUNT_HOSTS]).arg(hosts);
         }
         command

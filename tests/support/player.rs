@@ -53,7 +53,7 @@ impl Cluster {
         }
     }
 
-    /// The same with a node of its own.
+    /// A cluster with a node of this name.
     pub fn on_node(self, node: &'static str) -> Self {
         Self { node, ..self }
     }
@@ -194,7 +194,7 @@ pub struct Part {
     stage: Arc<Stage>,
 }
 
-/// What ends a part.
+/// The cue that ends a part.
 pub struct Cue {
     stop: oneshot::Receiver<()>,
     curtain: watch::Receiver<bool>,

@@ -13,7 +13,7 @@ use super::scene::containers;
 /// Processes have no events for others: they are looked for this often.
 const LOOK: Duration = Duration::from_millis(5);
 
-/// Those of all containers; none if they have ended already.
+/// Processes of all containers; none if they have ended already.
 pub fn of_pod(pod: &Pod) -> Vec<Pid> {
     let ids = containers(pod)
         .into_iter()
@@ -58,7 +58,7 @@ pub fn kill_container(pod: &Pod, container: &str) {
     }
 }
 
-/// The same for one that may have ended; returns whether anything was killed.
+/// Kills the processes of a container that may have ended; returns true if there was any.
 pub fn kill_if_running(pod: &Pod, container: &str) -> bool {
     let processes = of_container(&id_of(pod, container)).into_iter();
     processes.flat_map(|process| kill(process, Signal::SIGKILL)).count() > 0

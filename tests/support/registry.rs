@@ -22,7 +22,7 @@ pub struct Registry {
 }
 
 impl Registry {
-    /// One that asks everybody for credentials that nobody has.
+    /// A registry that asks for credentials that no client has.
     pub async fn that_refuses() -> Self {
         Self::start(true).await
     }

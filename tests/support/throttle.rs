@@ -1,5 +1,5 @@
-//! A proxy before the stand-in that is an AWS which is asked too often: it refuses as many requests as a test asks for, and hands on
-//! the others.
+//! A proxy before the stand-in that plays an AWS with too many requests. It refuses as many requests as a test asks for, and hands on the
+//! others.
 
 use std::sync::Arc;
 use std::sync::atomic::{AtomicU32, Ordering};
@@ -22,7 +22,7 @@ pub struct Throttle {
 }
 
 impl Throttle {
-    /// Before `to`. What it refuses, it refuses with the error `code`.
+    /// Starts the proxy before `to`. Its refusals have the error `code`.
     pub async fn start(to: &str, code: &'static str) -> Self {
         let listener = TcpListener::bind("127.0.0.1:0").await.unwrap();
         let endpoint = format!("http://{}", listener.local_addr().unwrap());

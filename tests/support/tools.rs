@@ -1,4 +1,4 @@
-//! Programs of others that the lab builds once and keeps: where they are, and how one is started that listens on a port of its own.
+//! Programs of others that the lab builds once and keeps: their paths, and the start of one that listens on a port of its own.
 
 use std::net::SocketAddr;
 use std::path::{Path, PathBuf};

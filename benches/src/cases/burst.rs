@@ -124,8 +124,8 @@ fn since(times: &HashMap<String, Instant>, began: Instant) -> Vec<f64> {
         .collect()
 }
 
-/// Milliseconds from this program's own event of the last container's end until the API server received the operator's last
-/// PATCH of the status: what the API server takes for its part is not in it.
+/// Milliseconds from this program's own event of the last container's end to the operator's last PATCH of the status, as the API server
+/// received it. The API server's own part of the time is not in it.
 fn to_patch(moments: &Moments, log: &std::path::Path) -> Outcome<Vec<f64>> {
     let mut last: HashMap<String, Timestamp> = HashMap::new();
     for entry in audit::read(log)? {

@@ -86,7 +86,7 @@ async fn one(bench: &Bench, bodies: &Bodies, figures: &mut Figures, count: usize
     Ok(())
 }
 
-/// What the operator has written, by the audit log.
+/// Adds the operator's writes, by the audit log.
 async fn add_writes(figures: &mut Figures, world: &World, count: usize) -> Outcome<()> {
     let all = audit::read_settled(&world.servers.audit_log()).await?;
     let each = |requests: usize| requests as f64 / count as f64;

@@ -43,7 +43,7 @@ pub async fn measure(bench: &Bench, bodies: &Bodies) -> Outcome<Figures> {
     Ok(figures)
 }
 
-/// What the operator has written about the measured submissions, by the audit log.
+/// Number of the operator's writes about the measured submissions, by the audit log.
 async fn writes(world: &World) -> Outcome<usize> {
     let all = audit::read_settled(&world.servers.audit_log()).await?;
     Ok(audit::writes(&all).measured.values().sum())

@@ -26,7 +26,7 @@ const ALL_CAP: Duration = Duration::from_mins(3);
 /// Measures with each of these numbers of submissions, the smallest first.
 pub async fn measure(bench: &Bench, sizes: &[usize]) -> Outcome<Figures> {
     let mut figures = Figures::default();
-    // Nobody else makes Pods: the Job controller would only share the cores.
+    // This program alone makes Pods: the Job controller would only share the cores.
     let setup = Setup {
         has_operator: true,
         pods: Some(Pods::Run),
@@ -71,7 +71,7 @@ async fn block(world: &World, figures: &mut Figures, from: usize, to: usize) -> 
     Ok(is_done)
 }
 
-/// Memory, CPU and requests while nothing changes but the live reports.
+/// Memory, CPU and requests while only the live reports change.
 async fn rest(bench: &Bench, world: &World, figures: &mut Figures, live: usize) -> Outcome<()> {
     let Some(operator) = &world.operator else { return Ok(()) };
     tokio::time::sleep(SETTLE).await;

@@ -22,7 +22,7 @@ pub enum Case {
     /// 300 submissions at once, until each has its Job.
     #[value(name = "intake-300")]
     Intake300,
-    /// The same with `concurrency.total`.
+    /// 300 submissions at once, with `concurrency.total`.
     #[value(name = "intake-300-limited")]
     Intake300Limited,
     /// 1,000 at once.
@@ -34,7 +34,7 @@ pub enum Case {
     Latency,
     /// 1,000 whole lives at once.
     Burst,
-    /// The same with a kill of the operator in its middle.
+    /// 1,000 whole lives at once, with a kill of the operator in the middle.
     BurstRestart,
     /// 1,000 and 5,000 live ones: memory, rest, restart.
     Live,
@@ -53,7 +53,7 @@ pub enum Case {
     StormNodes,
 }
 
-/// Those that were named; without a name all but the longest.
+/// The named cases; without a name all but the longest.
 pub fn chosen(named: &[Case]) -> Vec<Case> {
     let all = Case::value_variants().iter().copied();
     let is_chosen = |case: &Case| match named {

@@ -1,5 +1,5 @@
-//! Jobs that get no Pod, or Pods that get no node, all at once: what the operator asks the API server for meanwhile, and how soon
-//! each submission shows the reason.
+//! Jobs that get no Pod, or Pods that get no node, all at once. The case counts the operator's requests to the API server meanwhile, and
+//! the time until each submission shows the reason.
 
 use std::time::Duration;
 
@@ -24,7 +24,7 @@ const IN_TIME: Duration = Duration::from_mins(1);
 const CAP: Duration = Duration::from_mins(3);
 const REST: Duration = Duration::from_secs(30);
 
-/// What holds the Pods back.
+/// The obstacle that holds the Pods back.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 pub enum Storm {
     Quota,

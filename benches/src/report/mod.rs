@@ -1,4 +1,4 @@
-//! Makes the tables and plots of the documentation from the lines of a run. What is between two marks of a document is replaced.
+//! Makes the tables and plots of the documentation from the lines of a run. They replace the text between two marks of a document.
 
 mod aims;
 mod plots;
@@ -54,7 +54,7 @@ fn replaced(text: &str, mark: &str, content: &str) -> Outcome<String> {
     Ok(format!("{before}{begin}{}\n{end}{after}", content.trim_end()))
 }
 
-/// What the lines were measured on.
+/// The machine of the lines, in words.
 fn machine(lines: &[Line]) -> String {
     let mut text = String::new();
     let Some(first) = lines.first() else { return text };

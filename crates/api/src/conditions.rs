@@ -42,7 +42,7 @@ pub const SYSTEMS: [(&str, &str); 3] = [(ARCHIVED, "S3"), (PUBLISHED, "EvalAI"),
 /// Characters of a condition's message, which may hold a stranger's text.
 pub const MAX_MESSAGE: usize = 32_768;
 
-/// A condition as Kubernetes has it. Of thousands of submissions most conditions have the same texts, which are in memory once.
+/// A condition as Kubernetes has it. Conditions of thousands of submissions mostly have equal texts, which share their memory.
 #[derive(Serialize, Deserialize, Clone, Debug, PartialEq)]
 #[serde(rename_all = "camelCase")]
 pub struct Condition {
@@ -66,7 +66,7 @@ impl Condition {
         [&mut self.type_, &mut self.status, &mut self.message]
     }
 
-    /// Whether it is True.
+    /// True if the condition's status is `True`.
     pub fn is_true(&self) -> bool {
         self.status == Truth::True.as_str()
     }
@@ -137,7 +137,7 @@ pub fn set(
     changed
 }
 
-/// What of a message the definition allows.
+/// The first [`MAX_MESSAGE`] characters of a message: the definition allows no more.
 fn fitting(message: &str) -> &str {
     let end = message
         .char_indices()
@@ -156,7 +156,7 @@ pub fn get<'a>(conditions: &'a [Condition], type_: &str) -> Option<&'a Condition
     conditions.iter().find(|c| c.type_ == type_)
 }
 
-/// Whether the condition of a type is True.
+/// True if there is a condition of this type, and its status is `True`.
 pub fn is_true(conditions: &[Condition], type_: &str) -> bool {
     get(conditions, type_).is_some_and(Condition::is_true)
 }

@@ -57,7 +57,7 @@ impl Status {
         found.unwrap_or(Self::Unknown)
     }
 
-    /// Whether EvalAI waits for an end of it.
+    /// True if EvalAI waits for this submission to end.
     pub fn is_live(self) -> bool {
         matches!(
             self,

@@ -88,7 +88,7 @@ pub enum ClaimOf<'a> {
 }
 
 impl Gpu {
-    /// What is asked for. What the rules of the definition forbid is none.
+    /// The source of the GPUs that the fields name. `None` for a combination of fields that the definition refuses.
     pub fn source(&self) -> GpuSource<'_> {
         let resource = self.resource_name.as_deref();
         match (self.mode, resource) {

@@ -1,6 +1,6 @@
 //! References to container images, by the grammar that registries and the kubelet share (`distribution/reference`).
 //!
-//! Pure. What is refused here can never be pulled; what is taken may still not exist.
+//! Pure. A reference that is refused here can never be pulled. The image of one that is taken may still not exist.
 
 /// Longest reference that a Submission may hold, in characters.
 pub const LONGEST: usize = 512;
@@ -102,7 +102,7 @@ fn split(text: &str, at: Option<usize>) -> (&str, Option<&str>) {
     at.map_or((text, None), |at| (&text[..at], Some(&text[at + 1..])))
 }
 
-/// Whether the first component of a name is a registry rather than a part of the repository.
+/// True if the first component of a name is a registry. Otherwise it is part of the repository.
 fn is_host(first: &str) -> bool {
     first.contains(['.', ':']) || first == "localhost" || first.bytes().any(|byte| byte.is_ascii_uppercase())
 }

@@ -1,6 +1,6 @@
 //! Which images may be submitted: patterns of registries and repositories, with a place for the team.
 //!
-//! Pure. What a pattern does not name is refused, so a spelling that is not understood here is never let in.
+//! Pure. A pattern refuses every image that it does not name, so a spelling that is not understood here is never let in.
 
 use std::borrow::Cow;
 
@@ -66,7 +66,7 @@ impl<'a> Repository<'a> {
         Self { registry, path }
     }
 
-    /// Whether both are one place, also where a host is written in capitals or with the port that it has anyway.
+    /// True if both are one place. Capitals in the host and the default port `:443` make no difference.
     pub fn is_same(&self, other: &Self) -> bool {
         let host = |registry: &str| {
             let registry = registry.to_ascii_lowercase();
@@ -77,7 +77,7 @@ impl<'a> Repository<'a> {
 }
 
 impl ImagePattern {
-    /// Whether it lets the images of this repository in, for a team of this id.
+    /// True if the pattern lets in the images of this repository, for a team of this id.
     pub fn allows(&self, repository: &Repository<'_>, team: Option<&str>) -> bool {
         let Some((registry, path)) = self.0.split_once('/') else {
             return false;
@@ -113,8 +113,8 @@ fn have_parts(pattern: &str, text: &str, separator: char, team: Option<&str>) ->
         })
 }
 
-/// Whether a text is like a pattern in which `*` stands for at least one character. In steps of one text times one pattern: the
-/// text is a stranger's.
+/// True if a text matches a pattern in which `*` stands for at least one character. It takes no more steps than the product of
+/// both lengths, because a participant wrote the text.
 fn is_like(pattern: &[u8], text: &[u8]) -> bool {
     // Which beginnings of the pattern the text so far is like.
     let mut reached = vec![false; pattern.len() + 1];

@@ -1,4 +1,4 @@
-//! What made a Submission or began its present attempt: an annotation that `ingest` writes and the controller reads.
+//! The annotation that records the message or the sweep behind a Submission's attempts: `ingest` writes it, the controller reads it.
 //!
 //! Pure.
 
@@ -6,7 +6,7 @@ use serde::{Deserialize, Serialize};
 
 use super::{Attempt, Submission, names};
 
-/// What the annotation names as the message where the sweep stood in for one.
+/// Value of [`Ingested::message`] if the sweep of EvalAI's rows took the place of a message.
 pub const SWEEP: &str = "sweep";
 
 /// The value of `leaderboard.carla.org/ingested`.
@@ -44,7 +44,7 @@ impl Ingested {
         serde_json::from_str(annotations.get(names::ANNOTATION_INGESTED)?).ok()
     }
 
-    /// Whether EvalAI has asked for an attempt, by a message or by its row. Every other was begun by a person.
+    /// True if EvalAI asked for this attempt, by a message or by its row. A person asked for every other attempt.
     pub fn has_begun(&self, attempt: Attempt) -> bool {
         self.attempt == Some(attempt) || self.without_message.contains(&attempt)
     }

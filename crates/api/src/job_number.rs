@@ -18,7 +18,7 @@ impl JobNumber {
         Self { attempt, retry: 0 }
     }
 
-    /// What the name of its Job ends with.
+    /// Suffix of the Job's name: `ATTEMPT`, or `ATTEMPT-rRETRY` from the first retry on.
     pub fn suffix(self) -> String {
         let Self { attempt, retry } = self;
         if retry == 0 {

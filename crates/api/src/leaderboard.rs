@@ -1,7 +1,7 @@
 //! The kind `Leaderboard`: one version of a leaderboard, what it runs and where its results go.
 //!
 //! Owns the top level of the spec, its cross-field rules and the status. The parts are in `leaderboard_parts`.
-//! What depends on another field has no schema default: `api::effective` computes it.
+//! A value that depends on another field has no schema default: `api::effective` computes it.
 
 use std::collections::BTreeMap;
 
@@ -165,13 +165,13 @@ pub struct LeaderboardSpec {
 pub const JOB_SECONDS: i32 = 7 * 86_400;
 
 impl LeaderboardSpec {
-    /// Whether its Pods prove their identity with a token of their ServiceAccount.
+    /// True if the Pods prove their identity with a token of their ServiceAccount.
     pub fn has_role(&self) -> bool {
         let identity = self.pod_identity.as_ref();
         identity.is_some_and(|identity| identity.role_arn.is_some())
     }
 
-    /// Whether nothing of it is written to EvalAI.
+    /// True if the operator writes nothing to EvalAI for this Leaderboard.
     pub fn observes(&self) -> bool {
         self.evalai
             .as_ref()
@@ -210,7 +210,7 @@ impl Leaderboard {
         conditions::get(&self.status.as_ref()?.conditions, type_)
     }
 
-    /// Whether a phase of an EvalAI challenge is one of its tracks.
+    /// True if one of the tracks is this phase of this EvalAI challenge.
     pub fn serves(&self, challenge: i64, phase: i64) -> bool {
         let is_of_challenge = self.spec.evalai.as_ref().is_some_and(|e| e.challenge == challenge);
         is_of_challenge && self.spec.tracks.iter().any(|track| track.phase == Some(phase))

@@ -77,7 +77,7 @@ pub const CONTAINER_LOGCOPY: &str = "logcopy";
 /// The init containers of a Pod, in the order in which they start. `logcopy` goes on while the pairs run.
 pub const INIT_CONTAINERS: [&str; 3] = [CONTAINER_WORKSPACE, CONTAINER_CONTENTS, CONTAINER_LOGCOPY];
 
-/// Key of the log that explains a failure, below the run's prefix. Of that prefix it is the one text that the controller writes.
+/// Key of the log that explains a failure, below the run's prefix. The controller writes no other text below that prefix.
 pub const FAILURE_LOG_KEY: &str = "evalai/environment_log.txt";
 
 /// Name of an agent's container; pairs count from 1.

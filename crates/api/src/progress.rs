@@ -1,4 +1,4 @@
-//! How far a run is, and what it has scored. What is counted, and which numbers there are, is the kind of evaluation's own.
+//! How far a run is, and what it has scored. The kind of evaluation decides what is counted, and which numbers there are.
 //!
 //! Part of a Submission's status. Pure.
 
@@ -59,7 +59,7 @@ impl Metric {
         }
     }
 
-    /// Whether its name has letters and its value is a decimal number, and both are as short as the definition asks.
+    /// True if the name is not blank, the value is a finite decimal number, and both fit the definition's lengths.
     pub fn is_plausible(&self) -> bool {
         let is_number = |text: &str| text.parse().is_ok_and(f64::is_finite);
         let is_short = self.name.chars().count() <= MAX_NAME && self.value.len() <= MAX_NUMBER;
@@ -97,7 +97,7 @@ impl Score {
         }
     }
 
-    /// The same as the score of a run that goes on.
+    /// This score, marked as not final.
     #[must_use]
     pub fn so_far(self) -> Self {
         let (name, value) = (self.name, self.value);

@@ -1,7 +1,7 @@
 //! Ranges of addresses, and which addresses the policy of a Leaderboard lets its Pods reach. Pure.
 //!
-//! Read by the controller, which makes the policy, and in the Pod, which measures whether it is enforced. And which addresses are
-//! public: who follows an address that a stranger has named goes to no other.
+//! The controller reads them to make the policy, and a Pod reads them to measure whether the policy is enforced.
+//! The module also tells public addresses from others: a URL that a participant may have chosen leads to public ones only.
 
 use std::net::{IpAddr, Ipv4Addr};
 
@@ -16,7 +16,7 @@ const FORBIDDEN: [(&str, u8); 6] = [
     ("fd00:ec2::", 64),
 ];
 
-/// What is nobody's on the internet, or leads back into a network of one's own (IANA's registries of special addresses).
+/// Ranges that no server on the internet owns, or that lead back into a private network (IANA's registries of special addresses).
 const NOT_PUBLIC: [(&str, u8); 25] = [
     ("0.0.0.0", 8),
     ("10.0.0.0", 8),
@@ -51,11 +51,11 @@ const NOT_PUBLIC: [(&str, u8); 25] = [
     ("f000::", 4),
 ];
 
-/// What stands before an IPv4 address in one of IPv6 that leads to it: as a socket shows it, and as a NAT64 takes it.
+/// IPv6 prefixes in front of an IPv4 address: the form that a socket shows, and the form that a NAT64 gateway takes.
 const LEADS_TO_V4: [(&str, u8); 2] = [("::ffff:0:0", 96), ("64:ff9b::", 96)];
 
-/// Whether an address is one of the internet, which a server of its own answers: not private, local, shared, documentation, multicast or
-/// reserved, and no way to such a one.
+/// True if an address belongs to a server on the internet. Private, local, shared, documentation, multicast and reserved
+/// addresses do not, nor do addresses that lead to one of these.
 pub fn is_public(address: IpAddr) -> bool {
     let address = leads_to(address);
     let Some(alone) = Range::alone(address) else {
@@ -78,7 +78,7 @@ fn leads_to(address: IpAddr) -> IpAddr {
     Ipv4Addr::new(a, b, c, d).into()
 }
 
-/// What no policy lets a Pod reach, whatever the host allows.
+/// The ranges that no policy lets a Pod reach, whatever the host allows.
 pub fn forbidden() -> impl Iterator<Item = Range> {
     table(&FORBIDDEN)
 }
@@ -88,7 +88,7 @@ fn table(rows: &'static [(&str, u8)]) -> impl Iterator<Item = Range> {
         .filter_map(|(address, bits)| Range::new(address.parse().ok()?, *bits))
 }
 
-/// Whether a policy that allows these ranges lets a Pod reach an address, on some port.
+/// True if a policy that allows these ranges lets a Pod reach an address, on some port.
 pub fn allows<'a>(mut allowed: impl Iterator<Item = &'a str>, address: IpAddr) -> bool {
     let Some(alone) = Range::alone(address) else {
         return false;
@@ -138,7 +138,7 @@ impl Range {
         Self::new(address, if address.is_ipv4() { 32 } else { 128 })
     }
 
-    /// Whether all of another range lies in this one.
+    /// True if all of another range lies in this one.
     pub fn contains(self, other: Self) -> bool {
         self.v6 == other.v6 && self.bits <= other.bits && other.start & mask(self.bits) == self.start
     }

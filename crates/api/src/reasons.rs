@@ -10,7 +10,7 @@ use serde::{Serialize, Serializer};
 
 use crate::DOCUMENTS;
 
-/// What kind of thing a reason explains. Each class is one table of docs/states.md.
+/// The kind of thing that a reason explains. Each class is one table of docs/states.md.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 pub enum Class {
     /// Why a submission is Pending.
@@ -58,27 +58,27 @@ impl Reason {
         self.row().name
     }
 
-    /// What kind of thing it explains.
+    /// The kind of thing that the reason explains.
     pub fn class(self) -> Class {
         self.row().class
     }
 
-    /// What it means, in sentences.
+    /// The meaning of the reason, in sentences.
     pub fn meaning(self) -> &'static str {
         self.row().meaning
     }
 
-    /// What to do next, in sentences.
+    /// The step to take next, in sentences.
     pub fn next_step(self) -> &'static str {
         self.row().next_step
     }
 
-    /// What a host does once a submission has failed for this reason.
+    /// The step for a host once a submission has failed for this reason, in sentences.
     pub fn after_failure(self) -> &'static str {
         self.own_after_failure().unwrap_or(self.next_step())
     }
 
-    /// The same where it is another step than before the failure.
+    /// The step after a failure, if it differs from [`Reason::next_step`].
     fn own_after_failure(self) -> Option<&'static str> {
         self.row().after_failure
     }

@@ -1,4 +1,4 @@
-//! What programs ask of a plan and of a Leaderboard, whatever kind of evaluation they are of.
+//! Questions that programs ask of a plan and of a Leaderboard, for every kind of evaluation.
 //!
 //! Pure. Fields of one kind alone are read here, and in `evaluation`.
 

@@ -21,12 +21,12 @@ impl SharedText {
         &self.0
     }
 
-    /// Whether it has copies.
+    /// True if another value shares this text.
     pub fn has_copies(&self) -> bool {
         Arc::strong_count(&self.0) > 1
     }
 
-    /// Whether both are copies of one text.
+    /// True if both values share one text in memory. Equal texts that do not share it give false.
     pub fn is_copy_of(&self, other: &Self) -> bool {
         Arc::ptr_eq(&self.0, &other.0)
     }

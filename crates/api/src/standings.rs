@@ -160,7 +160,7 @@ impl Standing {
         row.ranked_by(ranking)
     }
 
-    /// The same result by another metric. None if it lacks that metric.
+    /// This result, ranked by another metric. None if it lacks that metric, or if the value is no finite number.
     #[must_use]
     pub fn ranked_by(mut self, ranking: &Ranking) -> Option<Self> {
         if self.score.name != ranking.metric {
@@ -203,7 +203,7 @@ impl Standing {
         }
     }
 
-    /// Whether both are results of one object. An object that was made anew has another UID.
+    /// True if the row is a result of this object. An object that was made anew has another UID.
     fn is_same_object(&self, submission: &Submission) -> bool {
         self.submission == submission.name_any() && (self.uid.is_none() || self.uid == submission.uid())
     }
@@ -216,7 +216,7 @@ fn metric_of(score: &Score) -> Metric {
     }
 }
 
-/// Whether a Submission has a result that ranks by some metric.
+/// True if a Submission has a result that can rank: it finished with a final score, is no check, and is not cancelled in EvalAI.
 pub fn is_candidate(submission: &Submission) -> bool {
     let Some(status) = submission.status.as_ref().filter(|_| !submission.spec.check) else {
         return false;

@@ -15,12 +15,12 @@ impl SubmissionStatus {
         conditions::get(&self.conditions, type_)
     }
 
-    /// Whether a condition is True.
+    /// True if the condition of this type is set and True.
     pub fn is_true(&self, type_: &str) -> bool {
         conditions::is_true(&self.conditions, type_)
     }
 
-    /// Whether another system has the end, or is to have none, by this condition.
+    /// True if this condition shows that a system has the end, or that it gets none.
     pub fn is_delivered(&self, type_: &str) -> bool {
         let found = self.condition(type_);
         let settled = [Reason::NotRequired, Reason::Superseded, Reason::CancelledInEvalAI];
@@ -32,12 +32,12 @@ impl SubmissionStatus {
         self.condition(FINISHED).filter(|end| end.status == "True")
     }
 
-    /// Whether the present attempt has come to its end.
+    /// True if the present attempt has come to its end.
     pub fn has_ended(&self) -> bool {
         self.end().is_some()
     }
 
-    /// Whether an attempt that is asked for follows the present one: only a higher one, and none follows results that count.
+    /// True if a requested attempt follows the present one: its number is higher, and the present one is not Finished.
     pub fn is_followed_by(&self, attempt: Attempt) -> bool {
         self.attempt.is_some_and(|present| attempt > present) && self.state_of_conditions() != State::Finished
     }
@@ -53,7 +53,7 @@ impl SubmissionStatus {
         self.reason.clone().or_else(of_state)
     }
 
-    /// Whether it is in its state for this reason.
+    /// True if the submission is in its state for this reason.
     pub fn shows(&self, reason: Reason) -> bool {
         self.present_reason().is_some_and(|present| present == reason)
     }
@@ -82,25 +82,25 @@ impl SubmissionStatus {
         }
     }
 
-    /// Whether the present attempt takes up one of the slots that `concurrency.total` counts: it has a Job, also while that starts, or has
-    /// lost one to the infrastructure and is about to get another.
+    /// True if the present attempt takes one of the slots that `concurrency.total` counts. It does from its first Job to its end:
+    /// also while a Job starts, and between one that the infrastructure ended and the next.
     pub fn has_slot(&self) -> bool {
         !self.has_ended() && self.has_run()
     }
 
-    /// Whether a Job was made for the present attempt: that of a try that the infrastructure ended counts.
+    /// True if a Job was made for the present attempt. A Job that an infrastructure failure ended counts.
     pub fn has_run(&self) -> bool {
         self.job_name.is_some() || self.retry > 0
     }
 
-    /// Whether the present attempt has taken the place of one that ran. No other system has had an end in between, so each end that EvalAI
+    /// True if the present attempt replaces one that ran. No other system got an end in between, so each end that EvalAI
     /// shows is new.
     pub fn is_restart(&self) -> bool {
         let live = self.condition(FINISHED).filter(|finished| finished.status != "True");
         live.is_some_and(|finished| finished.reason == Reason::Replacing)
     }
 
-    /// Whether its run continues from stored results.
+    /// True if the run continues from stored results.
     pub fn is_resumed(&self) -> bool {
         self.plan.as_ref().is_some_and(|plan| plan.resume) || self.attempt > Some(Attempt::FIRST)
     }

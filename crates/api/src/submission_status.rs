@@ -1,4 +1,4 @@
-//! What the operator last observed of a Submission. Written by the controller's leader alone; read by people and the bridge.
+//! The last observed status of a Submission. The controller's leader alone writes it; people and the bridge read it.
 //!
 //! `state` is for people: it is computed from the conditions and never read back.
 

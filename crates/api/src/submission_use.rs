@@ -1,4 +1,4 @@
-//! What a submission has used of its cluster, and how often the cluster has taken its nodes away.
+//! Cluster resources that a submission has used, and how often the cluster has taken its nodes away.
 
 use k8s_openapi::apimachinery::pkg::apis::meta::v1::Time;
 use kube::KubeSchema;

@@ -1,4 +1,4 @@
-//! Who submitted: as a spec names it, and as it is shown.
+//! The team that submitted: as a spec names it, and as the status shows it.
 //!
 //! Pure.
 

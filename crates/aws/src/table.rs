@@ -96,7 +96,7 @@ impl Row {
             .metrics
             .iter()
             .map(|(column, value)| (column.as_str(), value.as_deref()));
-        // What a metric may be called is the phase's; our own columns come last and win.
+        // The phase names its metrics, maybe like a column of ours; our own columns come last and win.
         metrics
             .chain(fixed.iter().map(|(column, value)| (*column, Some(value.as_str()))))
             .filter(|(column, value)| *value != Some("") && *column != ATTEMPT)

@@ -1,6 +1,6 @@
 //! The process's one stop signal: SIGTERM or SIGINT, for every part.
 //!
-//! Made once by `main`, cloned to all parts. What a part does about it is the part's own.
+//! Made once by `main`, cloned to all parts. Each part decides how it stops.
 
 use std::io;
 

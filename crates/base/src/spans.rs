@@ -1,7 +1,7 @@
-//! What all log lines about one submission share: a span with its name, its Leaderboard, its attempt and its trace.
+//! The fields that all log lines about one submission share: its name, its Leaderboard, its attempt and its trace.
 //!
-//! A reconcile runs in such a span. What it hands to another task, it hands over with [`LogSpan`], so that the lines of that task
-//! have the same fields.
+//! A reconcile runs in a span with these fields. It hands work to another task with [`LogSpan`], so that the lines of that task
+//! have them too.
 
 use std::fmt;
 use std::sync::Arc;
@@ -13,7 +13,7 @@ use super::trace_id::TraceId;
 
 /// The span of a submission that has an object. `submission` is `namespace/name`.
 ///
-/// Of the level ERROR: a filter that lets an error through lets its fields through as well.
+/// The span has level ERROR: a filter that lets an error through lets its fields through as well.
 pub fn submission(submission: impl fmt::Display, leaderboard: &str, attempt: i64, uid: &str) -> Span {
     tracing::error_span!(
         "submission",

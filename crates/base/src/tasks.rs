@@ -188,7 +188,7 @@ async fn watched<T>(mut guard: Guard, stays: bool, work: impl Future<Output = T>
     }
 }
 
-/// What a panic was about.
+/// The message of a panic, or `without a message`.
 pub fn panic_message(panic: &(dyn Any + Send)) -> &str {
     let text = panic.downcast_ref::<&str>().copied();
     text.or_else(|| panic.downcast_ref::<String>().map(String::as_str))

@@ -6,12 +6,12 @@ use std::fmt;
 
 use sha2::{Digest, Sha256};
 
-/// Of one submission, over all its attempts. Written as 32 hexadecimal digits.
+/// Trace of one submission, over all its attempts. Written as 32 hexadecimal digits.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 pub struct TraceId(u128);
 
 impl TraceId {
-    /// Of the object with this UID. A UID has fixed bits, by which samplers would take all or none; so it is hashed.
+    /// Trace of the object with this UID. A UID has fixed bits, by which samplers would take all or none; so it is hashed.
     pub fn of(uid: &str) -> Self {
         let digest = Sha256::digest(uid.as_bytes());
         Self(u128::from_be_bytes(std::array::from_fn(|at| digest[at])))

@@ -21,7 +21,7 @@ pub const REFUSED: &str = "logcopy/refused/";
 pub const OWN_LOG: &str = "logcopy/logcopy.log";
 /// The log of `workspace`.
 pub const WORKSPACE_LOG: &str = "logcopy/workspace.log";
-/// What the host's contents print; the runner writes it.
+/// The output of the host's contents. The runner writes it.
 pub const CONTENTS_LOG: &str = "contents/contents.log";
 
 /// Before the keys of the agents' files.
@@ -77,7 +77,7 @@ pub fn results_path(host: Host, pair: Pair) -> String {
     }
 }
 
-/// What the agent of a pair has printed.
+/// The output of a pair's agent.
 pub fn agent_log(pair: Pair) -> String {
     format!("{}/leaderboard.log", agent_folder(pair))
 }

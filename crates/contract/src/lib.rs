@@ -1,5 +1,9 @@
-//! What the controller and the programs in a Pod agree on: what a Pod is given (`run`), what it reports (`report`), what `workspace`
-//! ends with (`verdict`), and the names of what is stored (`keys`).
+//! The contract between the controller and the programs in a Pod:
+//!
+//! - `run`: the controller's input for a Pod.
+//! - `report`: the Pod's report after each round.
+//! - `verdict`: the end of `workspace`.
+//! - `keys`: the names of stored objects.
 //!
 //! ```text
 //! controller ── run (variable LEADERBOARD_RUN) ──▶ workspace, logcopy

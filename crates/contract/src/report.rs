@@ -1,4 +1,4 @@
-//! What a Pod reports to the controller: `logcopy/report.json`, written in each round after the results; and the mark of the
+//! A Pod's report to the controller: `logcopy/report.json`, written in each round after the results; and the mark of the
 //! prefix's owner.
 //!
 //! The report is written by `logcopy` and read by the controller as hostile text: bounded in size, checked in every number. Pure.
@@ -45,7 +45,7 @@ impl Owner {
         }
     }
 
-    /// What is stored.
+    /// The JSON that is stored.
     pub fn to_json(&self) -> Vec<u8> {
         serde_json::to_vec(self).unwrap_or_default()
     }
@@ -88,7 +88,7 @@ pub struct Report {
     /// True when the merge is complete against the plan and nothing more will come.
     #[serde(rename = "final")]
     pub is_final: bool,
-    /// Whether the results count.
+    /// True if the results count.
     pub eligible: bool,
     /// How the run ended, as its results show it.
     pub outcome: Outcome,
@@ -101,15 +101,15 @@ pub struct Report {
     /// Results that the host's own evaluator wrote and that cannot be used, for hosts.
     #[serde(default, skip_serializing_if = "Option::is_none")]
     pub unusable: Option<RefusedResults>,
-    /// What `verify` noticed.
+    /// Findings of `verify`, one sentence each.
     #[serde(default, skip_serializing_if = "Vec::is_empty")]
     pub warnings: Vec<String>,
-    /// Whether the run's lines come to CloudWatch; absent without a log group, and as long as it is not known.
+    /// State of the run's lines in CloudWatch. Absent without a log group, and until it is known.
     #[serde(default, skip_serializing_if = "Option::is_none")]
     pub logs: Option<Logs>,
     /// Text of `evalai/results.json`.
     pub results: String,
-    /// The same with the metrics over the routes done so far, in which `results` has zeros; only while the run goes on.
+    /// Text of `evalai/results.json` with the metrics so far, in place of zeros. Absent before the first unit and after the last.
     #[serde(default, skip_serializing_if = "Option::is_none")]
     pub partial_results: Option<String>,
     /// Most of what is on the volume of the logs, and enough to fill one, is in the agents' folders.
@@ -184,14 +184,14 @@ pub struct ReportWorker {
     pub total: u32,
     /// Crashes of the agent's or the environment's side, whichever is more.
     pub crashes: u32,
-    /// What it does.
+    /// State of the worker.
     pub state: WorkerState,
     /// Its checkpoint has a record that names a crash of the simulation.
     #[serde(default, skip_serializing_if = "std::ops::Not::not")]
     pub names_crash: bool,
 }
 
-/// What has become of the lines for CloudWatch.
+/// State of the lines for CloudWatch.
 #[derive(Serialize, Deserialize, Clone, Debug, PartialEq, Eq)]
 pub enum Logs {
     /// It has taken some, and refuses none.
@@ -218,7 +218,7 @@ pub enum ReportError {
     /// Not a report.
     #[error("the report is not one of ours: {0}")]
     Malformed(String),
-    /// Of a version that is not read.
+    /// A schema number that this version does not read.
     #[error("the report has schema {0}, and this operator reads {SCHEMA}")]
     Schema(u32),
     /// A number that no run can have.
@@ -282,7 +282,7 @@ impl Report {
         Ok(())
     }
 
-    /// Whether it is of this attempt of this object.
+    /// True if the report is from this attempt of the Submission with this UID.
     pub fn belongs_to(&self, uid: &str, attempt: Attempt) -> bool {
         self.submission_uid == uid && self.attempt == attempt
     }

@@ -1,4 +1,4 @@
-//! What the controller gives to a Pod: one JSON document without secrets, and the paths inside the Pod.
+//! The controller's input for a Pod: one JSON document without secrets, and the paths inside the Pod.
 //!
 //! Written by `pod-spec`, read by `workspace` and `logcopy`. Pure.
 
@@ -20,8 +20,8 @@ pub const TOOLS: &str = "/leaderboard-tools";
 pub const RUNNER: &str = "leaderboard-runner";
 /// The runner inside the operator's image.
 pub const RUNNER_IN_IMAGE: &str = "/usr/local/bin/leaderboard-runner";
-/// What a container resolves names by. The kubelet mounts one file of each for the whole Pod, writable; `workspace` copies them into
-/// [`TOOLS`], at the same path below it.
+/// Files by which a container resolves names. The kubelet mounts one file of each for the whole Pod, writable; `workspace` copies
+/// them into [`TOOLS`], at the same path below it.
 pub const NAME_FILES: [&str; 3] = ["/etc/hosts", "/etc/resolv.conf", "/etc/hostname"];
 /// Folder of the downward-API file with the stop annotation.
 pub const PODINFO: &str = "/podinfo";
@@ -51,7 +51,7 @@ pub struct Run {
     pub attempt: Attempt,
     /// Share of each worker, images and storage.
     pub plan: RunPlan,
-    /// What is done with scores that do not follow from their infractions.
+    /// The reaction to scores that do not follow from their infractions.
     pub verify: Verify,
     /// Seconds between two rounds.
     pub period_seconds: u64,
@@ -74,11 +74,11 @@ impl Run {
     }
 }
 
-/// What is to be measured, and what follows.
+/// The measurement of the Pod's NetworkPolicy, and its consequence.
 #[derive(Serialize, Deserialize, Clone, Debug, PartialEq, Eq)]
 #[serde(rename_all = "camelCase")]
 pub struct Isolation {
-    /// Whether the run may go on where the policy is not enforced.
+    /// `Require` ends the run unless the policy is found to be enforced. `Warn` lets it go on.
     pub enforcement: Enforcement,
     /// The address to try, as `10.0.0.1:443`; absent: the API server's service address.
     #[serde(default, skip_serializing_if = "Option::is_none")]

@@ -19,7 +19,7 @@ const RUN_1_CONTAINER: &str = include_str!("golden/run-1-container.json");
 const WORKSPACE_1: &str = include_str!("golden/workspace-1.json");
 const OWNER_1: &str = include_str!("golden/owner-1.json");
 
-/// What is read from a document and written again is the document: nothing of it was lost, and nothing new is needed.
+/// A document that is read and written again is unchanged: it lost no field, and needs no new one.
 fn assert_round_trip(golden: &str, read: &impl Serialize) {
     let golden: Value = serde_json::from_str(golden).unwrap();
     assert_eq!(serde_json::to_value(read).unwrap(), golden);

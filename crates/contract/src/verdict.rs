@@ -1,4 +1,4 @@
-//! What `workspace` ends with: why it could not prepare the Pod, or what it has found. Written by `workspace`, read by the controller.
+//! The verdict of `workspace`: why it could not prepare the Pod, or its measurement. `workspace` writes it, the controller reads it.
 
 use serde::{Deserialize, Serialize};
 
@@ -47,7 +47,7 @@ pub enum NotAVerdict {
     /// Longer than any version writes.
     #[error("the termination message has {0} bytes, more than the {VERDICT_BYTES} of a verdict of `workspace`")]
     TooLong(usize),
-    /// Of a version that is not read.
+    /// A schema number that this version does not read.
     #[error("the verdict of `workspace` has schema {0}, and this operator reads {VERDICT_SCHEMA}")]
     Schema(u32),
     /// Not the JSON of a verdict.

@@ -1,4 +1,4 @@
-//! What a round finds in the results of a run. Plain data, whatever kind of evaluation it is of.
+//! The state of a run's results after one round. Plain data, for every kind of evaluation.
 
 use std::collections::BTreeMap;
 use std::path::Path;
@@ -53,7 +53,7 @@ impl WorkerSeen {
         }
     }
 
-    /// Of the side that had more.
+    /// Number of crashes of the side that had more, the agent's or the host's.
     pub fn crashes(&self) -> u32 {
         self.agent.crashes.max(self.host.crashes)
     }
@@ -104,16 +104,16 @@ pub struct Summary {
     pub warnings: Vec<String>,
 }
 
-/// What EvalAI gets as a result.
+/// The texts that EvalAI gets as a result.
 #[derive(Clone, Debug, Default, PartialEq, Eq)]
 pub struct Texts {
     /// JSON of the metrics; zeros or an empty list until the results are complete.
     pub results: String,
-    /// The same with the metrics so far; `None` before the first unit, and once the results are complete.
+    /// JSON of the metrics so far. `None` before the first unit, and once the results are complete.
     pub partial_results: Option<String>,
 }
 
-/// What one round found.
+/// The findings of one round.
 #[derive(Clone, Debug)]
 pub struct Gathered {
     /// The last good merge; `None` before the first results.
@@ -158,13 +158,13 @@ impl Gathered {
         all.filter(|_| !self.is_complete())
     }
 
-    /// Whether nothing is missing: judged by the plan and the last good files, whatever the agents report.
+    /// True if no unit of the plan is missing. The last good files decide, whatever the agents report.
     pub fn is_complete(&self) -> bool {
         self.unmerged.is_none() && self.merged.as_ref().is_some_and(|merged| merged.is_complete)
     }
 
-    /// Whether every evaluator has come to its regular end. One whose host crashed in its last unit of work
-    /// has a record of each and has not: it will repeat that one, as long as it is restarted.
+    /// True if every evaluator has come to its regular end. An evaluator whose host crashed in its last unit has a record
+    /// of every unit, but no end. It repeats that unit if it is restarted.
     pub fn has_ended(&self) -> bool {
         self.merged.as_ref().is_some_and(|merged| merged.has_ended)
     }

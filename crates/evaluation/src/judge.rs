@@ -1,5 +1,5 @@
-//! Whether a run goes on, is wound down, or has ended: a pure function of what a round found, and the little memory it needs
-//! to say for how long.
+//! Decides if a run goes on, is wound down, or has ended: a pure function of the findings of a round. [`Judge`] remembers
+//! since when each of them holds.
 //!
 //! Called by `logcopy`. Knows no clock but the one handed in, no file and no S3.
 
@@ -32,7 +32,7 @@ impl std::fmt::Display for Ending {
     }
 }
 
-/// What logcopy does next.
+/// The next step of `logcopy`.
 #[derive(Clone, Debug, PartialEq, Eq)]
 pub enum Step {
     /// Nothing out of the ordinary.
@@ -43,7 +43,7 @@ pub enum Step {
     Finish(Ending),
 }
 
-/// What one round found, with the times since when.
+/// The findings of one round, and for how long each has held.
 #[derive(Clone, Debug, PartialEq, Eq, Default)]
 pub struct Situation {
     /// No unit of work is missing.
@@ -64,9 +64,9 @@ pub struct Situation {
     pub quiet: Duration,
 }
 
-/// What to do next.
+/// The next step. `cancel` is the run's time for a cancel; at least half of it is left for storing.
 pub fn decide(seen: &Situation, pace: &Pace, cancel: Duration) -> Step {
-    // Who has a record of each unit without a regular end will repeat the last one, if only its container comes back.
+    // An evaluator with a record of each route, but no regular end, repeats the last route if its container comes back.
     let settled = (seen.whole && seen.all_done) || seen.complete.is_some_and(|since| since >= pace.settle);
     if let (true, None) = (settled, seen.stop) {
         return Step::Finish(Ending::Complete);
@@ -103,7 +103,7 @@ pub struct Judge {
     activity: Option<u64>,
 }
 
-/// What a round hands to [`Judge::see`] besides the results.
+/// The input of [`Judge::see`] besides the results.
 #[derive(Clone, Copy, Debug)]
 pub struct Outside {
     /// A stop is requested.
@@ -184,7 +184,7 @@ pub struct Pace {
     pub backoff: Duration,
     /// Shortest time that logs get in a round of a running run.
     pub logs: Duration,
-    /// What a file that is being sent gets beyond the time for logs in a round: the next report waits that long at most.
+    /// Further time for a file that is being sent when the time for logs ends. It delays the next report by no more than this.
     pub in_air: Duration,
     /// How long a network plugin may take until it enforces the policy of a new Pod.
     pub enforced_within: Duration,

@@ -60,7 +60,7 @@ pub trait Evaluation {
     /// An error if the plan of a run contradicts itself.
     fn check(&self, run: &Run) -> Result<(), Refused>;
 
-    /// What reads the results of a run from the `logs` volume.
+    /// The reader of the run's results, on the `logs` volume. An error if the plan cannot be evaluated.
     fn results(&self, run: &Run, tree: Arc<Tree>) -> Result<Box<dyn Results>, Refused>;
 }
 

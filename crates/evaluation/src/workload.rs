@@ -1,4 +1,4 @@
-//! What a Pod runs, as plain data: a kind of evaluation says it, and `pod-spec` makes Kubernetes' objects of it.
+//! The containers of a Pod, as plain data. A kind of evaluation describes them, and `pod-spec` makes Kubernetes' objects of them.
 
 use leaderboard_api::{Attempt, Deadlines, LeaderboardSpec, RunPlan, Track};
 use leaderboard_protocol::graphics::Needs;
@@ -19,7 +19,7 @@ pub struct Reserved {
     pub folders: &'static [&'static str],
 }
 
-/// What a workload depends on.
+/// The input of a workload: the spec, the plan, and the settings of the run.
 #[derive(Clone, Copy, Debug)]
 pub struct Asked<'a> {
     pub spec: &'a LeaderboardSpec,

@@ -22,7 +22,7 @@ const MAX_PATH: usize = 480;
 /// Deepest folder below the one that is walked.
 const MAX_DEPTH: usize = 16;
 
-/// What identifies the content of a file without reading it.
+/// Size, time and inode of a file, which together identify its content without reading it.
 #[derive(Serialize, Deserialize, Clone, Copy, Debug, PartialEq, Eq, Hash, Default)]
 pub struct Stamp {
     /// Bytes.
@@ -306,7 +306,7 @@ impl Tree {
         }
     }
 
-    /// The same as openat2 does, one name at a time.
+    /// Opens as openat2 does, one name at a time.
     fn step_by_step(&self, relative: &str, flags: OFlag) -> Result<OwnedFd, TreeError> {
         let mut at = self.root.try_clone()?;
         let mut names = relative.split('/').peekable();
@@ -330,7 +330,7 @@ impl Stamp {
     }
 }
 
-/// Whether a path is relative, stays below its root, and can be a key.
+/// True if a path is relative, stays below its root, and can be a key.
 pub fn is_plain(path: &str) -> bool {
     path.len() <= MAX_PATH
         && !path.chars().any(char::is_control)

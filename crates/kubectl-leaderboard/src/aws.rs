@@ -35,7 +35,7 @@ pub fn place(storage: Option<&S3Bucket>) -> Vec<String> {
     flags.collect()
 }
 
-/// What `aws` is called with for a copy, quiet but for errors.
+/// Arguments of `aws` for the copy of one object, with only errors printed.
 pub fn copy(from: &str, to: &str, storage: Option<&S3Bucket>) -> Vec<String> {
     let mut arguments = ["s3", "cp", "--only-show-errors"].map(str::to_owned).to_vec();
     arguments.extend(place(storage));
@@ -94,7 +94,7 @@ pub async fn run(arguments: &[String], mut show: impl FnMut(&str)) -> Result<(),
     let complaint = async {
         let mut text = Vec::new();
         if let Some(errors) = errors {
-            // What cannot be read is not shown; the exit status shows that it failed.
+            // An unreadable complaint is left out: the exit status shows the failure.
             let _ = errors.take(LONGEST_ERROR).read_to_end(&mut text).await;
         }
         text

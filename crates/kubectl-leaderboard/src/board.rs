@@ -1,4 +1,4 @@
-//! What keeps the submissions of a Leaderboard from starting: it is missing, paused, not Ready or being deleted.
+//! Reasons of a Leaderboard that keep its submissions from starting: it is missing, paused, not Ready or being deleted.
 //!
 //! Called by `why`, `overview` and `change`. Pure.
 
@@ -24,7 +24,7 @@ impl<'a> Observed<'a> {
         }
     }
 
-    /// Whether the host lets nothing new start.
+    /// True if the Leaderboard is known and paused, so that nothing new starts.
     pub(super) fn is_paused(self) -> bool {
         self.leaderboard().is_some_and(|l| l.spec.paused)
     }

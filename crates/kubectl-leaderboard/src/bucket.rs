@@ -21,7 +21,7 @@ pub fn folder(results: &str, folder: Option<&Path>, storage: Option<&S3Bucket>) 
     }
 }
 
-/// A word of a command that people copy: an imported address is a text of a table's row, and no shell may run any part of it.
+/// A word of a command that people copy. An imported address is a text of a table's row, so a shell must not run any part of it.
 fn word(text: &str) -> String {
     let is_plain = |c: char| c.is_ascii_alphanumeric() || "/._:-=@+,".contains(c);
     if text.chars().all(is_plain) {

@@ -1,4 +1,4 @@
-//! Whether a submission can be cancelled, resumed or restarted, the patch that does it, and what happens then.
+//! Decides if a submission can be cancelled, resumed or restarted; makes the patch that does it, and the lines that explain it.
 //!
 //! Called by `commands`. Pure; the API server's own rules decide in the end.
 
@@ -10,12 +10,12 @@ use super::facts::{command, has_ended, is_attempt_requested, is_run, shown};
 use super::text::{Frame, span, when, wrap};
 use leaderboard_api::{Attempt, Deadlines, Reason, State, Submission, SubmissionStatus};
 
-/// What a person asks for.
+/// The change that a person requests.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 pub enum Request {
     Cancel,
     Resume,
-    /// The same for many: in few words.
+    /// Resume as one of many, explained in few words.
     ResumeMany,
     /// A higher attempt of a live run.
     Restart,
@@ -26,7 +26,7 @@ pub enum Request {
 pub struct Change {
     /// The merge patch; none if the request was made before.
     pub patch: Option<Value>,
-    /// What happens then.
+    /// Lines that explain the consequences.
     pub lines: Vec<String>,
     /// The attempt whose end fulfils the request.
     pub attempt: Attempt,
@@ -88,7 +88,7 @@ fn cancel(submission: &Submission, leaderboard: Observed<'_>, frame: Frame) -> R
     })
 }
 
-/// What the operator does about a stop at this stage; docs/states.md has the details.
+/// One sentence on how the operator stops the run at its present stage; docs/states.md has the details.
 fn how_it_stops(submission: &Submission, leaderboard: Observed<'_>) -> String {
     let status = submission.status.as_ref().filter(|status| !status.has_ended());
     if status.is_none_or(|s| s.job_name.is_none()) {
@@ -96,7 +96,7 @@ fn how_it_stops(submission: &Submission, leaderboard: Observed<'_>) -> String {
     }
     let seconds = match leaderboard {
         Observed::Found(leaderboard) => Some(leaderboard.spec.deadlines.cancel_seconds),
-        // What the operator takes then.
+        // The operator uses the default if the Leaderboard is gone.
         Observed::Missing => Some(Deadlines::default().cancel_seconds),
         Observed::Forbidden => None,
     };
@@ -230,7 +230,7 @@ fn not_resumable(submission: &Submission) -> Option<String> {
     }
 }
 
-/// What to do when the API server refuses a patch.
+/// Next step after the API server refused a patch.
 pub fn after_refusal(request: Request, submission: &Submission) -> String {
     match (request, submission.spec.evalai) {
         (Request::Resume | Request::ResumeMany, Some(evalai)) => format!(

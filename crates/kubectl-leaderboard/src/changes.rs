@@ -49,7 +49,7 @@ pub async fn resume(cluster: &Cluster, wanted: &resume::Resume) -> Result<ExitCo
     }
     print(&resume::lines(&chosen, frame));
     print(&[String::new()]);
-    // Where nobody can be asked, the command is the answer.
+    // Without a terminal there is no answer, and the command itself counts as a yes.
     if !wanted.yes && !output::ask(&resume::question(verb, chosen.len())).unwrap_or(true) {
         print(&["Nothing was changed.".to_owned()]);
         return Ok(ExitCode::SUCCESS);
@@ -82,8 +82,8 @@ async fn send_all(cluster: &Cluster, request: Request, chosen: &[&Submission]) -
     Ok(code(requested == names.len()))
 }
 
-/// Sends a request for each; returns those that were taken, with their attempts. One that is refused does not hold up the others, but
-/// without the right to it, or a way to the API server, no further one is tried.
+/// Sends the request for each submission; returns those that the API server took, with their attempts. A refusal does not hold up the
+/// others. It ends with the first error that each request would meet: no right, no credentials, or no API server.
 async fn send_each<'a>(
     cluster: &Cluster,
     request: Request,

@@ -25,7 +25,7 @@ use crate::why;
 /// Start of a check's name. The API server takes no other, so that its prefix in the bucket is never a team's.
 const NAME_PREFIX: &str = "check-";
 
-/// What is to be checked, and how long to wait.
+/// Arguments of `check`: the Leaderboard, the agent, and the time to wait.
 #[derive(Args, Debug)]
 pub struct Check {
     /// Name of the Leaderboard.
@@ -102,7 +102,7 @@ pub(super) fn object(leaderboard: &Leaderboard, wanted: &Check) -> Result<Value,
     Ok(submit::manifest(NAME_PREFIX, &wanted.name, &spec))
 }
 
-/// What is known of a check: its own `why`, and all conditions of its Leaderboard.
+/// Lines about a check: its own `why`, and all conditions of its Leaderboard.
 pub(super) fn lines(submission: &Submission, leaderboard: Observed<'_>, frame: Frame) -> Vec<String> {
     let mut page = frame.page();
     for found in conditions_of(leaderboard) {
@@ -118,7 +118,7 @@ pub(super) fn lines(submission: &Submission, leaderboard: Observed<'_>, frame: F
     lines
 }
 
-/// Whether its run has finished, and is stored and sent to CloudWatch, and the Leaderboard is Ready.
+/// True if the check is Finished, its condition Logged is not False, and the Leaderboard is Ready.
 pub(super) fn has_passed(submission: &Submission, leaderboard: Observed<'_>) -> bool {
     let is_well = |status: &SubmissionStatus| {
         let logged = conditions::get(&status.conditions, conditions::LOGGED);

@@ -67,7 +67,7 @@ pub struct Scope {
 /// All states of a submission.
 const STATES: [&str; 6] = ["Pending", "Running", "Resumed", "Finished", "Failed", "Cancelled"];
 
-/// Whose submissions.
+/// Limits a list of submissions to a Leaderboard, a track and a team.
 #[derive(Args, Clone, Debug, Default)]
 pub struct Filter {
     /// Only this Leaderboard.
@@ -82,7 +82,7 @@ pub struct Filter {
 }
 
 impl Filter {
-    /// Whether nothing is left out.
+    /// True if no flag limits the list.
     pub fn is_empty(&self) -> bool {
         self.leaderboard.is_none() && self.track.is_none() && self.team.is_none()
     }
@@ -109,7 +109,7 @@ impl Filter {
 }
 
 impl Scope {
-    /// Whether a submission fits; a new one is Pending.
+    /// True if the state and the filter take a submission; a new one counts as Pending.
     fn takes(&self, one: &Submission) -> bool {
         let state = one
             .status
@@ -120,7 +120,7 @@ impl Scope {
         (self.state.is_empty() || self.state.iter().any(is_state)) && self.filter.takes(one)
     }
 
-    /// What it leaves only, in words; none if it leaves all.
+    /// The limits in words, such as `the Leaderboard a and the team b`; None without limits.
     pub fn words(&self) -> Option<String> {
         let (filter, states) = (&self.filter, self.state.join(" or "));
         let parts = [
@@ -154,7 +154,7 @@ pub enum Fetched {
 }
 
 impl Fetched {
-    /// The same by reference.
+    /// Borrows the answer.
     pub fn observed(&self) -> Observed<'_> {
         match self {
             Self::Found(leaderboard) => Observed::Found(leaderboard),

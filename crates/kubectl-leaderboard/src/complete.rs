@@ -1,4 +1,4 @@
-//! What a shell offers for a command line that is not finished. Pure; `main` asks the cluster for names.
+//! Completes a command line that is not finished. Pure; `main` asks the cluster for names.
 //!
 //! kubectl calls a program `kubectl_complete-leaderboard` with the words so far, and takes lines and a directive in cobra's form.
 
@@ -15,7 +15,7 @@ exec kubectl-leaderboard complete -- \"$@\"
 pub const NO_FILES: &str = ":4";
 pub const FILES: &str = ":0";
 
-/// What fits.
+/// Candidates for a word.
 #[derive(Clone, Debug, PartialEq, Eq)]
 pub enum Offer {
     Words(Vec<String>),
@@ -27,7 +27,7 @@ pub enum Offer {
     Files,
 }
 
-/// What fits in place of the last word, which may be empty.
+/// Candidates for the last word, which may be empty.
 pub fn offer(command: &Command, words: &[String]) -> Offer {
     let (last, before) = words
         .split_last()
@@ -61,7 +61,7 @@ pub fn offer(command: &Command, words: &[String]) -> Offer {
     }
 }
 
-/// Those of the words that begin like the last one, each once.
+/// The words that begin like the last one, sorted, each once.
 pub fn fitting(words: impl IntoIterator<Item = String>, last: &str) -> Offer {
     let mut words: Vec<String> = words.into_iter().filter(|word| word.starts_with(last)).collect();
     words.sort();

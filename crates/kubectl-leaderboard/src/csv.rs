@@ -4,9 +4,9 @@
 
 use crate::text::clean;
 
-/// What a spreadsheet takes for the beginning of a formula; the wide forms in some languages.
+/// Characters with which a formula begins in a spreadsheet; the wide forms count in some languages.
 const FORMULA: [char; 8] = ['=', '+', '-', '@', '＝', '＋', '－', '＠'];
-/// What ends a cell in the spreadsheets of some countries.
+/// Characters that end a cell in the spreadsheets of some countries.
 const OTHER_SEPARATORS: [char; 2] = [';', '|'];
 
 /// One line.

@@ -43,7 +43,7 @@ struct Replica {
     port: u16,
 }
 
-/// What all connections share.
+/// State that all connections share.
 struct Forwards {
     pods: Api<Pod>,
     /// The replica that answered last.
@@ -63,7 +63,7 @@ pub async fn dashboard(cluster: &Cluster, wanted: &Dashboard) -> Result<(), Erro
         replica: Mutex::default(),
         printed: Mutex::default(),
     });
-    // What is missing is shown before a browser is sent there.
+    // A missing replica or port is an error before a browser opens.
     forwards.find().await.map_err(Error::Unfit)?;
     let address = SocketAddr::from((Ipv4Addr::LOCALHOST, wanted.port));
     let taken = |error| Error::Unfit(format!("cannot listen on {address}: {error}. Choose another --port"));

@@ -35,7 +35,7 @@ pub enum Error {
     /// No object has the name.
     #[error("there is no {kind} {name} in namespace {namespace}. {next}")]
     Unknown {
-        /// What it is.
+        /// The object's kind, such as `submission`.
         kind: &'static str,
         /// As the person wrote it.
         name: String,
@@ -52,7 +52,7 @@ pub enum Error {
     Refused {
         /// Its message.
         message: String,
-        /// What to do instead.
+        /// The next step.
         next: String,
     },
     /// Others keep changing the object.
@@ -80,7 +80,7 @@ pub enum Error {
     Unreachable {
         /// Where it is.
         server: Option<String>,
-        /// What happened.
+        /// The cause, such as a refused connection.
         why: String,
     },
     /// An object does not have the expected form.
@@ -117,7 +117,7 @@ impl From<kube::Error> for Error {
 }
 
 impl Error {
-    /// The same with the address of the API server that was asked.
+    /// Adds the API server's address to an error that lacks it; leaves other errors as they are.
     #[must_use]
     pub fn naming(self, api_server: &str) -> Self {
         match self {

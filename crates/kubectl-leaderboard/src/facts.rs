@@ -1,4 +1,4 @@
-//! What is read off one Submission, and how it is called: its state, since when, its team and track.
+//! Facts of one Submission in words: its state, since when, its team and track.
 //!
 //! Called by every module that shows or changes submissions. Pure: the time is handed in.
 
@@ -7,7 +7,7 @@ use k8s_openapi::apimachinery::pkg::apis::meta::v1::Time;
 use kube::ResourceExt;
 
 use super::text::{Frame, join, span, when};
-use leaderboard_api::{Attempt, FailureClass, ReasonName, State, Submission, SubmissionStatus, Waiting, conditions};
+use leaderboard_api::{Attempt, FailureClass, State, Submission, SubmissionStatus, Waiting, conditions};
 
 /// The state as people read it.
 pub(super) fn shown(submission: &Submission) -> &'static str {
@@ -38,18 +38,11 @@ pub(super) fn since(submission: &Submission) -> Option<Timestamp> {
     found.or_else(|| submission.creation_timestamp().map(|t| t.0))
 }
 
-/// Why it is in its state: the reason, unless it is the state's own name, and a message about it. The progress of a run that goes on
-/// or has finished says what its message would.
+/// Why it is in its state: the status's reason with the message, or the message alone. Empty without a reason if there is progress, which
+/// says what the message would; a cancelled one keeps its message.
 pub(super) fn reason(status: &SubmissionStatus, message: &str) -> String {
-    let state = status.known_state();
-    let is_cancelled = state == Some(State::Cancelled);
-    let state = state.map(State::as_str);
-    match status
-        .reason
-        .as_ref()
-        .map(ReasonName::as_str)
-        .filter(|reason| Some(*reason) != state)
-    {
+    let is_cancelled = status.known_state() == Some(State::Cancelled);
+    match &status.reason {
         Some(reason) => join(&[&format!("{reason}:"), message]).trim_end_matches(':').to_owned(),
         None if status.progress.is_some() && !is_cancelled => String::new(),
         None => message.to_owned(),
@@ -85,17 +78,13 @@ pub(super) fn headline(submission: &Submission, now: Timestamp) -> String {
     }
 }
 
-/// The state of this attempt, or of a later one, with its reason; and with the message, as a person who waits for it reads it. None before
-/// the attempt has begun.
+/// The state of this attempt, or of a later one, with its reason. Then the lines for a person who waits for it, which have the message
+/// too. None before the attempt has begun.
 pub(super) fn transition(submission: &Submission, attempt: Attempt, frame: Frame) -> Option<(String, Vec<String>)> {
     let status = submission.status.as_ref().filter(|s| s.attempt >= Some(attempt))?;
     let shown = status.state_of_conditions().as_str();
-    let reason = status
-        .reason
-        .as_ref()
-        .map(ReasonName::as_str)
-        .filter(|reason| *reason != shown);
-    let reason = reason.map(|reason| format!(" ({reason})")).unwrap_or_default();
+    let reason = status.reason.as_ref().map(|reason| format!(" ({reason})"));
+    let reason = reason.unwrap_or_default();
     let state = format!("{} is {shown}{reason}", submission.name_any());
     let text = format!("{state}: {}", status.message.as_deref().unwrap_or_default());
     let mut page = frame.page();
@@ -126,19 +115,19 @@ pub(super) fn track(submission: &Submission) -> String {
     text
 }
 
-/// Whether the attempt has ended and no higher one is requested.
+/// True if the attempt has ended and no higher one is requested.
 pub(super) fn has_ended(submission: &Submission) -> bool {
     let status = submission.status.as_ref();
     status.is_some_and(SubmissionStatus::has_ended) && !is_attempt_requested(submission)
 }
 
-/// Whether it has a Job and has not ended.
+/// True if the submission has a Job and has not ended.
 pub(super) fn is_run(submission: &Submission) -> bool {
     let status = submission.status.as_ref();
     status.is_some_and(|status| status.job_name.is_some() && !status.has_ended())
 }
 
-/// Whether a higher attempt is requested than the operator has started.
+/// True if a higher attempt is requested than the operator has started.
 pub(super) fn is_attempt_requested(submission: &Submission) -> bool {
     let status = submission.status.as_ref();
     status.is_some_and(|status| status.is_followed_by(submission.spec.attempt))

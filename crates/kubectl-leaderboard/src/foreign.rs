@@ -1,5 +1,5 @@
-//! Endpoints that are not AWS's. A Leaderboard names them, and a person's own program `aws` would sign its request with the person's
-//! credentials, session token included: the owner of that server gets the token.
+//! Endpoints that are not AWS's. A Leaderboard names them. The program `aws` signs its requests with the person's own credentials.
+//! The session token is in each request, so the owner of such a server would get it.
 //!
 //! Called by what starts that program. Pure, but for the person's own variables.
 

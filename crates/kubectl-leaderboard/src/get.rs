@@ -18,7 +18,7 @@ use crate::table::table;
 use crate::text::{Frame, clean, size, span, wrap};
 use crate::{bucket, facts, foreign};
 
-/// What is fetched.
+/// Arguments of `get`: the submission, and the folder for its files.
 #[derive(Args, Debug)]
 pub struct Get {
     /// Name of the submission.
@@ -102,7 +102,7 @@ async fn download(
     Ok(ExitCode::SUCCESS)
 }
 
-/// Whether nothing is overwritten there.
+/// Refuses a folder that has files, so that nothing is overwritten.
 fn is_free(folder: &Path) -> Result<(), String> {
     let shown = folder.display();
     match std::fs::read_dir(folder).map(|mut entries| entries.next().is_none()) {
@@ -142,7 +142,7 @@ async fn list(results: &str, storage: Option<&S3Bucket>) -> Result<Vec<Stored>, 
     Ok(stored)
 }
 
-/// Whether a key is a path below any folder, on each system.
+/// True if a key is a path that stays below any folder, on each system.
 pub(super) fn stays_within(key: &str) -> bool {
     let is_plain = |part: &str| !part.is_empty() && part != "." && part != "..";
     let is_safe = |c: char| !c.is_control() && c != '\\' && c != ':';
@@ -182,7 +182,7 @@ pub(super) fn lines(submission: &Submission, stored: &[Stored], frame: Frame) ->
     lines
 }
 
-/// What is in the folder.
+/// Lines at the end of a copy, with a note if the submission has not ended.
 pub(super) fn done(submission: &Submission, frame: Frame) -> Vec<String> {
     let part = if facts::has_ended(submission) {
         String::new()

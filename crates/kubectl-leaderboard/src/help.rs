@@ -1,4 +1,4 @@
-//! What the help of each command has besides its flags: examples, the place of the global options, and addresses of documents.
+//! Parts of each command's help besides its flags: examples, the place of the global options, and addresses of documents.
 
 use clap::Command;
 

@@ -37,7 +37,7 @@ pub struct Logs {
     endpoint: Option<String>,
 }
 
-/// Whose log is shown.
+/// The containers whose log is shown.
 #[derive(ValueEnum, Clone, Copy, Debug, Default, PartialEq, Eq)]
 pub(super) enum Whose {
     #[default]
@@ -79,7 +79,7 @@ impl Whose {
         }
     }
 
-    /// Whether each container begins when the one before has ended.
+    /// True if each container begins when the one before has ended.
     fn is_in_turn(self) -> bool {
         self == Self::Start
     }
@@ -139,7 +139,7 @@ fn no_worker(name: &str, worker: usize, workers: usize) -> String {
     }
 }
 
-/// That nothing can be followed yet.
+/// One sentence for a submission that has no log to follow yet.
 pub(super) fn begins_later(submission: &Submission) -> String {
     let shown = facts::shown(submission);
     format!(
@@ -148,19 +148,17 @@ pub(super) fn begins_later(submission: &Submission) -> String {
     )
 }
 
-/// That a container runs again; the lines of its life before are above.
+/// One sentence between the lives of a container; the lines of the life before are above.
 pub(super) fn begins_again(container: &str, restarts: i32) -> String {
     format!("{container} was started again (restart {restarts}). Its log follows.")
 }
 
-/// What has become of a submission whose log was followed.
+/// One sentence about the end of a submission whose log was followed, with the next step.
 pub(super) fn end(submission: &Submission) -> String {
     let status = submission.status.as_ref();
     let shown = facts::shown(submission);
     let reason = status.and_then(|status| status.reason.as_ref());
-    let reason = reason
-        .filter(|reason| reason.as_str() != shown)
-        .map(|reason| format!(" ({reason})"));
+    let reason = reason.map(|reason| format!(" ({reason})"));
     let next = if shown == State::Finished.as_str() {
         String::new()
     } else {

@@ -1,8 +1,8 @@
 //! `kubectl leaderboard`: shows and explains submissions, changes them, and checks Leaderboards and manifests.
 //!
-//! `why`, `status`, `overview`, `top`, `change`, `resume` and `facts` are pure and hold what is printed and decided; `cluster` talks to
-//! the API server; `commands` and `changes` bring both together. `import` and `lint` make text of text. The plugin shows what the status holds, and
-//! contacts neither EvalAI nor AWS; where that helps, it starts the person's own `aws` program.
+//! `why`, `status`, `overview`, `top`, `change`, `resume` and `facts` are pure: they decide, and make the lines to print.
+//! `cluster` talks to the API server; `commands` and `changes` bring both together. `import` and `lint` make text of text.
+//! The plugin shows the status and contacts neither EvalAI nor AWS; where files or logs help, it starts the person's own `aws` program.
 
 mod aws;
 mod board;
@@ -283,7 +283,7 @@ async fn complete(words: &[String]) {
     // The flags that name the cluster may be among the words; the last one may be half of anything.
     let before = words.split_last().map_or(&[][..], |(_, before)| before);
     let before = std::iter::once("kubectl-leaderboard").chain(before.iter().map(String::as_str));
-    // What the command requires may not be there yet.
+    // A required argument may be missing while its line is typed.
     let matches = Cli::command().ignore_errors(true).try_get_matches_from(before);
     let target = matches.ok().and_then(|matches| Target::from_arg_matches(&matches).ok());
     let target = target.unwrap_or_default();

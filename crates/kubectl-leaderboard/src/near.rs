@@ -21,7 +21,7 @@ pub(super) fn names(wrong: &str, known: &[String]) -> Vec<String> {
     found.into_iter().take(MOST).map(|(_, name)| name.clone()).collect()
 }
 
-/// Where else to look for an object of this kind: in a namespace that has one of its name, under a name like it, or among all.
+/// Where else to look for an object: in a namespace that has one of its name, under a name like it, or among all.
 pub(super) fn next(kind: &str, wrong: &str, namespace: &str, known: &[String], elsewhere: &[String]) -> String {
     let near = names(wrong, known);
     match elsewhere {

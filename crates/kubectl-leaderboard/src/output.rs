@@ -17,10 +17,10 @@ use super::text::{WIDTH, clean, hanging, join};
 const NARROWEST: usize = 60;
 const WIDEST: usize = 120;
 
-/// Whether lines are coloured; set once at the start.
+/// True if lines are coloured; set once at the start.
 static COLOURS: OnceLock<bool> = OnceLock::new();
 
-/// What a command prints.
+/// Output format of a command.
 #[derive(ValueEnum, Clone, Copy, Debug, Default, PartialEq, Eq)]
 pub enum Format {
     #[default]
@@ -152,7 +152,7 @@ pub struct Screen {
 }
 
 impl Screen {
-    /// Whether it can be drawn over: then the times on it go on.
+    /// True on a terminal, where lines can be drawn over, and ages grow as time passes.
     pub fn is_live() -> bool {
         terminal().is_some()
     }
@@ -170,7 +170,7 @@ impl Screen {
     }
 }
 
-/// What draws lines over those before. Nothing is erased but what they leave, so the screen is never empty for a moment.
+/// The text that draws lines over those before. It erases only the rest of each line and of the screen, so the screen never blinks.
 fn redrawn(lines: &[String], (columns, rows): (usize, usize), is_coloured: bool, is_drawn: bool) -> String {
     let mut text = if is_drawn {
         HOME.to_owned()

@@ -46,7 +46,7 @@ impl Place<'_> {
     }
 }
 
-/// What is printed where there is no submission that has what `words` name. `elsewhere` are the namespaces that have some, with their number.
+/// Lines for an empty list. `words` are its limits; `elsewhere` are the namespaces that have submissions, with their number.
 pub fn nothing(place: Place<'_>, words: Option<&str>, elsewhere: &[(String, usize)], frame: Frame) -> Vec<String> {
     let namespace = place.namespace;
     let others: Vec<String> = elsewhere
@@ -110,7 +110,7 @@ pub fn lines(
     lines
 }
 
-/// The same for programs: those that have a line, each as `why NAME` has it.
+/// The submissions that have a line, as JSON; each as `why NAME -o json` has it.
 pub fn value(submissions: &[Submission], leaderboards: Option<&[Leaderboard]>, now: Timestamp) -> Value {
     let place = Place {
         namespace: "",
@@ -129,7 +129,7 @@ pub fn value(submissions: &[Submission], leaderboards: Option<&[Leaderboard]>, n
     Value::Array(shown.map(|one| why::value(one, board_of(one))).collect())
 }
 
-/// What is wrong with the existing Leaderboards, and with those that submissions name.
+/// Lines about the problems of existing Leaderboards, and of those that submissions name.
 fn of_leaderboards(place: Place<'_>, submissions: &[Submission], leaderboards: Option<&[Leaderboard]>) -> Vec<String> {
     let Some(leaderboards) = leaderboards else {
         return vec!["You have no right to read Leaderboards; one may be paused or not Ready.".to_owned()];
@@ -212,7 +212,7 @@ fn own_reason(submission: &Submission, status: &SubmissionStatus) -> Option<Stri
     }
 }
 
-/// What keeps EvalAI, or after it DynamoDB, from having the result: the table's row follows EvalAI, so the first is enough.
+/// The system that lacks the result for too long, with the reason. The first is enough: DynamoDB's row follows EvalAI.
 fn other_systems(status: &SubmissionStatus, now: Timestamp) -> Option<String> {
     let late = |c: &&Condition| {
         let age = now.duration_since(c.last_transition_time.0).as_secs();

@@ -40,7 +40,7 @@ pub async fn pause(cluster: &Cluster, wanted: &Pause, paused: bool) -> Result<Ex
     Ok(ExitCode::SUCCESS)
 }
 
-/// What happens to submissions that run, that wait, and that come.
+/// Lines about the Leaderboard and its submissions that run, that wait, and that come.
 pub(super) fn lines(board: &Leaderboard, is_same: bool, frame: Frame) -> Vec<String> {
     let (name, namespace) = (board.name_any(), board.namespace().unwrap_or_default());
     let counts = board.status.as_ref().and_then(|status| status.counts.as_ref());

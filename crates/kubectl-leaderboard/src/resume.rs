@@ -48,7 +48,7 @@ pub struct Resume {
 }
 
 impl Resume {
-    /// What each of them is asked for.
+    /// The request to send for each submission.
     pub fn request(&self) -> Request {
         if self.restart {
             Request::Restart
@@ -59,7 +59,7 @@ impl Resume {
         }
     }
 
-    /// What is done, as a command.
+    /// The command as a verb.
     pub fn verb(&self) -> &'static str {
         if self.restart { "restart" } else { "resume" }
     }
@@ -90,7 +90,7 @@ impl Resume {
         })
     }
 
-    /// What is shown where none of so many submissions fits.
+    /// Lines for the case that none of `number` submissions fits.
     pub fn none(&self, number: usize, namespace: &str, frame: Frame) -> Vec<String> {
         let cause = if self.infrastructure {
             " because of the infrastructure"
@@ -114,7 +114,7 @@ impl Resume {
     }
 }
 
-/// What is chosen, with the class of each failure.
+/// A table of the chosen submissions, with the class of each failure.
 pub fn lines(chosen: &[&Submission], frame: Frame) -> Vec<String> {
     let rows: Vec<Vec<String>> = chosen.iter().map(|one| row(one, frame.now)).collect();
     let is_by_evaluator = |one: &&Submission| matches!(evaluation(one), Some(PlannedEvaluation::Container(_)));
@@ -127,7 +127,7 @@ pub fn lines(chosen: &[&Submission], frame: Frame) -> Vec<String> {
     table(&head, &rows, frame.width)
 }
 
-/// What a command would do.
+/// The table, and a sentence about the effect without `--dry-run`.
 pub fn dry_run(verb: &str, chosen: &[&Submission], frame: Frame) -> Vec<String> {
     let mut lines = lines(chosen, frame);
     let number = counted(chosen.len());
@@ -173,7 +173,7 @@ pub fn question(verb: &str, number: usize) -> String {
     format!("{}{rest} {}?", first.to_uppercase(), counted(number))
 }
 
-/// What has become of all, after a line of each.
+/// The sum after a line for each submission: how many were requested, and how many were refused.
 pub fn summary(requested: usize, chosen: usize, namespace: &str, frame: Frame) -> Vec<String> {
     let refused = match chosen - requested {
         0 => String::new(),

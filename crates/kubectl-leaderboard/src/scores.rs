@@ -27,7 +27,7 @@ const GAP: usize = 2;
 /// The team of a submission that has none.
 const NO_TEAM: &str = "(none)";
 
-/// Whose standings, and how they are printed.
+/// Arguments of `scores`: the standings to print, and their format.
 #[derive(Args, Debug)]
 pub struct Scores {
     /// Name of the Leaderboard [default: all of the namespace].
@@ -43,7 +43,7 @@ pub struct Scores {
     format: As,
 }
 
-/// What is printed.
+/// Output format of the standings.
 #[derive(ValueEnum, Clone, Copy, Debug, Default, PartialEq, Eq)]
 enum As {
     #[default]
@@ -243,7 +243,7 @@ fn cells(rows: &[Standing], metric: &str, metrics: &[&str]) -> (Vec<String>, Vec
     (head.collect(), rows.iter().map(row).collect())
 }
 
-/// Whether a table does without cutting more than the names of teams.
+/// True if a table fits with only the names of teams cut, to `TEAM` columns.
 fn fits(head: &[String], rows: &[Vec<String>], width: usize) -> bool {
     let widest = |column: usize| {
         let cells = rows.iter().filter_map(|row| row.get(column));
@@ -279,7 +279,7 @@ fn metric_names<'a>(rows: impl IntoIterator<Item = &'a Standing>) -> Vec<&'a str
     names
 }
 
-/// The same for programs.
+/// The standings as JSON.
 pub(super) fn value(boards: &[Board]) -> Value {
     let item = |board: &Board| {
         json!({
@@ -290,7 +290,7 @@ pub(super) fn value(boards: &[Board]) -> Value {
     Value::Array(boards.iter().map(item).collect())
 }
 
-/// The same for a spreadsheet: one line for each row of all tracks.
+/// The standings for a spreadsheet: one line for each row of all tracks.
 pub(super) fn comma_separated(boards: &[Board]) -> Vec<String> {
     let metrics = metric_names(boards.iter().flat_map(|board| &board.rows));
     let head = ["namespace", "leaderboard", "track", "rank", "team", "metric", "score"];

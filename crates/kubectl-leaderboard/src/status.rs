@@ -165,7 +165,7 @@ pub fn lines(submissions: &[Submission], is_qualified: bool, is_wide: bool, fram
         .into_iter()
         .map(|one| row(one, is_qualified, is_wide, now))
         .collect();
-    // Who asks for more columns has the space for them, or takes what the terminal makes of it.
+    // `-o wide` is printed whole: the person has the space, or accepts broken lines.
     table(&head, &rows, if is_wide { usize::MAX } else { frame.width })
 }
 
@@ -227,7 +227,7 @@ fn place(waiting: &Waiting) -> String {
     format!("#{}{}", waiting.position, eta.unwrap_or_default())
 }
 
-/// The same for programs.
+/// The status as JSON.
 pub fn value(submission: &Submission) -> Value {
     json!({
         "name": submission.name_any(),

@@ -9,7 +9,7 @@ use crate::board::{self, Observed};
 use crate::facts::command;
 use crate::text::Frame;
 
-/// What is submitted.
+/// Arguments of `submit`.
 #[derive(Args, Debug)]
 pub struct Submit {
     /// Name of the Leaderboard.
@@ -38,7 +38,7 @@ pub struct Submit {
     pub wait: bool,
 }
 
-/// Whether the Leaderboard has the track; the text has the next step. Of one that cannot be read, the operator will know.
+/// Refuses a track that the Leaderboard lacks, with the next step. An unreadable Leaderboard passes: the operator checks it.
 pub fn fits(name: &str, track: &str, leaderboard: Observed<'_>) -> Result<(), String> {
     let Some(found) = leaderboard.leaderboard() else {
         return Ok(());
@@ -53,7 +53,7 @@ pub fn fits(name: &str, track: &str, leaderboard: Observed<'_>) -> Result<(), St
     ))
 }
 
-/// What was submitted, what keeps it from starting, and how to follow it.
+/// Lines about the new submission, the obstacles to its start, and the commands to follow it.
 pub fn lines(created: &Submission, leaderboard: Observed<'_>, frame: Frame) -> Vec<String> {
     let (spec, mut page) = (&created.spec, frame.page());
     page.paragraph(&format!(

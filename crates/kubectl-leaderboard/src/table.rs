@@ -6,18 +6,18 @@ use crate::text::{clean, columns, cut, cut_start, padded};
 const GAP: usize = 2;
 /// The fewest columns to which a cell is cut.
 const LEAST: usize = 8;
-/// What is copied from a table or searched for, so it is not cut.
+/// Columns that are never cut, because people copy them or search for them.
 const WHOLE: [&str; 5] = ["NAMESPACE", "NAME", "SUBMISSION", "STATE", "REASON"];
-/// What `why`, `logs` and `-o wide` show as well, so that a narrow terminal may go without it.
+/// Columns that a narrow terminal may go without: `why`, `logs` and `-o wide` show them as well.
 const SPARE: [&str; 5] = ["QUEUE", "CRASHES", "NODE", "SIMULATOR", "EVALUATOR"];
-/// What is cut at its start: the tags of an image's versions differ at the end.
+/// Columns that are cut at their start: the tags of an image's versions differ at the end.
 const ENDS: [&str; 2] = ["SIMULATOR", "EVALUATOR"];
-/// What a bar is made of: the part that is done, and the rest.
+/// Characters of a bar: the part that is done, and the rest.
 pub(super) const DONE: char = '█';
 pub(super) const OPEN: char = '░';
 
-/// Lines of a table with its head, of at most `width` columns as far as cutting its widest cells can help. Each cell is cleaned: many were
-/// written by strangers.
+/// Lines of a table with its head, at most `width` columns wide if cutting its widest cells is enough. Each cell is cleaned, because
+/// participants wrote many of them.
 pub(super) fn table(head: &[&str], rows: &[Vec<String>], width: usize) -> Vec<String> {
     let head: Vec<String> = head.iter().map(|title| (*title).to_owned()).collect();
     let rows: Vec<Vec<String>> = rows

@@ -105,7 +105,7 @@ pub(super) fn hanging(text: &str, width: usize) -> Vec<String> {
     lines.map(indented).collect()
 }
 
-/// The words of a text. What stands between two backticks is one, with what touches it.
+/// The words of a text. A text in backticks is one word with the letters that touch it.
 fn words(text: &str) -> Vec<String> {
     let is_balanced = text.matches('`').count().is_multiple_of(2);
     let mut words: Vec<String> = Vec::new();

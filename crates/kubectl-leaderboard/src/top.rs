@@ -12,10 +12,10 @@ use super::text::Frame;
 /// Leaderboard and team.
 type Key = (String, String, String);
 
-/// What a team has in a Leaderboard.
+/// The submissions of one team in one Leaderboard.
 #[derive(Clone, Debug, Default)]
 struct Use {
-    /// Those with a slot, also while their Pod starts.
+    /// Submissions with a slot, also while their Pod starts.
     running: usize,
     waiting: usize,
     first_in_line: Option<i32>,
@@ -151,7 +151,7 @@ fn row((_, board, team): &Key, each: &Use) -> Vec<String> {
     ]
 }
 
-/// The same for programs.
+/// The table as JSON.
 pub fn value(submissions: &[Submission]) -> Value {
     let uses = uses(submissions);
     let items = uses.iter().map(|((namespace, leaderboard, team), each)| {

@@ -22,7 +22,7 @@ const RELEASES: &str = concat!(env!("CARGO_PKG_REPOSITORY"), "/releases/tag/v");
 /// The label by which the chart marks a Pod with the version.
 const LABEL: &str = "app.kubernetes.io/version";
 
-/// Whose version.
+/// Arguments of `version`.
 #[derive(Args, Debug)]
 pub struct Version {
     /// Only this program's: no cluster is asked.
@@ -35,7 +35,7 @@ pub struct Version {
     output: Output,
 }
 
-/// What runs: version and image, with the number of replicas.
+/// Number of replicas by version and image.
 pub(super) type Running = BTreeMap<(String, String), usize>;
 
 /// Prints the versions. Without a cluster the own one is printed all the same.

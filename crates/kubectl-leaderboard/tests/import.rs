@@ -45,7 +45,7 @@ fn file(name: &str, text: &str, mode: u32) -> PathBuf {
     path
 }
 
-/// What the command prints, with its exit code; the token is in nothing of it.
+/// The command's exit code, standard output and standard error. Fails if any of them holds the token.
 fn import(words: &[&str], input: Stdio) -> (Option<i32>, String, String) {
     let queue = "https://sqs.us-west-2.amazonaws.com/123456789012/leaderboard";
     let mut command = Command::new(env!("CARGO_BIN_EXE_kubectl-leaderboard"));

@@ -1,6 +1,6 @@
-//! What the program prints, from its first to its last line, with its exit code: files in `printed/`. UPDATE_GOLDEN=1 writes them.
+//! The program's whole output with its exit code, compared with files in `printed/`. UPDATE_GOLDEN=1 writes them.
 //!
-//! What is printed of times is in the tests of `src/tests`, which have a time of their own.
+//! Output that depends on the time is tested in `src/tests`, which have a time of their own.
 
 #![allow(
     clippy::unwrap_used,

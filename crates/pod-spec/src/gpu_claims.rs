@@ -15,12 +15,12 @@ const HASH_BYTES: usize = 5;
 /// Name of the one request of a claim.
 const REQUEST: &str = "gpu";
 
-/// What the API server calls templates.
+/// The API resource of a ResourceClaimTemplate.
 pub fn resource() -> ApiResource {
     ApiResource::from_gvk(&GroupVersionKind::gvk("resource.k8s.io", "v1", "ResourceClaimTemplate"))
 }
 
-/// What gives the workers of a Leaderboard their GPUs.
+/// The source of the GPUs of a Leaderboard's workers.
 pub fn source(spec: &LeaderboardSpec) -> GpuSource<'_> {
     spec.gpu.as_ref().map_or(GpuSource::None, leaderboard_api::Gpu::source)
 }

@@ -1,8 +1,8 @@
 //! The NetworkPolicy of a Leaderboard: nothing in, out only what its `network` names. Pure; called by the controller in each
 //! reconcile of a Leaderboard, and before each Job.
 //!
-//! It holds for whole Pods, so what logcopy may reach the agents may reach too. Whether it is enforced depends on the
-//! cluster's network plugin, which `pod::isolation` measures.
+//! It holds for whole Pods, so what logcopy may reach the agents may reach too. The cluster's network plugin decides
+//! whether it is enforced, and `pod::isolation` measures that.
 
 use std::collections::BTreeMap;
 
@@ -46,7 +46,7 @@ pub fn network_policy(leaderboard: &Leaderboard) -> NetworkPolicy {
     }
 }
 
-/// Whether a policy, as the API server has it, is the one that the Leaderboard's present spec asks for.
+/// True if a policy, as the API server has it, is the one of the Leaderboard's present spec.
 pub fn is_in_place(found: &NetworkPolicy, leaderboard: &Leaderboard) -> bool {
     let wanted = network_policy(leaderboard);
     let has_labels = wanted.metadata.labels.iter().flatten().all(|(key, value)| {

@@ -1,4 +1,4 @@
-//! What a host should know of the Pods of a Leaderboard although they can be made: shown in `Ready`, which stays True.
+//! Warnings about the Pods of a Leaderboard that can be made all the same: shown in `Ready`, which stays True.
 //!
 //! Pure, on the Pods as they are created, so that every way to say a thing is covered: fields, tracks, `podOverrides`.
 
@@ -224,7 +224,7 @@ mod tests {
             assert_eq!(found.len(), 1);
             assert!(found[0].starts_with("Agents can read Secret key: "), "{found:?}");
         }
-        // One that nobody mounts, and one that is no Secret.
+        // A Secret that no container mounts, and a volume that is no Secret.
         let volumes = json!([{"name": "w", "secret": {"secretName": "key"}}, {"name": "v", "emptyDir": {}}]);
         assert!(notes(&[pods("a", with("volumeMounts", mount()), &volumes)]).is_empty());
     }

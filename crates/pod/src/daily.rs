@@ -3,9 +3,10 @@
 //! Used for S3 (`upload`) and CloudWatch (`ship`), which note it next to the files, so that a restart does not begin anew.
 
 use std::collections::BTreeMap;
-use std::time::{SystemTime, UNIX_EPOCH};
 
 use serde::{Deserialize, Serialize};
+
+use leaderboard_base::clock::Clock;
 
 /// Seconds of a day.
 const DAY: u64 = 24 * 60 * 60;
@@ -67,8 +68,8 @@ impl Daily {
 
 /// The day in UTC, counted from 1970.
 pub fn today() -> u64 {
-    let since = SystemTime::now().duration_since(UNIX_EPOCH).unwrap_or_default();
-    since.as_secs().checked_div(DAY).unwrap_or(0)
+    let seconds = u64::try_from(Clock::system().now().as_second()).unwrap_or_default();
+    seconds.checked_div(DAY).unwrap_or(0)
 }
 
 #[cfg(test)]

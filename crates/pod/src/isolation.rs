@@ -164,7 +164,7 @@ async fn measure(mut reach: impl AsyncFnMut() -> Try, patience: Duration) -> Mea
     }
 }
 
-/// Tries to connect. Of the errors that come at once, only these are an answer of the network.
+/// Tries to connect, for at most [`TRY`]. `of_error` tells the network's answers from other errors that come at once.
 async fn reach(address: SocketAddr) -> Try {
     match timeout(TRY, TcpStream::connect(address)).await {
         Ok(Ok(_)) => Try::Connected,

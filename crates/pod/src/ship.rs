@@ -1,12 +1,12 @@
 //! Sends the containers' logs to CloudWatch: each file once, in order, line by line.
 //!
-//! A task of `logcopy` with a pace of its own, so that neither waits for the other. Streams are `<run id>/<container>`. What
-//! was sent is noted next to the files, so that a restarted logcopy goes on where the last one was.
+//! A task of `logcopy` with a pace of its own, so that neither waits for the other. Streams are `<run id>/<container>`. The position
+//! in each file is noted next to the files, so that a restarted logcopy goes on where the last one was.
 
 use std::collections::{BTreeMap, BTreeSet};
 use std::os::unix::fs::FileExt;
 use std::sync::Arc;
-use std::time::{Duration, Instant, SystemTime, UNIX_EPOCH};
+use std::time::{Duration, Instant};
 
 use serde::{Deserialize, Serialize};
 use tokio::sync::watch;
@@ -17,6 +17,7 @@ use super::upload::Memory;
 use leaderboard_api::RunId;
 use leaderboard_aws::logs::{BETWEEN_BATCHES, LogClient, LogEvent, LogsError, Miss, OVERHEAD, cut};
 use leaderboard_base::backoff::Backoff;
+use leaderboard_base::clock::Clock;
 use leaderboard_contract::keys::{CONTENTS_LOG, OWN_LOG, WORKSPACE_LOG, agent_log, host_log};
 use leaderboard_contract::report::Logs;
 use leaderboard_evidence::{Tree, TreeError};
@@ -78,8 +79,8 @@ pub struct Shipper {
 }
 
 impl Shipper {
-    /// Goes on where the last one was. What a Pod before this one has stored was also sent by it. `a_day`: bytes that one stream
-    /// gets on a day.
+    /// Goes on where the last one was. Bytes that a Pod before this one has stored count as sent: that Pod sent them. `a_day`: bytes
+    /// that one stream gets on a day.
     pub fn new(
         client: LogClient,
         tree: Arc<Tree>,
@@ -343,6 +344,5 @@ fn billed(events: &[LogEvent]) -> u64 {
 }
 
 fn milliseconds() -> i64 {
-    let since = SystemTime::now().duration_since(UNIX_EPOCH).unwrap_or_default();
-    i64::try_from(since.as_millis()).unwrap_or(i64::MAX)
+    Clock::system().now().as_millisecond()
 }

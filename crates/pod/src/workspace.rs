@@ -234,7 +234,7 @@ async fn claim(run: &Run, archive: &Archive) -> Result<Claim, WorkspaceError> {
     )))
 }
 
-/// The report of a run in which nothing has happened. No other file is stored with it.
+/// The report of a run in which no container has started. It names no stored files.
 fn first_report(run: &Run, pod_uid: &str, results: &mut dyn Results) -> Report {
     Report {
         files: BTreeMap::new(),

@@ -1,10 +1,12 @@
-//! What Leaderboards may name where the operator acts with an AWS identity of its own: entries of Secrets Manager, queues, buckets, tables
-//! and log groups. Pure.
+//! Names of entries in Secrets Manager, queues, buckets, tables and log groups that a Leaderboard may use. The operator reaches them
+//! with an AWS identity of its own. Pure.
 //!
-//! Who may edit Leaderboards in one namespace could otherwise have any entry sent to a server of their own, any queue emptied, and the
-//! results and rows of another namespace read and replaced. The chart hands in what `allow` and `namespaces[]` of its values have; without it, as on a
-//! person's machine, everything is allowed. Asked by the controller, which then reads no token, starts and records no run, and shows
-//! `NotAllowed`, and by the bridge, which then reads no queue.
+//! Without this check, anyone who may edit Leaderboards in one namespace could send any entry to a server of their own, and empty
+//! any queue. They could also read and replace the results and rows of another namespace.
+//!
+//! The chart hands in its values `allow` and `namespaces[]`. Without them, as on a person's machine, everything is allowed.
+//! For a name that is not allowed the controller reads no token, starts and records no run, and shows `NotAllowed`. The bridge then
+//! reads no queue.
 
 use std::borrow::Cow;
 use std::collections::BTreeMap;
@@ -18,7 +20,7 @@ use leaderboard_api::Leaderboard;
 /// Stands for every namespace that has no entry of its own.
 const ANY: &str = "*";
 
-/// What Leaderboards may name, by their namespace.
+/// The patterns of allowed names, by namespace. None: everything is allowed.
 #[derive(Clone, Debug, Default, PartialEq, Eq)]
 pub struct Allowed(Option<BTreeMap<String, Patterns>>);
 
@@ -38,7 +40,7 @@ struct Patterns {
     log_groups: Vec<String>,
 }
 
-/// What a Leaderboard names and may not.
+/// A name that a Leaderboard uses and may not.
 #[derive(Clone, Debug, PartialEq, Eq)]
 pub struct NotAllowed {
     kind: Kind,
@@ -170,7 +172,7 @@ fn is_queue(pattern: &str, url: &str) -> bool {
     !url.contains(['?', '#']) && matches(pattern, name)
 }
 
-/// Whether a text matches the pattern: `*` stands for any text, also none; all else for itself.
+/// True if a text matches the pattern: `*` stands for any text, also none; every other character for itself.
 fn matches(pattern: &str, text: &str) -> bool {
     let mut parts = pattern.split('*');
     let first = parts.next().unwrap_or_default();

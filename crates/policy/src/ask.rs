@@ -8,7 +8,7 @@ use leaderboard_api::{DynamoTable, LogGroup, S3Bucket, SecretsManagerKey, SqsQue
 
 /// One kind of question. Everything that makes an older answer useless is part of the question: the attempt, a digest, a stage.
 pub trait Ask: Clone + Debug + PartialEq + Send + 'static {
-    /// The finding. The same answer as before is no news.
+    /// The finding. An answer equal to the one before is no news.
     type Answer: Debug + PartialEq + Send + Sync + 'static;
     /// Reads under way at once.
     const AT_ONCE: usize;

@@ -9,7 +9,7 @@ use super::view::View;
 use leaderboard_api::conditions::{ARCHIVED, FINISHED, PUBLISHED, RECORDED, RUNNING};
 use leaderboard_api::{Attempt, Ingested, Reason, Submission, SubmissionStatus};
 
-/// What a submission goes through.
+/// A stage of a submission's life.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 pub enum Phase {
     /// From EvalAI's message to the object. Without a message it has no length.
@@ -104,7 +104,7 @@ pub fn restarted<'a>(submission: &'a Submission, new: &SubmissionStatus) -> Opti
 struct Found(Vec<Ended>);
 
 impl Found {
-    /// None: nobody knows when it began, so nothing is shown of it.
+    /// Adds nothing if the start is unknown.
     fn add(&mut self, phase: Phase, start: Option<Timestamp>, end: Timestamp) {
         let ended = start.map(|start| Ended {
             phase,
@@ -211,7 +211,7 @@ impl Step<'_> {
         of_pod.or(of_status).or_else(seen)
     }
 
-    /// Whether no further run of the present Job comes.
+    /// True if no further run of the present Job comes.
     fn is_job_over(&self) -> bool {
         let Some(old) = self.old else {
             return self.new.has_ended();
@@ -222,7 +222,7 @@ impl Step<'_> {
     }
 }
 
-/// Whether agents of the present Job run, or have run and may come back.
+/// True if agents of the present Job run, or have run and may come back.
 fn has_run(status: &SubmissionStatus) -> bool {
     status
         .condition(RUNNING)

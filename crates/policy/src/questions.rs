@@ -1,4 +1,4 @@
-//! What `decide` asks of services outside the cluster.
+//! Questions of `decide` to services outside the cluster.
 
 use std::time::Duration;
 

@@ -15,7 +15,7 @@ const LONGEST: usize = 500;
 /// Most splits of a result that are kept.
 const MAX_SPLITS: usize = 16;
 
-/// What is kept of a report. Its texts are read again when they are published.
+/// The part of a report that is kept in memory. Its texts are read again when they are published.
 #[derive(Clone, Debug, Default, PartialEq)]
 pub struct ReportDigest {
     pub id: ContentId,
@@ -39,7 +39,7 @@ pub struct ReportDigest {
     pub unusable: Option<RefusedResults>,
     /// The first warning.
     pub warning: Option<String>,
-    /// Whether the lines of the run come to CloudWatch.
+    /// State of the run's lines in CloudWatch. None without a log group, and until it is known.
     pub logs: Option<Logs>,
     /// The agents' folders fill the volume of the logs.
     pub agents_fill_disk: bool,
@@ -66,13 +66,13 @@ impl ReportDigest {
         Ok(is_of.then(|| Self::of(&report, ContentId::of(bytes))))
     }
 
-    /// Whether the whole run is done, and nothing more comes.
+    /// True if the whole run is done, and nothing more comes.
     pub fn is_complete(&self) -> bool {
         self.is_final && self.done == self.total && self.total > 0
     }
 
-    /// Whether it shows how a run came to its own end, whatever becomes of its Job. Of one that was stopped by a person or for its node
-    /// only results that count do: another Job may go on, which stores no report of its own before its first round.
+    /// True if the report shows how a run came to its own end, with or without its Job. For a run that a person or its node stopped,
+    /// only results that count show it. Another Job may go on, and stores no report of its own before its first round.
     pub fn is_verdict(&self) -> bool {
         let goes_on = matches!(self.stopped, Some(Stop::Interruption | Stop::Cancel));
         let is_spoiled = self.refused.is_some() || self.unusable.is_some();

@@ -23,11 +23,11 @@ pub struct View {
     pub leaderboard: Option<Arc<Leaderboard>>,
     /// The first name that the Leaderboard may not use, in words.
     pub not_allowed: Option<String>,
-    /// Whether the NetworkPolicy that the Leaderboard's present spec asks for is in place; only meaningful while it has no Job.
+    /// True if the NetworkPolicy of the Leaderboard's present spec is in place; only meaningful while the submission has no Job.
     pub is_policy_in_place: bool,
     /// The row that another program may have written of it.
     pub row: Lookup<Row>,
-    /// Whether it may start now; only meaningful while it has no Job and all else is settled.
+    /// Its permission to start; only meaningful while it has no Job and all else is settled.
     pub turn: Turn,
     pub job: ObservedJob,
     pub pod: Option<PodView>,
@@ -147,7 +147,7 @@ pub struct PodView {
     pub scheduled: Option<Timestamp>,
     /// The scheduler's words, while no node fits.
     pub unschedulable: Option<String>,
-    /// What an autoscaler reports of that.
+    /// An autoscaler's report about that.
     pub scale_up: Option<ScaleUp>,
     /// When it has to be gone, once it is being deleted (its grace included).
     pub delete_by: Option<Timestamp>,
@@ -161,13 +161,13 @@ pub struct PodView {
     pub containers: Vec<ContainerView>,
     /// Why the kubelet ended it as a whole: reason and message, for example `Evicted`.
     pub ended_by_node: Option<(String, String)>,
-    /// Who takes it away: the reason of its condition `DisruptionTarget`.
+    /// Cause of its removal: the reason of its condition `DisruptionTarget`.
     pub disruption: Option<String>,
     pub stop: Option<Stop>,
 }
 
 impl PodView {
-    /// Whether it has not ended, so that its node matters.
+    /// True if it has not ended, so that its node matters.
     pub fn needs_node(&self) -> bool {
         self.delete_by.is_some() || self.run_ended.is_none()
     }
@@ -200,7 +200,7 @@ pub struct NodeView {
     pub leaving: Option<String>,
 }
 
-/// What an autoscaler has reported of a Pod that no node accepts.
+/// The report of an autoscaler about a Pod that no node accepts.
 #[derive(Clone, Debug, PartialEq, Eq)]
 pub enum ScaleUp {
     /// A node was asked for.
@@ -213,7 +213,7 @@ pub enum ScaleUp {
 #[derive(Clone, Debug, Default, PartialEq)]
 pub struct ContainerView {
     pub name: SharedText,
-    /// What its node calls the image that it runs or ran: `NAME@sha256:…`, if a registry gave it to the node.
+    /// Its node's name of the image that it runs or ran: `NAME@sha256:…`, if a registry gave it to the node.
     pub image_id: Option<SharedText>,
     pub restarts: i32,
     pub running: bool,
@@ -227,12 +227,12 @@ pub struct ContainerView {
 }
 
 impl ContainerView {
-    /// Whether it belongs to the Pod's own ones, which run before the agents.
+    /// True if it is one of the Pod's own containers, which run before the agents.
     pub fn is_before_agents(&self) -> bool {
         names::INIT_CONTAINERS.contains(&self.name.as_str())
     }
 
-    /// Whether the restarts count a life after the last end.
+    /// True if the restarts count a life after the last end.
     pub fn has_next_life(&self) -> bool {
         self.running || self.begins_anew
     }
@@ -247,22 +247,22 @@ pub struct EndView {
     /// When this life of it began.
     pub began: Option<Timestamp>,
     pub at: Option<Timestamp>,
-    /// What the runner reported. An agent can forge its own.
+    /// The runner's verdict. An agent can forge its own.
     pub verdict: Option<Verdict>,
-    /// What `workspace` reported.
+    /// The reason that `workspace` reported.
     pub own_reason: Option<WorkspaceReason>,
     /// The sentence of a container of the host's, or Kubernetes' own.
     pub why: Option<String>,
 }
 
 impl EndView {
-    /// Whether the kubelet could not even start it.
+    /// True if the kubelet could not start it at all.
     pub fn is_start_error(&self) -> bool {
         matches!(self.reason.as_str(), "StartError" | "ContainerCannotRun")
     }
 }
 
-/// What was known of a run when its report was asked for. What is stored later than that is not in the answer.
+/// Progress of a run when its report was asked for. The answer lacks everything that is stored later.
 #[derive(Clone, Copy, Debug, PartialEq, Eq, PartialOrd, Ord)]
 pub enum Stage {
     /// Its agents may still run.
@@ -304,7 +304,7 @@ pub enum LogAt {
 /// The report in S3, as far as it was read.
 #[derive(Clone, Debug, Default, PartialEq)]
 pub enum ObservedReport {
-    /// It was not read, or nobody has asked for it.
+    /// It was not read, or not asked for.
     #[default]
     NotRead,
     Absent,
@@ -335,7 +335,7 @@ impl ReportView {
     }
 }
 
-/// Whether our own mark is in `logcopy/owner`, so that a lost Pod stores nothing more.
+/// State of our own mark in `logcopy/owner`. While it is there, a lost Pod stores nothing more.
 #[derive(Clone, Copy, Debug, Default, PartialEq, Eq)]
 pub enum ObservedFence {
     #[default]
@@ -347,7 +347,7 @@ pub enum ObservedFence {
     Held,
 }
 
-/// What became of the log that explains a failure.
+/// State of the log that explains a failure.
 #[derive(Clone, Copy, Debug, Default, PartialEq, Eq)]
 pub enum ObservedLog {
     #[default]
@@ -361,10 +361,10 @@ pub enum ObservedLog {
     GivenUp,
 }
 
-/// What is known of the submission in EvalAI.
+/// The operator's knowledge of the submission in EvalAI.
 #[derive(Clone, Debug, Default, PartialEq)]
 pub struct EvalaiView {
-    /// What EvalAI last reported of it; None until it was asked.
+    /// EvalAI's last report of it; None until it was asked.
     pub info: Option<EvalaiInfo>,
     /// How long it has been asked whether the present attempt is to run.
     pub waited: Duration,
@@ -378,13 +378,13 @@ pub struct EvalaiView {
     pub cancelled_as_of: Option<Timestamp>,
     /// A write of ours may have undone that cancel in EvalAI.
     pub overtaken: bool,
-    /// What became of the final result of this attempt.
+    /// Outcome of the final result of this attempt. None until EvalAI has answered.
     pub end: Option<EvalaiEnd>,
     /// Why what the bucket holds of that result cannot be read.
     pub unread: Option<String>,
     /// Units of work in the last partial result of this attempt that EvalAI has answered.
     pub partial_done: Option<u32>,
-    /// Whether the leaderboards of its phase show partial results; no as long as that is not known.
+    /// True if the leaderboards of its phase show partial results; false as long as that is not known.
     pub shows_partial: bool,
     /// Team of its row, as last read.
     pub team_id: Option<String>,
@@ -411,7 +411,7 @@ pub struct EvalaiInfo {
     pub image_problem: Option<String>,
 }
 
-/// What EvalAI's status means for a run of this attempt.
+/// The meaning of EvalAI's status for a run of this attempt.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 pub enum Standing {
     /// It wants to run.
@@ -422,7 +422,7 @@ pub enum Standing {
     Ended,
 }
 
-/// What became of a final result.
+/// The outcome of a final result.
 #[derive(Clone, Debug, PartialEq)]
 pub enum EvalaiEnd {
     /// EvalAI has it.
@@ -433,7 +433,7 @@ pub enum EvalaiEnd {
     Refused { message: String },
 }
 
-/// What is known of the row in DynamoDB.
+/// The operator's knowledge of the row in DynamoDB.
 #[derive(Clone, Debug, Default, PartialEq)]
 pub struct RecordView {
     /// The end of this attempt is written.

@@ -166,7 +166,7 @@ impl fmt::Display for Member {
     }
 }
 
-/// What a member's file means. The number is the round: the crashes of that side before it.
+/// Meaning of a member's file. The number is the round: the crashes of that side before it.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, PartialOrd, Ord, Hash)]
 pub enum Mark {
     /// Simulator: the server answers. Evaluator: it can be reached. Agent: the command is about to start.
@@ -219,8 +219,8 @@ impl StatusFile {
         root.join(self.folder()).join(self.name())
     }
 
-    /// The file `name` in the sub-folder `folder`; `None` for every other name, and for one in a foreign folder. What a pair reports
-    /// of GPUs is of use to that pair alone.
+    /// The file `name` in the sub-folder `folder`. `None` for every other name, and for a name in a foreign folder. The GPU files of a
+    /// pair give `None` too: its simulator alone reads them, by their paths.
     pub fn parse(folder: &str, name: &str) -> Option<Self> {
         if folder == LOGCOPY_FOLDER {
             return [Self::Cancel, Self::Stored]
@@ -239,7 +239,7 @@ impl StatusFile {
         Some(Self::Of(member, mark))
     }
 
-    /// Whether it is there. What kind of file it is does not matter.
+    /// True if the file is there, as a file of any kind.
     pub fn exists(&self, root: &Path) -> bool {
         fs::symlink_metadata(self.path(root)).is_ok()
     }

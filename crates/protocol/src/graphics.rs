@@ -1,4 +1,4 @@
-//! What a simulator draws with, as the controller asks for it and the runner reads it.
+//! The graphics API and the adapter of a simulator, as the controller asks for them and the runner reads them.
 
 use std::fmt;
 use std::str::FromStr;
@@ -7,10 +7,10 @@ use thiserror::Error;
 
 /// Variable of a simulator: which of several GPUs is its pair's, from 0.
 pub const INDEX: &str = "LEADERBOARD_GPU_INDEX";
-/// What the runner puts in place of `$(NAME)` in a server's words, and gives it as a variable: the number of its graphics adapter.
+/// Variable with the number of a server's graphics adapter. The runner sets it, and replaces `$(NAME)` in the server's words with it.
 pub const ADAPTER: &str = "LEADERBOARD_GRAPHICS_ADAPTER";
 
-/// What a server draws with.
+/// The graphics API that a server draws with.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 pub enum Needs {
     /// Not known: only that there is a GPU counts.

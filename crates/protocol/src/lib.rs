@@ -1,5 +1,8 @@
-//! What the runner, logcopy and the controller have to agree on: the status files of a run (`files`), what a container ends with
-//! (`verdict`), and what a simulator draws with (`graphics`).
+//! The contract between the runner, logcopy and the controller:
+//!
+//! - `files`: the status files of a run.
+//! - `verdict`: the end of a container.
+//! - `graphics`: the graphics API of a simulator.
 //!
 //! ```text
 //! runners of a pair ◀── files (empty, in /status) ──▶ logcopy

@@ -1,4 +1,4 @@
-//! What a container reports about its own end, in its termination message, from where the kubelet copies it into the container
+//! A container's report about its own end, in its termination message. The kubelet copies that message into the container
 //! status.
 //!
 //! Written by the runner, parsed by the controller as hostile text: an agent's processes can write the same file while they
@@ -19,8 +19,8 @@ pub const CODE_NO_PROCESS: i32 = 75;
 /// Version of the document.
 pub const SCHEMA: u32 = 1;
 
-/// How the command of a container came to its end. Whether its results are complete is shown by the container's exit code
-/// (0) and by the status files.
+/// How the command of a container came to its end. The container's exit code (0) and the status files show if its results are
+/// complete.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, Hash, Serialize, Deserialize)]
 #[serde(rename_all = "camelCase")]
 pub enum What {
@@ -91,7 +91,7 @@ pub enum NotAVerdict {
     /// Longer than any version writes.
     #[error("the termination message is longer than a verdict can be ({0} bytes)")]
     TooLong(usize),
-    /// Of a version that is not known here.
+    /// A schema number that this version does not read.
     #[error("the verdict has schema {0}; this version reads {SCHEMA}")]
     Schema(u32),
     /// Not the JSON of a verdict.
@@ -147,7 +147,7 @@ impl Verdict {
         Ok(verdict)
     }
 
-    /// What the beginning of a verdict holds. A number without its end may lack digits, so it does not count.
+    /// The fields in the beginning of a verdict whose end is missing. A number without its end may lack digits, so it does not count.
     fn of_beginning(message: &str) -> Option<Self> {
         let (what, rest) = message.strip_prefix(r#"{"what":""#)?.split_once('"')?;
         let what: StrDeserializer<'_, ValueError> = what.into_deserializer();

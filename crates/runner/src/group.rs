@@ -110,7 +110,7 @@ impl Group {
 pub(crate) fn kill_all_others() {
     const ALL: Pid = Pid::from_raw(-1);
     if Pid::this() == Pid::from_raw(1) {
-        // Nobody is left, or one is not ours to end: the caller looks at what lives, not at this.
+        // An error means that no process is left, or that one is not ours to end: the caller looks at what lives, not at this.
         let _ = kill(ALL, Signal::SIGKILL);
     }
 }

@@ -91,6 +91,6 @@ fn print(text: &str) -> ExitCode {
 
 /// One line on stderr. Standard output is the command's.
 pub(crate) fn say(text: fmt::Arguments<'_>) {
-    // Nobody is left to report to when stderr is gone.
+    // Without stderr there is no place to report to.
     let _ = writeln!(io::stderr(), "leaderboard-runner: {text}");
 }

@@ -1,4 +1,4 @@
-//! Undoes what an agent can do to its own status folder so that nobody else can look into it.
+//! Opens an agent's status folder again after an agent has shut other users out of it.
 //!
 //! The kubelet makes the folder as root. An agent that runs as root owns it, as its runner does, and can take it from everybody else by
 //! its mode or by an access control list. Its simulator and `logcopy` run as other users: they would wait for an end that they cannot

@@ -188,16 +188,22 @@ mod tests {
         detail: None,
     };
 
+    fn assert_verdicts<const N: usize>(cases: [(End<'_>, What, &str); N]) {
+        for (end, what, why) in cases {
+            let verdict = verdict(&end);
+            assert_eq!((verdict.what, verdict.why.as_str()), (what, why));
+        }
+    }
+
     #[test]
-    fn the_sentence_names_what_ended_and_what_is_left() {
+    fn the_sentence_names_the_commands_end_and_its_results() {
         let partial = Ok(Checkpoint {
             complete: false,
             partial: true,
             driven: None,
         });
         let missing = Err(Unreadable::Missing);
-        let killed = Some(Status::Killed(Some(9)));
-        let cases = [
+        assert_verdicts([
             (
                 End {
                     left: Some(of_checkpoint(&partial)),
@@ -208,7 +214,7 @@ mod tests {
             ),
             (
                 End {
-                    status: killed,
+                    status: Some(Status::Killed(Some(9))),
                     out_of_memory: true,
                     left: Some(of_checkpoint(&missing)),
                     ..END
@@ -216,10 +222,16 @@ mod tests {
                 What::Killed,
                 "the command died of signal 9; the kernel killed a process of this container for lack of memory; there is no checkpoint file",
             ),
+        ]);
+    }
+
+    #[test]
+    fn the_sentence_names_another_cause_than_the_commands_end() {
+        assert_verdicts([
             (
                 End {
                     cause: Cause::PeerCrashed,
-                    status: killed,
+                    status: Some(Status::Killed(Some(9))),
                     ..END
                 },
                 What::PeerCrashed,
@@ -263,11 +275,7 @@ mod tests {
                 What::NoResult,
                 "the agent is done, and the evaluator had no complete result in time; its result is not final",
             ),
-        ];
-        for (end, what, why) in cases {
-            let verdict = verdict(&end);
-            assert_eq!((verdict.what, verdict.why.as_str()), (what, why));
-        }
+        ]);
     }
 
     #[test]

@@ -196,7 +196,7 @@ impl Runner {
         let (Role::Agent { idle, .. }, Some(tee)) = (&self.job.role, &self.tee) else {
             return None;
         };
-        // What it prints waits in its pipe while the node takes nothing of standard output: that is no silence. Only the node reads
+        // Output that waits in its pipe while the node reads no standard output is no silence. Only the node reads
         // there, so no command can bring this about.
         if tee.wants_stdout() {
             return Some(*idle);
@@ -285,7 +285,7 @@ impl Runner {
         Ok(())
     }
 
-    /// Nobody crashes so often: an agent has made the files itself, and its host must not answer for it.
+    /// No run crashes so often: an agent has made the files itself, and its host must not answer for it.
     fn too_many_crashes(&mut self) -> Cause {
         let of_peer = StatusFile::Of(self.peer, Mark::Crash(MAX_ROUNDS - 1));
         if self.part.is_host() && of_peer.exists(&self.job.status) {
@@ -375,7 +375,7 @@ impl Runner {
         self.announce_end(decide::conclude(self.part, cause, complete, &seen))
     }
 
-    /// Writes the file that belongs to the conclusion; without it nobody could rely on the conclusion.
+    /// Writes the file that belongs to the conclusion. If that fails, the conclusion changes: other containers rely on the file.
     fn announce_end(&mut self, conclusion: Conclusion) -> Conclusion {
         let mark = match conclusion.mark {
             None => return conclusion,

@@ -105,7 +105,7 @@ impl Tee {
             }
         }
         if self.pending.is_empty() {
-            // Nobody has read the command's pipe meanwhile: what it has printed there is found from now on.
+            // No one read the command's pipe meanwhile: its output there is found from now on.
             self.last_output = Instant::now();
         }
     }

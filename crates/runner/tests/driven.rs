@@ -46,7 +46,7 @@ fn a_pair_whose_routes_are_all_driven_ends_without_its_command() {
             (vec!["agent-1.done".to_owned()], false)
         );
         assert_eq!(fs::read_to_string(pod.checkpoint()).unwrap(), file);
-        // Its simulator, whenever it begins, has nothing to do but to wait for the store.
+        // The agent's simulator only waits for the store, whenever it begins.
         let mut simulator = pod.simulator();
         pod.until(SIMULATOR, Mark::Done);
         pod.write(StatusFile::Stored);

@@ -29,7 +29,7 @@ while True:
     os.close(log)
 "#;
 
-/// The words that start a program as the first process of a PID namespace. None where this machine lets nobody make one; the test
+/// The words that start a program as the first process of a PID namespace. None if this machine lets no process make one; the test
 /// reports it then.
 fn namespace() -> Option<Vec<String>> {
     let mut words = vec!["unshare", "--pid", "--fork", "--mount-proc", "--kill-child"];

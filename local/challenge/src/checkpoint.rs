@@ -185,7 +185,7 @@ pub fn write_in_pieces(path: &Path, text: &str, mut between: impl FnMut()) -> io
     Ok(())
 }
 
-/// What an earlier run left, or none if there is no file or it is not a checkpoint.
+/// The checkpoint that an earlier run left; None if there is no file or it is not a checkpoint.
 pub fn saved(path: &Path) -> Option<Checkpoint> {
     serde_json::from_slice(&fs::read(path).ok()?).ok()
 }

@@ -1,6 +1,6 @@
 //! The Leaderboard's evaluator: runs a worker's routes against a simulator, keeps the checkpoint, resumes from it, and writes it
-//! at the moments of the original. Called by `challenge-agent`. What happens on a route comes from `scenario`, what goes wrong on
-//! purpose from `faults`.
+//! at the moments of the original. Called by `challenge-agent`. `scenario` decides how a route ends, and `faults` has the faults on
+//! purpose.
 
 use std::{
     fs,
@@ -29,7 +29,7 @@ const STARTED: &str = "Started";
 /// A copy that does not come is not waited for any longer.
 const COPY_PATIENCE: Duration = Duration::from_secs(10);
 
-/// What does not come from the command line.
+/// Settings that do not come from the command line.
 #[derive(Debug)]
 pub struct Environment {
     /// How long each route takes.
@@ -200,7 +200,7 @@ struct Worker<'a> {
     has_world: bool,
 }
 
-/// What came of a route.
+/// The end of a route.
 struct Driven {
     record: Record,
     /// The entry status: all but `Started` stop the evaluation.

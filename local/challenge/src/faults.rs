@@ -1,5 +1,5 @@
-//! What goes wrong in an agent on purpose: the knobs of `AGENT_KNOBS`, and how the checkpoint gets to disk under them.
-//! Called by `evaluator` at fixed moments, so that the evaluator itself reads like an honest one.
+//! Faults of an agent on purpose: the knobs of `AGENT_KNOBS`, and how the checkpoint gets to disk under them. Called by `evaluator` at
+//! fixed moments, so that the evaluator itself reads like an honest one.
 
 use std::{
     fs, io,
@@ -268,7 +268,7 @@ fn forge_verdict() -> ! {
     std::process::exit(1);
 }
 
-/// Listens on another pair's port as soon as its simulator is down, and answers nobody.
+/// Listens on another pair's port as soon as its simulator is down, and never answers.
 fn take_port(port: u16) -> ! {
     loop {
         match TcpListener::bind((Ipv4Addr::LOCALHOST, port)) {

@@ -36,7 +36,7 @@ pub enum FlagError {
     NotANumber { flag: &'static str, value: String },
 }
 
-/// What the evaluator was asked to do.
+/// The evaluator's command line.
 #[derive(Debug, PartialEq, Eq)]
 pub struct Invocation {
     /// The Python file that was to run.

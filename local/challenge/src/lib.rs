@@ -1,7 +1,6 @@
-//! Stand-ins for the images of a challenge: a simulator and an agent that behave as CARLA and the Leaderboard do towards
-//! the programs that run them, in milliseconds and without a GPU. The programs in `bin/` call `simulator::run` and
-//! `evaluator::run`. Nothing here knows the operator: it is written from the Leaderboard's own behaviour, so that it
-//! can contradict the operator.
+//! Stand-ins for the images of a challenge: a simulator and an agent. They behave as CARLA and the Leaderboard do towards the programs
+//! that run them, in milliseconds and without a GPU. The programs in `bin/` call `simulator::run` and `evaluator::run`. This crate does
+//! not know the operator: it is written from the Leaderboard's own behaviour, and so can contradict the operator.
 
 pub mod checkpoint;
 pub mod evaluator;

@@ -1,5 +1,5 @@
-//! What happens on each route: the table `scenario.json` beside the routes file, and the record a route ends in. Called
-//! by `evaluator`; the penalties follow the Leaderboard's formulas (V1, and V2.0).
+//! The end of each route: the table `scenario.json` beside the routes file, and the record that it makes. Called by `evaluator`; the
+//! penalties follow the Leaderboard's formulas (V1, and V2.0).
 
 use std::collections::BTreeMap;
 

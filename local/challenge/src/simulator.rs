@@ -42,7 +42,7 @@ pub enum SimulatorError {
     Listen { port: u16, source: io::Error },
 }
 
-/// What all connections of one simulator share.
+/// State that all connections of one simulator share.
 struct World {
     knobs: Knobs,
     saved: PathBuf,
@@ -50,7 +50,7 @@ struct World {
     worlds: Mutex<usize>,
     /// Routes begun since then.
     routes: Mutex<usize>,
-    /// The main loop hangs: nobody is answered any more, on no connection.
+    /// The main loop hangs: no connection gets an answer any more.
     hangs: AtomicBool,
     log: Mutex<Option<File>>,
 }

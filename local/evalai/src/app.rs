@@ -1,5 +1,5 @@
-//! What all requests share: the state, the knobs, the log and the throttle behind their locks, and the clock. Made by `server`,
-//! used by the handlers and [`crate::control`]. Knows no HTTP.
+//! State that all requests share: the rows, the knobs, the log and the throttle behind their locks, and the clock. Made by `server`, used
+//! by the handlers and [`crate::control`]. Knows no HTTP.
 
 use std::sync::{Arc, Mutex, MutexGuard, PoisonError};
 use std::time::Instant;
@@ -19,9 +19,9 @@ use crate::throttle::Throttle;
 /// Requests a minute without signing in.
 const ANONYMOUS_LIMIT: usize = 100;
 
-/// What a stand-in is started with.
+/// Settings of a stand-in.
 pub struct Config {
-    /// What it holds at first, and after a reset.
+    /// The rows at first, and after a reset.
     pub seed: Seed,
     /// Requests per user and minute; 0 is no limit.
     pub throttle: usize,
@@ -64,6 +64,7 @@ fn lock<T>(mutex: &Mutex<T>) -> MutexGuard<'_, T> {
 }
 
 /// Now, to the microsecond, as the server's database keeps it.
+#[allow(clippy::disallowed_methods, reason = "a stand-in for another program")]
 pub(crate) fn now() -> Timestamp {
     let now = Timestamp::now();
     now.round(Unit::Microsecond).unwrap_or(now)

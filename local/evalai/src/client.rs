@@ -1,4 +1,4 @@
-//! What the program's commands for people do: requests to a running stand-in, and their answers as text.
+//! The program's commands for people: requests to a running stand-in, and their answers as text.
 
 use std::fmt::Write as _;
 

@@ -145,7 +145,7 @@ error_texts! {
     SPLIT_NOT_FOUND = 400 Shape::Error, "Challenge Phase Split does not exist with phase_id: {} andsplit codename: {}";
     /// Metrics that the leaderboard does not have: the wording is inverted, these are extra (sic).
     METRICS_UNKNOWN = 400 Shape::Error, "Following metrics are missing in theleaderboard data: {}";
-    /// The same on the endpoint for partial results (sic).
+    /// Metrics that the leaderboard does not have, on the endpoint for partial results (sic).
     METRICS_UNKNOWN_PARTIAL = 400 Shape::Error, "Following metrics are missing in theleaderboard data: {} of challenge phase: {}";
     /// Values that are not numbers (sic).
     METRICS_MALFORMED = 400 Shape::Error, "Values for following metrics are not offloat/int: {}";
@@ -232,7 +232,7 @@ error_texts! {
 
     /// No challenge has a queue of that name.
     QUEUE_UNKNOWN = 400 Shape::Error, "Challenge with queue name {} does not exist";
-    /// The same when deleting a message (sic).
+    /// No challenge has a queue of that name, at the deletion of a message (sic).
     QUEUE_UNKNOWN_DELETE = 400 Shape::Error, "Challenge with queue name {} does not exists";
     /// The queue belongs to somebody else's challenge.
     QUEUE_FORBIDDEN = 401 Shape::Error, "Sorry, you are not authorized to access this resource";

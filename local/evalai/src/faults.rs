@@ -109,7 +109,7 @@ pub struct Knobs {
     pub patch_delay_ms: u64,
     /// Between the read of a list and its answer, in milliseconds.
     pub list_delay_ms: u64,
-    /// The same for each row of the list.
+    /// Further delay of the answer for each row of the list, in milliseconds.
     pub list_row_ms: u64,
     /// How long a connection without a request is kept open, in milliseconds.
     pub keep_alive_ms: u64,
@@ -120,7 +120,7 @@ pub struct Knobs {
     pub queue_down: bool,
     /// Requests per user and minute; 0 is no limit. Absent: as the program was started.
     pub throttle: Option<usize>,
-    /// What fails next, in this order.
+    /// The next faults, in this order.
     pub fail_next: Vec<Fault>,
 }
 

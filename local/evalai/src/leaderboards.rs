@@ -45,7 +45,7 @@ pub(crate) fn entries(state: &State, split: u64, order_by: Option<&str>) -> Resu
     Ok(found.into_iter().map(entry).collect())
 }
 
-/// What the schema says of a metric comes before the split's own order, and is ascending unless it says otherwise.
+/// True if a higher value is better. The schema's word on a metric comes before the split's own order, and is ascending by default.
 fn is_descending(board: &Split, metric: &str) -> bool {
     match board.schema.metadata.get(metric).filter(|about| !about.is_null()) {
         Some(about) => about.get("sort_ascending") == Some(&Value::Bool(false)),

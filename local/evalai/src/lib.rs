@@ -1,11 +1,10 @@
 //! A stand-in for EvalAI's API: the demo's participants push into it, the operator reports to it, the tests read it.
 //!
-//! Started by the binary `evalai-stand-in` and, inside tests, by [`serve`]. It knows nothing of the operator: what it
-//! does is what EvalAI's own server was observed to do, including what is wrong with it (no state machine, duplicate
-//! leaderboard rows after concurrent results, whole rows saved late).
+//! Started by the binary `evalai-stand-in` and, inside tests, by [`serve`]. It does not know the operator. It behaves as EvalAI's own
+//! server was observed to, faults included: no state machine, duplicate leaderboard rows after concurrent results, whole rows saved late.
 //!
 //! The pure part ([`state`], [`update`], [`submissions`], [`edit`], [`views`], [`python`], [`throttle`], [`routes`])
-//! knows no network and no clock; `app` is what requests share of it, and [`server`] puts HTTP around `handlers`.
+//! knows no network and no clock. Requests share `app`, and [`server`] puts HTTP around `handlers`.
 
 mod app;
 pub mod body;

@@ -22,7 +22,7 @@ pub struct Entry {
     pub method: String,
     /// Its path with the query.
     pub path: String,
-    /// What it was signed with.
+    /// The token that signed it.
     pub token: Option<String>,
     /// Its body: as JSON where it is JSON, else as text, cut at 64 KiB.
     pub body: Value,

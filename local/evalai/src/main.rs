@@ -116,7 +116,7 @@ struct Submit {
 
 #[tokio::main]
 async fn main() -> ExitCode {
-    // Without TLS there is nothing to provide, but the client asks for a provider all the same.
+    // The client asks for a provider of TLS also where it uses none.
     let _ = rustls::crypto::ring::default_provider().install_default();
     let filter = tracing_subscriber::EnvFilter::try_from_default_env().unwrap_or_else(|_| "info".into());
     tracing_subscriber::fmt()

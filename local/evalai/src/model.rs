@@ -22,7 +22,7 @@ pub enum Status {
     Queued,
     /// Ended with a result.
     Finished,
-    /// Of old rows only.
+    /// A status of old rows only.
     Submitting,
     /// Put away by a host.
     Archived,
@@ -75,7 +75,7 @@ impl Status {
     }
 }
 
-/// What fetching a submission's input file gives when EvalAI fetches it again for a re-run or a resume.
+/// Result when EvalAI fetches a submission's input file again for a re-run or a resume.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, Default, Serialize, Deserialize)]
 #[serde(rename_all = "kebab-case")]
 pub enum FileState {
@@ -128,7 +128,7 @@ pub struct User {
     /// Not switched off.
     #[serde(default = "yes")]
     pub active: bool,
-    /// What the user signs requests with.
+    /// The tokens that sign the user's requests.
     #[serde(default)]
     pub tokens: Vec<Token>,
 }
@@ -244,7 +244,7 @@ pub struct Schema {
     pub labels: Vec<String>,
     /// The metric that ranks.
     pub default_order_by: String,
-    /// Of each metric, such as `{"A": {"sort_ascending": true}}`.
+    /// Settings of each metric, such as `{"A": {"sort_ascending": true}}`.
     #[serde(default, skip_serializing_if = "Value::is_null")]
     pub metadata: Value,
 }
@@ -263,15 +263,15 @@ pub struct Submission {
     pub created_by: u64,
     /// Its status.
     pub status: Status,
-    /// What was uploaded.
+    /// The uploaded file.
     pub input_file: Option<String>,
-    /// Of two-stage challenges.
+    /// The second file of two-stage challenges.
     pub submission_input_file: Option<String>,
-    /// What the evaluation printed.
+    /// Output of the evaluation.
     pub stdout_file: Option<String>,
-    /// What it complained of.
+    /// Errors of the evaluation.
     pub stderr_file: Option<String>,
-    /// What only hosts may read.
+    /// The log that only hosts may read.
     pub environment_log_file: Option<String>,
     /// The shown results.
     pub submission_result_file: Option<String>,
@@ -311,7 +311,7 @@ pub struct Submission {
     pub submission_metadata: Value,
     /// Counts within team and phase.
     pub submission_number: u64,
-    /// What fetching `input_file` gives.
+    /// Result of fetching `input_file`.
     pub file_state: FileState,
 }
 

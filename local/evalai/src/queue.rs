@@ -24,11 +24,11 @@ pub struct Message {
 pub struct Received {
     /// The body.
     pub body: String,
-    /// What deletes it.
+    /// The handle that deletes it.
     pub receipt_handle: String,
 }
 
-/// What a queue would not do.
+/// Why a queue refused an action.
 #[derive(Debug, Error)]
 pub enum QueueError {
     /// The service refused or did not answer.
@@ -36,7 +36,7 @@ pub enum QueueError {
     Failed {
         /// Its name.
         queue: String,
-        /// What was asked of it.
+        /// The refused action.
         action: &'static str,
         /// Its message.
         reason: String,

@@ -7,7 +7,7 @@ use serde_json::Value;
 
 use crate::errors::{self, ErrorText};
 
-/// What a handler hands back; an error is an answer like any other.
+/// The answer of a handler; an error is an answer like any other.
 pub type Answer = Result<Reply, Reply>;
 
 /// Status, headers and body of one answer.
@@ -63,7 +63,7 @@ impl Reply {
         }
     }
 
-    /// The same answer with one more header.
+    /// Adds a header to the answer.
     #[must_use]
     pub fn with(mut self, name: &'static str, value: String) -> Self {
         self.headers.push((name, value));

@@ -81,7 +81,7 @@ impl Endpoint {
     }
 }
 
-/// What a path leads to.
+/// The target of a path.
 #[derive(Debug, Clone, PartialEq, Eq)]
 pub enum Found {
     /// An endpoint.

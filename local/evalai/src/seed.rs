@@ -1,5 +1,4 @@
-//! What the server holds before anybody has submitted: users, teams, challenges. Read from JSON, with a built-in
-//! default.
+//! The server's database before the first submission: users, teams, challenges. Read from JSON, with a built-in default.
 
 use serde::{Deserialize, Serialize};
 use thiserror::Error;
@@ -12,11 +11,11 @@ pub struct Seed {
     /// The first submission's primary key.
     #[serde(default = "one")]
     pub first_submission: u64,
-    /// Who may sign in.
+    /// Users who may sign in.
     pub users: Vec<User>,
-    /// Who takes part.
+    /// Teams that take part.
     pub teams: Vec<Team>,
-    /// What they take part in.
+    /// Challenges that they take part in.
     pub challenges: Vec<Challenge>,
 }
 
@@ -36,7 +35,7 @@ pub enum SeedError {
     Parse {
         /// The file.
         path: String,
-        /// What is wrong, with line and column.
+        /// The fault, with line and column.
         source: serde_json::Error,
     },
 }
@@ -59,8 +58,8 @@ impl Seed {
         serde_json::from_str(text)
     }
 
-    /// The built-in seed: `CARLA Leaderboard 2.0 (local)` as challenge 1 (phases 1 SENSORS, 2 MAP), 1.0 as challenge 2
-    /// (phases 3, 4), one that takes predictions as challenge 3, and teams a and b.
+    /// The built-in seed. Challenge 1 is `CARLA Leaderboard 2.0 (local)` (phases 1 SENSORS, 2 MAP), challenge 2 is 1.0 (phases 3, 4), and
+    /// challenge 3 takes predictions. The teams are a and b.
     pub fn built_in() -> Result<Self, SeedError> {
         Self::parse(include_str!("../seed.json")).map_err(|source| SeedError::Parse {
             path: "built into the program".to_owned(),

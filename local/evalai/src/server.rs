@@ -156,7 +156,7 @@ impl fmt::Display for Closed {
 
 impl std::error::Error for Closed {}
 
-/// What becomes of a request.
+/// The way in which a request ends.
 enum Outcome {
     Reply(Reply),
     Close,

@@ -45,7 +45,7 @@ pub struct State {
     pub published: Vec<Published>,
     /// Refresh tokens that profile pages gave in place of older ones, with their users; the newest last.
     renewed: Vec<(u64, String)>,
-    /// Refresh tokens that nobody may use any more.
+    /// Refresh tokens that are no longer valid.
     blacklist: BTreeSet<String>,
     /// Where each submission's row lies in the table: an update puts the row behind all others.
     #[serde(skip)]
@@ -57,7 +57,7 @@ pub struct State {
 }
 
 impl State {
-    /// A server nobody has submitted to.
+    /// A server without a submission.
     pub fn new(seed: Seed) -> Self {
         Self {
             next_submission: seed.first_submission,

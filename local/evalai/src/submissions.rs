@@ -1,5 +1,5 @@
-//! What people do: submit, re-run, resume; and the messages that follow. Called by the handlers and the control plane
-//! under the lock. Pure.
+//! Acts of people: submit, re-run, resume; and the messages that follow. Called by the handlers and the control plane under the lock.
+//! Pure.
 
 use jiff::Timestamp;
 use serde::{Deserialize, Serialize};
@@ -18,15 +18,15 @@ pub enum Upload {
     /// As `evalai push`: string keys, the flag, the image.
     #[default]
     Normal,
-    /// The same message without the image; the input file has it.
+    /// As `evalai push`, without the image; the input file has it.
     MissingImage,
     /// Fetched from a URL by EvalAI: integer keys, neither flag nor image; the input file has it.
     FileUrl,
-    /// The same message as of `missing-image`, and the input file answers 404.
+    /// As `evalai push`, without the image, and the input file answers 404.
     NoFile,
 }
 
-/// What a new submission holds.
+/// The contents of a new submission.
 #[derive(Debug, Clone)]
 pub struct NewSubmission {
     /// The team's primary key.
@@ -246,7 +246,7 @@ fn again(state: &State, id: u64, deleted: &ErrorText) -> Result<(Submission, Cha
     Ok((submission.clone(), challenge.clone()))
 }
 
-/// What [`bulk`] makes.
+/// The submissions that [`bulk`] makes.
 #[derive(Debug, Clone, Deserialize)]
 #[serde(deny_unknown_fields)]
 pub struct Bulk {

@@ -1,4 +1,4 @@
-//! What a host's worker writes: progress, results and partial results. Called by the handlers under the lock.
+//! Writes of a host's worker: progress, results and partial results. Called by the handlers under the lock.
 //!
 //! Pure, and in two halves as in the server: `prepare_*` reads rows and checks the request, [`commit`] saves the copies
 //! whole. Whatever happens between the two is overwritten, or doubled where both halves of two requests interleave.
@@ -44,7 +44,7 @@ pub struct Write {
 }
 
 impl Write {
-    /// Whether the submission comes to its end by it.
+    /// True if the write ends the submission.
     pub fn is_end(&self) -> bool {
         matches!(
             self.submission.status,
@@ -171,8 +171,8 @@ fn named(state: &State, form: &Form) -> Result<Submission, Reply> {
     submission.ok_or_else(|| Reply::error(&errors::SUBMISSION_NOT_FOUND, &[&python::str(value)]))
 }
 
-/// A primary key sent as a number, cut as Python's `int` cuts it, or as its decimal text. None: no row has it. What is
-/// no number raises in the server.
+/// A primary key sent as a number, cut as Python's `int` cuts it, or as its decimal text. None: no row has it. A value that is no number
+/// raises in the server.
 pub(crate) fn key(value: &Value) -> Result<Option<u64>, Reply> {
     let text = match value {
         Value::Null => return Ok(None),
@@ -247,7 +247,7 @@ fn check_results(
     Ok((rows, shown))
 }
 
-/// The items of `result`: a list inside a string. What else Python can walk over without an error is empty.
+/// The items of `result`: a list inside a string. Any other value that Python can walk over without an error is empty.
 fn results(form: &Form) -> Result<Vec<Value>, Reply> {
     let invalid = |error: String| Reply::error(&errors::RESULT_INVALID, &[&error]);
     let parsed: Value = match form.fields.get("result") {

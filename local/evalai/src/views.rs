@@ -184,7 +184,7 @@ pub fn split(phase: &Phase, row: &Split) -> Value {
     })
 }
 
-/// The same with what only its own request shows.
+/// The settings of a split with the fields that only its own request shows.
 pub fn split_settings(phase: &Phase, row: &Split) -> Value {
     json!({
         "id": row.id,

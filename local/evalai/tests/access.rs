@@ -1,4 +1,4 @@
-//! Who gets in, with which header, and what it costs.
+//! Access: the users and the headers that the server accepts, and the cost of a request.
 
 mod support;
 

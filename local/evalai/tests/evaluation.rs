@@ -1,4 +1,4 @@
-//! What a host's worker writes: progress, results, partial results, and what goes wrong with them.
+//! Writes of a host's worker: progress, results, partial results, and their faults.
 
 #![allow(clippy::unwrap_used, reason = "a helper that fails fails its test")]
 
@@ -117,7 +117,7 @@ async fn texts_are_stored_and_the_environment_log_is_for_hosts() {
     );
 }
 
-/// What a PUT of a result is changed to, and the answer with its values.
+/// The change of a PUT of a result, and the answer with its values.
 type Refusal = (Value, errors::ErrorText, &'static [&'static str]);
 
 fn refusals_of_fields() -> Vec<Refusal> {

@@ -1,4 +1,4 @@
-//! What participants and hosts do, and the messages that follow.
+//! Acts of participants and hosts, and the messages that follow.
 
 mod support;
 

@@ -1,4 +1,4 @@
-//! Lists that cost, in no order, and connections that are closed while nobody uses them.
+//! Slow lists, lists without an order, and connections that are closed while they are idle.
 
 #![allow(clippy::unwrap_used, reason = "a helper that fails fails its test")]
 
@@ -66,7 +66,7 @@ async fn ask(stream: &mut TcpStream) -> String {
     String::from_utf8_lossy(&answer[..length]).into_owned()
 }
 
-/// Waits until the server closes a connection that nobody uses.
+/// Waits until the server closes an idle connection.
 async fn closed_within(stream: &mut TcpStream, limit: Duration) -> bool {
     let read = tokio::time::timeout(limit, stream.read(&mut [0; 16])).await;
     read.is_ok_and(|read| read.unwrap() == 0)

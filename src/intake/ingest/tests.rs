@@ -27,12 +27,12 @@ fn sweep(sent_ms: i64) -> Incoming {
     incoming(Source::Sweep(Swept::New), sent_ms)
 }
 
-/// What the sweep finds of a resume whose message was lost.
+/// A resume that the sweep finds, because its message was lost.
 fn swept_resume(sent_ms: i64) -> Incoming {
     incoming(Source::Sweep(Swept::Resuming), sent_ms)
 }
 
-/// What the API server would hold after the first `incoming`.
+/// The object that the API server holds after the first `incoming`.
 fn made_by(first: &Incoming) -> Submission {
     let Ingest::Create(fresh) = decide_ingest(BOARD, None, first) else {
         panic!("nothing exists, so it is created");

@@ -61,7 +61,7 @@ impl Meta {
         self.owner_references.iter().any(|owner| *owner.uid == *uid)
     }
 
-    /// True if nothing but its version separates them.
+    /// True if the objects differ in their version alone.
     pub(super) fn is_same(&self, other: &Self) -> bool {
         let Self {
             name,

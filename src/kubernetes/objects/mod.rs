@@ -1,8 +1,7 @@
 //! The kinds that the API server types, reduced to what is read of them.
 //!
-//! A cache holds thousands, so that each takes as little as it can: fields that nobody reads are skipped while they are decoded,
-//! and texts that many objects share are stored once (`Texts`). Every field is optional and every enum a text: whatever a newer
-//! API server sends can be read.
+//! A cache holds thousands, so each takes as little memory as it can. Decoding skips the fields that no code reads, and `Texts` stores
+//! each shared text once. Every field is optional and every enum a text, so that the answer of a newer API server can be read.
 
 mod event;
 mod job;

@@ -53,7 +53,7 @@ async fn it_is_complete_once_every_namespace_was_listed() {
         Answer::Watch(vec![line("ADDED", &within("a", "early", "2", "6"))]),
     ];
     let mut two = two(first, Vec::new());
-    // All that a can bring without b: nobody learns of it, however late they subscribe.
+    // All objects of a, without a list of b: no subscriber gets them yet, however late it subscribes.
     while two.rig.watch.store.len() < 2 {
         tokio::time::sleep(Duration::from_millis(10)).await;
     }

@@ -1,4 +1,4 @@
-//! Changes that nobody reads.
+//! Changes of fields that no code reads.
 
 use super::*;
 use crate::kubernetes::objects::Pod;

@@ -1,4 +1,4 @@
-//! What follows from answers, caches and findings.
+//! The policy and the condition that follow from answers, caches and findings.
 
 use k8s_openapi::apimachinery::pkg::apis::meta::v1::Time;
 use serde_json::{Value, json};

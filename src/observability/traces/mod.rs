@@ -14,7 +14,7 @@ use leaderboard_base::trace_id::TraceId;
 #[derive(Clone, Debug, PartialEq)]
 pub struct Span {
     pub trace: TraceId,
-    /// The same span has the same id in every process.
+    /// Id of the span; each process makes the same id for it.
     pub id: u64,
     /// None: the first of its trace.
     pub parent: Option<u64>,
@@ -37,7 +37,7 @@ pub enum Kind {
     Client,
 }
 
-/// Of an attribute. A text is an object's name or of a closed set.
+/// Value of an attribute. A text is an object's name or of a closed set.
 #[derive(Clone, Debug, PartialEq, Eq)]
 pub enum Value {
     Text(String),

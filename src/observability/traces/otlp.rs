@@ -73,7 +73,7 @@ impl Sending {
     }
 }
 
-/// Whether the environment names a collector, and does not switch traces off.
+/// True if the environment names a collector, and does not switch traces off.
 pub fn is_wanted(variable: impl Fn(&str) -> Option<String>) -> bool {
     let is = |name: &str, value: &str| variable(name).is_some_and(|is| is.trim().eq_ignore_ascii_case(value));
     let has_endpoint = ENDPOINTS
@@ -122,7 +122,7 @@ pub fn start(endpoint: Option<&str>, metrics: &Arc<Metrics>, tasks: &Tasks) -> R
     Ok((Traces(Some(outlet)), Sending { close, task }))
 }
 
-/// What the environment has of the process, and its name where that has none.
+/// The process as the environment describes it; its name is the operator's if the environment gives none.
 fn resource() -> Resource {
     let given = Resource::builder().build();
     let name = given.get(&"service.name".into()).map(|name| name.to_string());

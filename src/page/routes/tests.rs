@@ -11,7 +11,7 @@ use super::*;
 use crate::page::connections::Bounded;
 use crate::page::hub::{Source, VIEWERS};
 
-/// What a test waits for at most.
+/// Longest wait of a test.
 const LIMIT: Duration = Duration::from_secs(30);
 const FILES: [&str; 8] = [
     "/",
@@ -223,7 +223,7 @@ async fn a_viewer_that_reads_nothing_loses_its_place() {
     // One that has sent nothing is closed, too.
     let _ = idle.read_to_end(&mut left).await;
     assert!(left.is_empty() && from.elapsed() >= super::super::connections::STILL);
-    // What the system's buffers hold is read to its end, which comes long before that of the view.
+    // The read ends with the bytes in the system's buffers, long before the end of the view.
     let _ = deaf.read_to_end(&mut left).await;
     assert!(left.len() < 64 << 20, "{}", left.len());
 }

@@ -111,7 +111,7 @@ function trouble(row) {
 }
 
 function fact(value, ...note) {
-  return element("div", { class: "fact" }, element("span", {}, value), element("span", { class: "muted" }, note));
+  return element("div", { class: "fact" }, element("span", {}, value), element("span", { class: "muted", title: note.filter(Boolean).join(" ") || null }, note));
 }
 
 export function running(view, context) {

@@ -145,7 +145,7 @@ fn in_state(state: State, reason: Option<&str>, class: Option<&str>) -> Submissi
     let mut one = submission("a", conditions);
     let failure = class.map(|class| json!({"class": class, "reason": "R", "message": "M"}));
     let status = one.status.as_mut().unwrap();
-    // What is for people is read by nobody.
+    // The gauges must not read these fields, which are for people.
     status.state = Some(State::Resumed);
     status.attempt = Some(Attempt::FIRST);
     status.reason = reason.map(Into::into);
@@ -160,7 +160,7 @@ fn submissions_are_counted_by_the_reason_and_the_class_of_their_failure() {
         in_state(State::Failed, Some("AgentCrashed"), Some("Participant")),
         in_state(State::Failed, Some("AgentCrashed"), Some("Participant")),
         in_state(State::Failed, Some("AgentCrashed"), Some("Infrastructure")),
-        // What failed once is no failure of the attempt that runs now.
+        // The failure of an earlier attempt is no failure of the attempt that runs now.
         in_state(State::Running, None, Some("Infrastructure")),
         in_state(State::Cancelled, Some("of a version to come"), None),
     ];

@@ -1,7 +1,7 @@
 //! Decision of a candidate about a Lease: a pure function of what it saw, when it saw it, and who it is.
 //!
-//! Called by the election before every write. Knows no client; times are those of the candidate's own boot clock, and
-//! expiry counts from when the candidate itself saw the record change, so that clocks never have to agree.
+//! Called by the election before every write. Knows no client; times are those of the candidate's own boot clock. An expiry counts from
+//! the time when the candidate itself saw the record change, so clocks never have to agree.
 
 use std::time::Duration;
 
@@ -295,8 +295,8 @@ mod tests {
     }
 
     proptest! {
-        /// Whatever is seen: nobody takes what another holds before it is silent long enough, nobody leads past the
-        /// deadline, and a new term is higher than any that was seen.
+        /// In any history a candidate takes a held Lease only after its holder was silent long enough. It never leads past the deadline,
+        /// and a new term is higher than any that was seen.
         #[test]
         fn it_never_takes_too_early_nor_leads_too_long(
             record in any_record(), changed in 0..100u64, later in 0..60u64, renewed in proptest::option::of(0..60u64),

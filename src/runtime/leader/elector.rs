@@ -6,7 +6,6 @@
 use std::sync::Arc;
 use std::time::Duration;
 
-use jiff::Timestamp;
 use k8s_openapi::api::coordination::v1::Lease;
 use kube::api::PostParams;
 use kube::{Api, Client};
@@ -21,6 +20,7 @@ use crate::metrics::Metrics;
 use crate::observability::Observability;
 use crate::observability::liveness::Liveness;
 use leaderboard_base::backoff::jittered;
+use leaderboard_base::clock::Clock;
 
 /// Looks at a Lease that changes while it is being released.
 const RELEASE_TRIES: u32 = 3;
@@ -35,6 +35,7 @@ pub(super) struct Elector {
     api: Api<Lease>,
     settings: Settings,
     outlets: Outlets,
+    clock: Clock,
     metrics: Arc<Metrics>,
     liveness: Liveness,
     seen: ObservedLease,
@@ -57,6 +58,7 @@ impl Elector {
             api: Api::namespaced(client, &settings.namespace),
             settings,
             outlets,
+            clock: telemetry.clock.clone(),
             metrics: telemetry.metrics.clone(),
             liveness: telemetry.liveness.clone(),
             seen: ObservedLease::default(),
@@ -85,7 +87,7 @@ impl Elector {
     }
 
     async fn round(&mut self) -> Next {
-        let now = self.settings.clock.now();
+        let now = self.clock.since_boot();
         if let Some(loss) = self
             .leading
             .and_then(|leading| is_overdue(&leading, &self.settings.timing, now))
@@ -98,7 +100,7 @@ impl Elector {
         {
             return self.failed(&error);
         }
-        let now = self.settings.clock.now();
+        let now = self.clock.since_boot();
         match decide(
             &self.seen,
             &self.settings.identity,
@@ -121,8 +123,8 @@ impl Elector {
     }
 
     async fn write(&mut self, term: i32) -> Next {
-        let sent = self.settings.clock.now();
-        let lease = held(self.lease.as_ref(), &self.settings, term, Timestamp::now());
+        let sent = self.clock.since_boot();
+        let lease = held(self.lease.as_ref(), &self.settings, term, self.clock.now());
         self.is_fresh = false;
         match self.send(&lease).await {
             Ok(written) => {
@@ -165,7 +167,7 @@ impl Elector {
 
     fn note(&mut self, lease: Option<Lease>) {
         self.seen
-            .note(lease.as_ref().map(Record::read), self.settings.clock.now());
+            .note(lease.as_ref().map(Record::read), self.clock.since_boot());
         self.lease = lease;
         self.is_fresh = true;
     }
@@ -214,7 +216,7 @@ impl Elector {
             return Duration::MAX;
         };
         let deadline = leading.renewed_at + self.settings.timing.renew_deadline;
-        deadline.saturating_sub(self.settings.clock.now())
+        deadline.saturating_sub(self.clock.since_boot())
     }
 
     fn retry(&self) -> Duration {
@@ -253,7 +255,7 @@ impl Elector {
         let Some(lease) = self.lease.take().filter(|_| is_ours) else {
             return Ok(());
         };
-        self.send(&released(lease, Timestamp::now())).await.map(|_| ())
+        self.send(&released(lease, self.clock.now())).await.map(|_| ())
     }
 }
 

@@ -21,7 +21,7 @@ use tokio::sync::{oneshot, watch};
 use tokio::task::JoinHandle;
 use tokio::time::Instant;
 
-pub use fence::{Clock, Fence};
+pub use fence::Fence;
 pub use record::Identity;
 
 use crate::observability::Observability;
@@ -64,11 +64,10 @@ pub struct Settings {
     /// Owner of a Lease that is made new, so that it goes with the operator.
     pub owner: Option<OwnerReference>,
     pub timing: Timing,
-    pub clock: Clock,
 }
 
 impl Settings {
-    /// The usual times and the boot clock.
+    /// The usual times.
     pub fn new(namespace: &str, name: &str, identity: Identity) -> Self {
         Self {
             namespace: namespace.to_owned(),
@@ -76,7 +75,6 @@ impl Settings {
             identity,
             owner: None,
             timing: Timing::default(),
-            clock: Clock::boot(),
         }
     }
 
@@ -89,7 +87,7 @@ impl Settings {
 /// Where this process stands.
 #[derive(Clone, Debug, PartialEq, Eq)]
 pub enum Leadership {
-    /// Somebody else leads, or nobody is known to.
+    /// Another process leads, or no leader is known.
     Standby,
     /// This process leads.
     Leader {
@@ -136,7 +134,7 @@ pub fn lease_client(mut config: kube::Config) -> Result<kube::Client, kube::Erro
 pub fn start(client: kube::Client, settings: Settings, telemetry: &Observability) -> Leader {
     let (publish, leadership) = watch::channel(Leadership::Standby);
     let (release, released) = oneshot::channel();
-    let fence = Fence::new(settings.clock.clone(), settings.timing.renew_deadline);
+    let fence = Fence::new(telemetry.clock.clone(), settings.timing.renew_deadline);
     let outlets = elector::Outlets {
         publish,
         fence: fence.clone(),

@@ -64,13 +64,13 @@ pub struct Record {
     pub duration: Duration,
     /// The holder's own time: only compared with itself, to see that something has changed.
     pub renewed: Option<Timestamp>,
-    /// It was handed over, or nobody has ever held it: no process can think of itself as the holder. One that a person clears shows since
-    /// when its holder has held it.
+    /// True if the Lease was handed over, or never had a holder, so that no process can think of itself as the holder. A Lease that a
+    /// person clears still shows since when its holder has held it, and is not free.
     pub is_free: bool,
 }
 
 impl Record {
-    /// Reads a Lease. What is absent or senseless is as if nobody had held it.
+    /// Reads a Lease. An absent or senseless field counts as that of a Lease without a holder.
     pub fn read(lease: &Lease) -> Self {
         let spec = lease.spec.clone().unwrap_or_default();
         let holder = spec.holder_identity.filter(|holder| !holder.is_empty());
@@ -111,7 +111,7 @@ pub(super) fn held(read: Option<&Lease>, settings: &Settings, term: i32, now: Ti
     lease
 }
 
-/// The Lease that shows that nobody leads, and that the last leader has left nothing under way.
+/// The Lease without a leader, which shows that the last one has left nothing under way.
 pub(super) fn released(mut lease: Lease, now: Timestamp) -> Lease {
     let spec = lease.spec.get_or_insert_default();
     (spec.holder_identity, spec.acquire_time) = (None, None);

@@ -39,9 +39,9 @@ impl Class {
 pub(super) type DueKey = (Instant, u64);
 type Lane = BTreeMap<DueKey, Key>;
 
-/// A lower class waits so long before it ages: half of the usual `syncPeriodSeconds`.
+/// Time that a lower class waits before it ages: half of the usual `syncPeriodSeconds`.
 const PATIENCE: Duration = Duration::from_secs(5);
-/// So many others go first while a lower class waits that has aged.
+/// Number of others that go first while an aged lower class waits.
 const OTHERS_FIRST: u32 = 3;
 
 /// All that is ready, by class. New ones are kept apart by namespace, since one namespace may have no permit left.

@@ -1,6 +1,6 @@
 //! The queue of one kind: which object is reconciled next, and the tasks that do so.
 //!
-//! Any task adds to it; `run` starts each reconcile as a task of its own, so that one that waits for the API server holds up no other.
+//! Any task adds to it. `run` starts each reconcile as a task of its own, so that one which waits for the API server holds up no other.
 //! `state` and `lanes`, which are pure, decide which object is next, and when; `urgency` decides how urgent an event is.
 
 mod lanes;

@@ -1,7 +1,7 @@
 //! Times of reconciles: each object has one reconcile at a time, and none of its events is lost. Pure: the time is handed in.
 //!
 //! An object is ready, waits for a time, or runs. An event makes it ready at once; while it runs, any number of events makes one
-//! more reconcile after it. What a reconcile asks for counts from its end, unless something has happened meanwhile.
+//! more reconcile after it. The pause that a reconcile asks for counts from its end, unless something has happened meanwhile.
 
 use std::collections::{BTreeMap, HashMap};
 use std::sync::Arc;
@@ -15,7 +15,7 @@ use super::lanes::{Class, DueKey, Lanes};
 /// How much may run at once.
 #[derive(Clone, Copy, Debug)]
 pub struct Limits {
-    /// Reconciles. Those that are not urgent leave a quarter free.
+    /// Reconciles at once. The ones that are not urgent leave a quarter free.
     pub reconciles: usize,
     /// Reconciles that create a Job, which an admission webhook may hold up.
     pub creates: usize,

@@ -32,7 +32,7 @@ struct Running {
     task: JoinHandle<()>,
 }
 
-/// A queue whose reconciles take as long as `takes` returns for their key. Those that are new create a Job.
+/// A queue whose reconciles take as long as `takes` returns for their key. The reconciles of new objects create a Job.
 fn start(takes: impl Fn(&Key) -> Duration + Send + Sync + 'static) -> Running {
     let waits = Class::ALL.map(|class| {
         Metrics::default()

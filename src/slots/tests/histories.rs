@@ -1,4 +1,4 @@
-//! Whatever happens, and however late the watch shows it: no more run than there are slots, and nobody is forgotten.
+//! In any history, and however late the watch shows it, no more run than there are slots, and every submission gets its turn.
 
 use proptest::prelude::*;
 

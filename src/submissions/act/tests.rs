@@ -1,4 +1,4 @@
-//! What is logged of a status that was written.
+//! The log lines of a status that was written.
 
 use std::sync::Arc;
 

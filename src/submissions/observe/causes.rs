@@ -1,5 +1,5 @@
-//! Why a Job has no Pod, and whether a node is on its way for a Pod that none accepts: what Kubernetes, cluster-autoscaler and
-//! Karpenter report in events.
+//! Why a Job has no Pod, and if a node is on its way for a Pod that no node takes. Kubernetes, cluster-autoscaler and Karpenter report
+//! this in events.
 //!
 //! Two watches hand them in, so that no reconcile asks for them. The last word on each object is kept, and wakes its submission.
 
@@ -22,12 +22,12 @@ use leaderboard_policy::view::ScaleUp;
 
 /// Why Jobs have no Pod.
 pub const OF_JOBS: &str = "involvedObject.kind=Job,reason=FailedCreate";
-/// What autoscalers report of Pods. The kubelet's events, some 35 of each Pod, and the scheduler's are left out by the API server.
+/// Events of autoscalers about Pods. The API server leaves out those of the kubelet, some 35 of each Pod, and of the scheduler.
 pub const OF_PODS: &str = "involvedObject.kind=Pod,source!=kubelet,source!=default-scheduler";
 
 /// As long as Kubernetes keeps an event.
 const LASTS: Duration = Duration::from_hours(1);
-/// How often what nobody has any more is dropped. An event may come before the cache shows its object.
+/// Time between two sweeps, which drop the words on objects that are gone. An event may come before the cache shows its object.
 const SWEPT: Duration = Duration::from_mins(1);
 /// How an event begins that stands for several.
 const COMBINED: &str = "(combined from similar events): ";
@@ -88,7 +88,7 @@ impl Causes {
         }
     }
 
-    /// What an autoscaler reports of a Pod.
+    /// An autoscaler's report about a Pod; None if its last word is another.
     pub fn scale_up(&self, pod: &str) -> Option<ScaleUp> {
         match self.word(pod)? {
             Word::ScaleUp(report) => Some(report),
@@ -183,7 +183,7 @@ fn is_karpenters(event: &Event) -> bool {
         .any(|name| ["karpenter", "eks-auto-mode/compute"].contains(&name))
 }
 
-/// What each try of a Job has in common: without the made up name of the Pod that was refused, each would be a new text and a write.
+/// The part of a message that each try of a Job shares. With the made up name of the refused Pod, each message would be new, and a write.
 fn steady(message: &str, job: &str) -> String {
     let message = message.strip_prefix(COMBINED).unwrap_or(message);
     let start = format!("\"{job}-");

@@ -8,7 +8,6 @@ pub mod workers;
 
 use std::sync::Arc;
 
-use jiff::Timestamp;
 use kube::ResourceExt;
 use kube::runtime::reflector::ObjectRef;
 
@@ -21,13 +20,15 @@ use crate::runtime::stores::Stores;
 use crate::slots::Slots;
 use causes::Causes;
 use leaderboard_api::{Leaderboard, Submission, SubmissionStatus};
+use leaderboard_base::clock::Clock;
 use leaderboard_policy::submissions::job_name;
 use leaderboard_policy::view::{EvalaiView, NodeView, ObservedJob, PodView, View};
 use workers::Workers;
 
-/// What reading the world of a submission uses.
+/// The sources of a submission's view.
 #[derive(Clone, Copy)]
 pub struct Uses<'a> {
+    pub clock: &'a Clock,
     pub stores: &'a Stores,
     pub memory: &'a Memory,
     pub workers: &'a Workers,
@@ -40,7 +41,7 @@ pub struct Uses<'a> {
 pub fn observe(uses: Uses<'_>, submission: Arc<Submission>, is_policy_in_place: impl Fn(&Leaderboard) -> bool) -> View {
     let workers = uses.workers;
     let submission = uses.memory.with_own_status(submission);
-    let now = Timestamp::now();
+    let now = uses.clock.now();
     let leaderboard = uses.stores.leaderboard_for(&submission);
     let (job, pod) = children(uses, &submission);
     let status = submission.status.as_ref();
@@ -77,7 +78,7 @@ pub fn observe(uses: Uses<'_>, submission: Arc<Submission>, is_policy_in_place: 
     }
 }
 
-/// Whether a Job may be made now.
+/// True if a Job may be made now.
 fn may_create(job: &ObservedJob) -> bool {
     matches!(job, ObservedJob::Absent { .. } | ObservedJob::Foreign)
 }

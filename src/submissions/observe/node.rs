@@ -1,6 +1,6 @@
 //! The node of a Pod as the watch of nodes shows it: it reports, is silent, is about to go, or is gone. For a Pod that is being deleted
-//! this decides between waiting for its kubelet and giving the Pod up. For a running Pod, people learn of a silent node before
-//! Kubernetes has given the Pod up, and the results are stored before the node is gone.
+//! this decides between waiting for its kubelet and giving the Pod up. For a running Pod, people see a silent node before Kubernetes has
+//! given the Pod up. The results are stored before the node is gone.
 
 use std::collections::HashMap;
 
@@ -14,14 +14,14 @@ use crate::runtime::stores::Stores;
 use leaderboard_api::Submission;
 use leaderboard_policy::view::{NodeView, ObservedNode};
 
-/// Taints with which a cluster announces that a node is about to go: Karpenter, cluster-autoscaler, and a person or a controller
-/// that knows a node to be off.
+/// Taints with which a cluster announces that a node is about to go. Karpenter, cluster-autoscaler, and a person or a controller that
+/// knows a node to be off set them.
 const LEAVING: [&str; 3] = [
     "karpenter.sh/disrupted",
     "ToBeDeletedByClusterAutoscaler",
     "node.kubernetes.io/out-of-service",
 ];
-/// What those of the AWS Node Termination Handler begin with: `spot-itn`, `scheduled-maintenance`, and others.
+/// Prefix of the taints of the AWS Node Termination Handler: `spot-itn`, `scheduled-maintenance`, and others.
 const TERMINATION_HANDLER: &str = "aws-node-termination-handler/";
 
 /// A node as its watch shows it. It is unknown without the right to watch nodes, and while the API server does not answer the watch.
@@ -77,7 +77,7 @@ fn of(node: &Node) -> NodeView {
     }
 }
 
-/// One that only asks new Pods to prefer other nodes announces no end, and the next Pod could come to this node again.
+/// The key of the taint that announces the node's end. A taint that only asks new Pods to prefer other nodes announces none.
 fn leaving(node: &Node) -> Option<String> {
     let mut taints = node.spec.taints.iter();
     let found = taints.find(|taint| {

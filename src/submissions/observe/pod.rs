@@ -41,7 +41,7 @@ fn deleted(pod: &Pod) -> Option<jiff::Timestamp> {
     by.checked_sub(jiff::SignedDuration::from_secs(grace)).ok()
 }
 
-/// Whether it has a node, if the scheduler reports it.
+/// The scheduler's condition, if it has this truth: `True` if the Pod has a node.
 fn scheduling<'a>(status: &'a PodStatus, truth: &str) -> Option<&'a Condition> {
     status.conditions.scheduled.as_deref().filter(|c| &*c.status == truth)
 }
@@ -117,8 +117,8 @@ fn container(status: &ContainerStatus) -> ContainerView {
     }
 }
 
-/// Whose words are passed on to people. A stranger's program can write whatever it likes where the runner leaves its
-/// verdict, for example a private route; of that only a verdict's closed words and numbers are used.
+/// True if people may read a container's own words. A participant's program can write anything, such as a private route, where the
+/// runner leaves its verdict. Only a verdict's closed words and numbers are used of that.
 fn may_speak(container: &str, ended: &Ended) -> bool {
     let is_hosts = names::INIT_CONTAINERS.contains(&container);
     // Without a start there was no program yet; the words are the kubelet's.

@@ -27,7 +27,7 @@ pub struct Workers {
 }
 
 impl Workers {
-    /// Starts them. What `wake` makes is called for each submission that has its answer.
+    /// Starts them. Each calls its own result of `wake` with each submission that has its answer.
     pub fn start(
         aws: &Aws,
         tables: Arc<Tables>,
@@ -43,12 +43,12 @@ impl Workers {
         }
     }
 
-    /// Notes which report is needed of a run that `ended` then; None: none any more.
+    /// Notes which report is needed of a run that `ended` then, if it has; None: none any more.
     pub fn demand_report(
         &self,
         submission: &Submission,
         status: &SubmissionStatus,
-        ended: Option<Timestamp>,
+        ended: Timestamp,
         demand: Option<ReportDemand>,
     ) {
         let Some((demand, files)) = demand.zip(files(submission, status)) else {

@@ -53,7 +53,7 @@ impl Bench {
         let around = surroundings(Cluster::default(), &endpoint).await;
         Self {
             objects,
-            reader: reader(around.aws.clone()),
+            reader: reader(around.aws.clone(), Clock::system()),
             endpoint,
         }
     }

@@ -87,7 +87,7 @@ impl Bench {
         };
         let status = self.status();
         self.workers()
-            .demand_report(&self.submission, &status, None, Some(demand));
+            .demand_report(&self.submission, &status, jiff::Timestamp::UNIX_EPOCH, Some(demand));
     }
 
     /// Waits until the submission is woken; hands back what is known then.

@@ -107,7 +107,7 @@ async fn one_bad_queue_among_several_is_named_and_the_others_are_read() {
 async fn a_queue_that_goes_away_for_a_while_loses_no_message() {
     let world = World::new("bridge-away").await;
     let url = world.stand_in.queue("q").await;
-    // What the broken receive may have taken comes back soon.
+    // Messages that the broken receive may have taken come back soon.
     world.stand_in.set_visibility(&url, 2).await;
     let proxy = ministack::server().await.proxy().await;
     let queue = json!({"url": url, "endpoint": proxy.endpoint()});

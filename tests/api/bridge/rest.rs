@@ -1,4 +1,4 @@
-//! What a queue without messages costs, counted by a server in SQS's place.
+//! Cost of a queue without messages, counted by a server in SQS's place.
 
 use std::sync::{Arc, Mutex};
 
@@ -15,7 +15,7 @@ use super::*;
 /// So many receives are answered, each at once: a real queue takes the time that it is given.
 const RECEIVES: usize = 30;
 
-/// What was asked, in order, and how many receives were under way at the same time.
+/// The requests in order, and the most receives that were under way at the same time.
 #[derive(Default)]
 struct Log {
     asked: Vec<(String, Value)>,

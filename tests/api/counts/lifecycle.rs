@@ -35,7 +35,7 @@ use crate::support::player::{Cluster, Player, ROUTES, reports};
 const BOARD: &str = "carla";
 /// Far longer than anything here takes.
 const LIMIT: Duration = Duration::from_mins(3);
-/// A controller that has written nothing during so long has nothing more to write. Nobody can wait for what does not come.
+/// A controller that has written nothing for so long has nothing more to write. No event announces that.
 const QUIET: Duration = Duration::from_secs(7);
 /// The audit log of the API server is read this often.
 const LOOK: Duration = Duration::from_millis(200);
@@ -85,7 +85,7 @@ impl Scenario {
         }
     }
 
-    /// What a submission costs, and what a controller without one does not.
+    /// Cost of a submission, without the allocations of an idle controller.
     pub async fn cost(self) -> Cost {
         let (idle, one) = tokio::join!(self.run(false), self.run(true));
         Cost {
@@ -153,7 +153,7 @@ pub struct Watched {
     pub log: Option<Dispatch>,
 }
 
-/// What is around a controller.
+/// The surroundings of a controller.
 pub struct World {
     pub client: Client,
     pub namespace: String,
@@ -253,8 +253,8 @@ impl World {
         reached.expect("the Leaderboard is ready").unwrap();
     }
 
-    /// A submission from its creation until every system has its end. The controller comes to rest in between, so that it
-    /// makes no difference how fast it is: with a Job, with a running Pod, and with an end.
+    /// A submission from its creation until every system has its end. The controller comes to rest in between: with a Job, with a running
+    /// Pod, and with an end. So the result does not depend on the machine's speed.
     pub async fn live(&self, controller: &Controller) {
         self.submit("one").await;
         self.until("one", "it has a Job", has_job).await;
@@ -380,7 +380,7 @@ impl Controller {
         }
     }
 
-    /// What it has asked the API server for, watches and the process's own requests left out.
+    /// Requests of the controller to the API server, without watches and without the process's own.
     pub(super) async fn requests(&self) -> Vec<Request> {
         let all = server().await.requests(&self.user).into_iter();
         let counts =

@@ -1,4 +1,4 @@
-//! What a controller asks for while its submissions only run or wait: nothing is new, so nothing but looks at their reports.
+//! Requests of a controller while its submissions only run or wait. Nothing is new, so it only looks at their reports.
 
 use std::collections::BTreeMap;
 use std::time::Duration;
@@ -23,7 +23,7 @@ const COUNT: usize = 4;
 const PERIOD: u32 = 10;
 const MINUTE: Duration = Duration::from_mins(1);
 
-/// What comes of a minute.
+/// Cost of a minute.
 #[derive(Debug, Clone, Default, PartialEq, Serialize, Deserialize)]
 #[serde(rename_all = "camelCase", deny_unknown_fields)]
 pub struct Rest {
@@ -50,7 +50,7 @@ pub async fn of_live_runs() -> Rest {
     rest
 }
 
-/// A minute with Jobs that a quota gives no Pod. Their reasons come from events, and nobody asks for them.
+/// A minute with Jobs that a quota gives no Pod. Their reasons come from events, so no request asks for them.
 pub async fn of_refused_jobs() -> Rest {
     let world = World::reading_every(PERIOD, Scenario::ALL[0]).await;
     let controller = Controller::start(&world, Watched::default()).await;
@@ -100,7 +100,7 @@ fn shows_quota(submission: &Submission) -> bool {
     })
 }
 
-/// What the Job controller reports of a Pod that the API server has refused: each try has a name of its own.
+/// Reports as the Job controller that the API server has refused a Pod: each try has a name of its own.
 async fn refuse(world: &World, job: &Job) {
     let (name, now) = (job.name_any(), Timestamp::now().to_string());
     let tried = format!("{name}-{}", &fastrand::u64(1 << 40..).to_string()[..5]);
@@ -116,7 +116,7 @@ async fn refuse(world: &World, job: &Job) {
     world.api().create(&PostParams::default(), &event).await.unwrap();
 }
 
-/// What is asked for within a minute that begins at rest.
+/// Cost of a minute that begins at rest.
 async fn minute(world: &World, controller: &Controller) -> Rest {
     controller.quiet().await;
     let before = (

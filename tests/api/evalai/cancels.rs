@@ -5,8 +5,8 @@
 
 use super::*;
 
-/// The write that undid a cancel knowingly: the first one that the server had not answered when it came, if the read right
-/// before it was made after it. What follows a cancel that is undone knows nothing of it.
+/// The write that undid a cancel knowingly. It is the first write that was not answered when the cancel came, if it and the read before
+/// it came after the cancel. Writes after a cancel that was undone cannot know of it.
 fn written_knowingly(log: &[Entry], pk: i64, cancelled: Timestamp) -> Option<&Entry> {
     let path = format!("/jobs/submission/{pk}");
     let is_write = |entry: &&Entry| entry.method != "GET" && entry.body["submission"] == json!(pk);
@@ -84,7 +84,7 @@ async fn cancels_during_partial_traffic_are_lost_only_inside_a_request() {
             let score = f64::from(u32::try_from(round).unwrap());
             world.update(*other, DesiredUpdate::Partial(results(&world.target, score)));
         }
-        // Those that are cancelled get none.
+        // Cancelled submissions get no PUT.
         let wanted = world.sent("PUT").len() + 5.min(pks.len() - round);
         world
             .server

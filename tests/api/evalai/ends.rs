@@ -1,4 +1,4 @@
-//! What becomes of each end in each state that EvalAI may have.
+//! Each end in each state that EvalAI may have, and the result.
 
 use super::*;
 
@@ -23,7 +23,7 @@ fn in_each_state(world: &World, wanted: Outcome, missing: i64) -> Vec<(i64, Stat
     all
 }
 
-/// What becomes of an end that EvalAI's state leaves no room for.
+/// The result of an end that EvalAI's state leaves no room for.
 #[derive(Debug, PartialEq, Eq)]
 pub(super) enum Kept {
     Agreed(Status),

@@ -1,4 +1,4 @@
-//! What old submissions of a challenge cost.
+//! Cost of a challenge's old submissions.
 
 use evalai_stand_in::submissions::{Bulk, bulk};
 
@@ -23,7 +23,7 @@ fn lists(world: &World) -> Vec<String> {
 #[tokio::test]
 async fn old_cancelled_submissions_cost_nothing() {
     let mut world = World::new().await;
-    // What a row costs is known; this is about how many there are.
+    // The cost of a row is tested elsewhere; here their number counts.
     world.server.set_knobs(Knobs {
         list_row_ms: 0,
         ..Knobs::default()
@@ -73,7 +73,7 @@ async fn old_cancelled_submissions_cost_nothing() {
     assert_eq!(view.ended, Some(Status::Cancelled));
 }
 
-/// What a list of so many rows takes the real server: a fixed part, and one for each row.
+/// Rows of a list, and the time that it takes the real server, in milliseconds: a fixed part, and one for each row.
 const ROWS: u64 = 2000;
 const LIST_MS: u64 = 3000;
 const ROW_MS: u64 = 10;
@@ -120,7 +120,7 @@ async fn a_list_of_2000_rows_that_takes_23_seconds_holds_no_end_up() {
         lists[0].answered, None,
         "the list is on its way until after the last end"
     );
-    // What it brings counts all the same.
+    // The answer counts all the same.
     let view = world.until(live, |view| view.ended.is_some()).await;
     assert_eq!(view.ended, Some(Status::Cancelled));
     let answered = world.sent("GET").into_iter().find(is_list).unwrap();

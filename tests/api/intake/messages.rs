@@ -1,4 +1,4 @@
-//! What EvalAI puts into the queue, in an order of chance.
+//! The messages that EvalAI puts into the queue, in random order.
 
 use std::collections::BTreeMap;
 

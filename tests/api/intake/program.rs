@@ -8,7 +8,7 @@ use tokio::process::{Child, Command};
 use super::super::process::operator;
 use crate::support::apiserver::server;
 
-/// What the controller writes last when it ends because its Lease could not be renewed: on a busy machine that may be.
+/// Last words of a controller that could not renew its Lease, which may happen on a busy machine.
 const LOST_LEASE: &str = "this process no longer leads";
 
 /// A running program, in a Pod of its own that keeps its name. It is killed when this is dropped.

@@ -167,7 +167,7 @@ fn give(terminal: &Terminal, person: &str, resource: &str) {
     give_changed(terminal, person, resource, |_| {});
 }
 
-/// The same with the rule changed.
+/// Gives a person the rights of the documents, with one rule changed.
 fn give_changed(terminal: &Terminal, person: &str, resource: &str, change: impl FnOnce(&mut Value)) {
     let (_, rest) = DOCS.split_once("```yaml\n").unwrap();
     let (role, _) = rest.split_once("```").unwrap();

@@ -98,7 +98,7 @@ impl Terminal {
         Printed::of(&ended(&mut self.command(arguments)).await)
     }
 
-    /// The same as a person with these rights alone.
+    /// Runs a command with the kubeconfig of a person, who has few rights.
     pub async fn run_as(&self, person: &Path, arguments: &[&str]) -> Printed {
         let mut command = self.command(arguments);
         Printed::of(&ended(command.arg("--kubeconfig").arg(person)).await)
@@ -109,7 +109,7 @@ impl Terminal {
     }
 }
 
-/// What a command printed.
+/// The output of a command.
 #[derive(Debug)]
 pub struct Printed {
     pub code: Option<i32>,

@@ -131,7 +131,7 @@ async fn an_s3_without_conditions_stores_all_the_same() {
     server.abort();
 }
 
-/// What S3 has of a stored object: how it is encrypted, with which key, and its class.
+/// Kind of encryption, key and class of a stored object.
 async fn kept_as(pod: &Pod, key: &str) -> (String, String, String) {
     let s3 = pod.aws.s3(None, Some(&server().await.endpoint()));
     let bucket = &pod.setting.run.plan.storage.s3.bucket;

@@ -1,4 +1,4 @@
-//! A store that knows no checksums: it answers 501 to each request that has one, or that is sent in the way in which the SDK adds one
+//! A store that knows no checksums. It answers 501 to each request that has one. It also refuses the way in which the SDK adds a checksum
 //! behind the content.
 
 use aws_sdk_s3::config::RequestChecksumCalculation;

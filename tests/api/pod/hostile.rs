@@ -1,5 +1,5 @@
-//! What an agent can put where its checkpoint should be, and volumes that take nothing: results stay, nothing is followed, and
-//! logcopy goes on.
+//! A hostile agent puts other things in place of its checkpoint, and volumes take nothing. Results stay, no link is followed, and logcopy
+//! goes on.
 
 use std::os::unix::fs::symlink;
 use std::process::Command;

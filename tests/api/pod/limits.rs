@@ -1,12 +1,12 @@
-//! What a run may store and send: every byte and every object counts, over restarts too, and nothing that an agent does
-//! hides a log or keeps a report back.
+//! Limits of a run: every byte and every object that it stores or sends counts, over restarts too. An agent cannot hide a log or keep a
+//! report back.
 
 use leaderboard_contract::keys::known_logs;
 
 use super::shelf::Shelf;
 use super::*;
 
-/// Of a limit of 1 MiB the agents' own files get half, which is as many files of a page.
+/// Most files of one page for the agents: their own files get half of the limit of 1 MiB.
 const AGENT_FILES: usize = 128;
 
 /// A Pod whose run may store 1 MiB.

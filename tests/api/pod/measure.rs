@@ -1,4 +1,4 @@
-//! What storing a run costs, measured against the reference of `aws s3 sync`. Takes five minutes, so it is asked for by name:
+//! Cost of storing a run, measured against the reference of `aws s3 sync`. It takes five minutes, so it runs only by name:
 //! `cargo test --profile local --test api -- --ignored --nocapture what_storing_the_reference_costs`.
 
 use super::*;

@@ -231,8 +231,8 @@ async fn a_pod_that_has_to_be_isolated_and_is_not_changes_nothing() {
     assert!(pod.keys().await.is_empty() && !pod.setting.places.runner_for_all().exists());
 }
 
-/// A way to the stand-in on which the first connections are cut in the middle of an answer, as a network plugin does that
-/// begins to enforce a policy.
+/// A way to the stand-in that cuts the first connections in the middle of an answer. A network plugin does that when it begins to
+/// enforce a policy.
 async fn cutting(connections: u32) -> String {
     let listener = TcpListener::bind("127.0.0.1:0").await.unwrap();
     let endpoint = format!("http://{}", listener.local_addr().unwrap());

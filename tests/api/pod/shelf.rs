@@ -9,7 +9,7 @@ use axum::http::{Method, StatusCode};
 use axum::response::{IntoResponse, Response};
 use tokio::sync::watch;
 
-/// What is stored under a key.
+/// An object in the store.
 #[derive(Clone, Debug, Default)]
 struct Stored {
     bytes: Vec<u8>,
@@ -46,7 +46,7 @@ impl Shelf {
         (shelf, endpoint)
     }
 
-    /// What is sent to this key arrives no more.
+    /// Loses each later write to this key.
     pub(super) fn lose(&self, key: &str) {
         self.state.send_modify(|state| {
             state.lost.insert(key.to_owned());

@@ -1,9 +1,9 @@
-//! What storing a file costs, and that it reads back as it was.
+//! Cost of storing a file, and its content when it is read back.
 
 use super::*;
 
 const LOG: &str = "agent/agent1/leaderboard.log";
-/// What a file counts at least.
+/// Least size that a file counts, in bytes.
 const PAGE: usize = 4096;
 
 async fn sync(pod: &Pod, uploader: &mut Uploader, path: &str) -> Sent {
@@ -70,7 +70,7 @@ async fn a_log_that_was_written_anew_is_stored_anew() {
     let mut uploader = pod.uploader();
     pod.put(LOG, &noise(6 * MIB, 1));
     sync(&pod, &mut uploader, LOG).await;
-    // The same file, longer, with another beginning.
+    // The file is longer, and has another beginning.
     pod.put(LOG, &noise(7 * MIB, 2));
     assert_eq!(sync(&pod, &mut uploader, LOG).await.objects, 1);
     assert_eq!(pod.stored(LOG).await.unwrap(), noise(7 * MIB, 2));

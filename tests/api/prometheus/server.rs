@@ -11,7 +11,7 @@ use tokio::process::Child;
 use super::super::bridge::eventually;
 use crate::support::tools;
 
-/// What is scraped, with the labels that the chart's monitors give it.
+/// A process to scrape, with the labels that the chart's monitors give it.
 pub(super) struct Target {
     pub(super) job: &'static str,
     pub(super) pod: String,

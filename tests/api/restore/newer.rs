@@ -1,4 +1,4 @@
-//! What has begun since the last backup comes back from the table, by the commands of docs/availability.md.
+//! Submissions that are newer than the last backup come back from the table, by the commands of docs/availability.md.
 
 use aws_sdk_dynamodb::types::AttributeValue;
 use kube::runtime::wait::await_condition;

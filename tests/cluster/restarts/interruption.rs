@@ -1,4 +1,4 @@
-//! The node of a run is about to be taken away: all that was reached is stored in time, and the run goes on from there.
+//! The node of a run is about to be taken away. All results so far are stored in time, and the run goes on from there.
 //!
 //! The cluster has one node, so it is not taken away after all, and the next Pod comes to it again.
 

@@ -57,7 +57,7 @@ async fn uses_up(id: &str) {
         let found = report_of(scene, "hostile").await;
         say(&found);
         assert!(found.starts_with(USED_UP), "this machine cannot show it: {found}");
-        // What is begun meanwhile has the same troubles, and more containers that have them.
+        // A later submission has the same troubles, and more containers that have them.
         scene.submit("late", "agent:standard").await;
         let neighbor = judge(scene, limit, "neighbor").await;
         assert_eq!(judge(scene, limit, "late").await, neighbor);
@@ -67,7 +67,7 @@ async fn uses_up(id: &str) {
     .await;
 }
 
-/// What the hostile agent says of the limit, from its node: what is stored of it may wait until the limit is given back.
+/// The hostile agent's line about the limit, read from its node: the stored log may wait until the limit is given back.
 async fn report_of(scene: &Scene, submission: &str) -> String {
     scene.running(submission, LIMIT).await;
     let pod = scene.pod(submission).await;

@@ -34,8 +34,8 @@ pub(super) async fn install_definitions(client: &Client) {
     }
 }
 
-/// The cluster may have an operator that serves all namespaces, such as the demo's: it may write nothing here, and what it
-/// would read and delete elsewhere is out of its reach, on loopback.
+/// Keeps an operator out that serves all namespaces, such as the demo's. It may write nothing here. The AWS that it would read and change
+/// is out of its reach, on loopback.
 pub(super) async fn keep_others_out(client: &Client) {
     let policy = json!({
         "apiVersion": "admissionregistration.k8s.io/v1",

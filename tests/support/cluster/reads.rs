@@ -1,4 +1,4 @@
-//! What tests read of objects.
+//! Readers of objects, for the tests.
 
 use k8s_openapi::api::core::v1::{ContainerStatus, Pod};
 use kube::{Resource, ResourceExt};
@@ -31,7 +31,7 @@ pub fn done(submission: &Submission) -> i32 {
     progress.map_or(0, |progress| progress.done)
 }
 
-/// Whether a condition of a Submission is True.
+/// True if a condition of a Submission is True.
 pub fn is_true(submission: &Submission, condition: &str) -> bool {
     let status = submission.status.as_ref();
     status.is_some_and(|status| conditions::is_true(&status.conditions, condition))
@@ -49,7 +49,7 @@ pub fn containers(pod: &Pod) -> Vec<ContainerStatus> {
     lists.into_iter().flatten().flatten().collect()
 }
 
-/// Whether it has come to its end in Kubernetes, EvalAI and DynamoDB.
+/// True if it has come to its end in Kubernetes, EvalAI and DynamoDB.
 pub fn is_settled(submission: &Submission) -> bool {
     let Some(status) = &submission.status else { return false };
     let known = |type_: &str| {

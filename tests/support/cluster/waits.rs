@@ -156,7 +156,7 @@ fn is_ending(pod: &Pod) -> bool {
     pod.metadata.deletion_timestamp.is_some()
 }
 
-/// What a person needs of an object to see why it is not as it should be.
+/// An object in brief, for a person who asks why it is not as expected.
 fn brief(object: &impl Serialize) -> String {
     let object = json!(object);
     let status = &object["status"];

@@ -39,7 +39,7 @@ impl ReasonName {
         self.known().map_or("Other", Reason::as_str)
     }
 
-    /// Whether it is one of these.
+    /// True if it is one of these. A name that the table does not know is none of them.
     pub fn is_one_of(&self, reasons: &[Reason]) -> bool {
         self.known().is_some_and(|known| reasons.contains(&known))
     }

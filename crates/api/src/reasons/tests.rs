@@ -1,4 +1,4 @@
-//! What holds for every row of the table, and that docs/states.md shows it.
+//! Rules for every row of the table, and for the tables of docs/states.md that are made from it.
 
 use std::fmt::Write as _;
 

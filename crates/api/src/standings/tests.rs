@@ -175,7 +175,7 @@ fn a_stored_row_stays_while_its_submission_is_gone_and_leaves_when_that_no_longe
     let left = of(&ranking, &objects([cancelled]), &stored);
     assert_eq!(left, rows(&[(1, "s-2", "30.00")]));
 
-    // The same message came once more after its retention: the new object has nothing to say about the old result.
+    // A message for s-1 came once more after its retention. The new object has no result, so the old one stays.
     let mut anew = finished("s-1", "a", "40.00", 1);
     anew["metadata"]["uid"] = json!("another");
     anew["status"]["conditions"] = json!([condition("Finished", "True", "EndedInEvalAI")]);

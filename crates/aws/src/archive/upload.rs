@@ -25,8 +25,8 @@ const PLAIN: &AsciiSet = &NON_ALPHANUMERIC
     .remove(b'/');
 
 impl Archive {
-    /// Stores the first `size` bytes of a file in parts; what is stored of it already is copied inside S3. At most one part
-    /// is in memory. What is not done at `cut_at` is aborted. Returns the new object's entity tag.
+    /// Stores the first `size` bytes of a file in parts. Bytes that are stored already are copied inside S3. At most one part
+    /// is in memory. At `cut_at` it aborts an upload that is not done. Returns the new object's entity tag.
     pub async fn upload(
         &self,
         key: &str,
@@ -58,7 +58,7 @@ impl Archive {
         };
         if stored.is_err() {
             let abort = self.client.abort_multipart_upload().bucket(&self.bucket);
-            // What is left over costs storage only; the bucket's lifecycle rule ends it.
+            // A failed abort leaves parts that cost storage only; the bucket's lifecycle rule removes them.
             let _ = abort.key(self.full(key)).upload_id(&id).send().await;
         }
         stored

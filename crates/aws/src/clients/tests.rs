@@ -46,7 +46,7 @@ fn loader() -> aws_config::ConfigLoader {
 
 /// Asks each service once.
 async fn ask_all(aws: &Aws, endpoint: Option<&str>) -> [&'static str; 5] {
-    // What they make of an answer like this is not of interest.
+    // Their reading of the answer does not matter here.
     let _ = aws.s3(None, endpoint).list_objects_v2().bucket("b").send().await;
     let _ = aws
         .sqs(None, endpoint)

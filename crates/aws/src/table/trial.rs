@@ -11,7 +11,7 @@ const NEVER: &str = "attribute_exists(#attempt) AND attribute_not_exists(#attemp
 impl Table {
     /// Asks whether the operator may write rows.
     pub async fn try_write(&self) -> Result<(), TableError> {
-        // The keys fit strings and numbers, and are nobody's: EvalAI counts teams and submissions from 1.
+        // The keys fit strings and numbers, and belong to no team or submission: EvalAI counts both from 1.
         let row = Row {
             team_id: "0".to_owned(),
             run_id: "0".to_owned(),

@@ -15,7 +15,7 @@ pub enum Adapter {
     /// The engine chooses.
     Unnamed,
     Numbered(i32),
-    /// What the runner finds, which sees the devices.
+    /// The runner finds the number: it sees the devices of its container.
     Found,
 }
 

@@ -31,7 +31,7 @@ pub(super) fn sockets(simulator: &SimulatorContainer) -> Option<Mount> {
     })
 }
 
-/// What the image sets of a screen, where there is none.
+/// Variables of the image that the container does not get: with no screen, those that name one.
 pub(super) fn removed(simulator: &SimulatorContainer) -> &'static [&'static str] {
     match simulator.display {
         Display::Offscreen => &[SCREEN, COOKIES],

@@ -1,9 +1,9 @@
-//! What CARLA counts and how it names its scores, in the words that EvalAI's files have for them. Pure.
+//! The unit that CARLA counts and the names of its scores, as EvalAI's files spell them. Pure.
 
 use leaderboard_api::Metric;
 use leaderboard_results::Merged;
 
-/// What a run consists of.
+/// The unit of work, in the plural.
 pub const UNIT: &str = "routes";
 /// The score that ranks where EvalAI names none.
 pub const DRIVING_SCORE: &str = "Driving score";

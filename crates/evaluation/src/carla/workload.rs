@@ -1,6 +1,6 @@
 //! CARLA's simulators and agents: images, commands, flags, variables and mounts of a pair. Pure.
 //!
-//! What they see is the original's, version by version.
+//! Both programs see the flags and variables of the original setup, version by version.
 
 use super::commands::{self, Adapter};
 use super::display;
@@ -17,7 +17,7 @@ const ROUTES_FILE: &str = "/workspace/leaderboard/data/routes_testing.xml";
 const SCENARIOS_FILE: &str = "/workspace/leaderboard/data/all_towns_traffic_scenarios_private.json";
 const CHECKPOINT: &str = "/tmp/agent/agent_results.json";
 const LIVE_RESULTS: &str = "/tmp/agent/live_results.txt";
-/// What a simulator keeps.
+/// The folder that a simulator writes.
 const SAVED: &str = "/home/carla/CarlaUE4/Saved";
 const CONTENTS_VOLUMES: [ContentsVolume; 3] = [
     ContentsVolume {
@@ -127,7 +127,7 @@ fn simulator(known: &Known<'_>, pair: Pair) -> Role {
     }
 }
 
-/// What the server draws with. Of a command of the host's that is not known.
+/// The graphics API that the server draws with. `Any` if the host has a command of its own: it may start any server.
 fn needs(spec: &SimulatorContainer, version: LeaderboardVersion) -> Needs {
     match (&spec.command, version) {
         (Some(_), _) => Needs::Any,

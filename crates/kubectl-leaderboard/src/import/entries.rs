@@ -50,7 +50,7 @@ const ORIGINALS: [Original; 2] = [
     },
 ];
 
-/// What AWS answers for one entry.
+/// The answer of AWS for one entry.
 #[derive(Deserialize)]
 struct Answer {
     #[serde(rename = "ARN")]
@@ -72,7 +72,7 @@ pub(super) struct Entry {
 }
 
 impl Entry {
-    /// Whether it holds EvalAI's token.
+    /// True if the entry holds EvalAI's token.
     pub(super) fn has_token(&self) -> bool {
         self.text.as_ref().is_some_and(|text| text.contains(TOKEN_KEY))
     }
@@ -118,7 +118,7 @@ impl Place {
     }
 }
 
-/// What the entries hold.
+/// The original pipeline, as its entries describe it.
 #[derive(Debug, PartialEq)]
 pub(super) struct Pipeline {
     /// Root of EvalAI's server.
@@ -127,7 +127,7 @@ pub(super) struct Pipeline {
     pub(super) token_region: String,
     /// Each Leaderboard whose entry is given.
     pub(super) boards: Vec<Board>,
-    /// What is not taken over, and why.
+    /// Settings that are not taken over, each with its cause.
     pub(super) dropped: Vec<String>,
 }
 
@@ -178,7 +178,7 @@ impl Track {
     }
 }
 
-/// What is not right, and what is not taken over.
+/// Problems that stop the import, and settings that are not taken over.
 #[derive(Default)]
 struct Found {
     problems: Vec<String>,
@@ -195,7 +195,7 @@ struct Fields<'a> {
 }
 
 impl<'a> Fields<'a> {
-    /// Those of an entry of the answers, if they are such.
+    /// The keys of one entry. None, with the problem in `found`, if its ARN or its text cannot be read.
     fn of(entry: &'static str, Entry { arn, text }: &Entry, found: &'a mut Found) -> Option<Self> {
         let Some(place) = Place::of(arn) else {
             found.problems.push(format!(

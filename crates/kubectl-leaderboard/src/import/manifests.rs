@@ -1,4 +1,4 @@
-//! What the original's entries become: manifests with comments. Pure.
+//! Makes manifests with comments from the original's entries. Pure.
 //!
 //! Every text of an entry stands in quotation marks, as JSON writes it, so it adds no field and no object.
 
@@ -14,7 +14,7 @@ use crate::text::wrap;
 /// Columns of a line of the first comment.
 const WIDTH: usize = 116;
 
-/// What no entry holds.
+/// Settings that no entry holds; the command line names them.
 pub(super) struct Options {
     pub(super) namespace: String,
     pub(super) challenge: i64,

@@ -24,7 +24,7 @@ use crate::output::{note, print};
 /// The namespace that the roles of examples/aws trust.
 const NAMESPACE: &str = "leaderboard";
 
-/// What a person names on the command line.
+/// Arguments of `import`.
 #[derive(Args, Debug)]
 pub struct Import {
     /// Files with what `aws secretsmanager get-secret-value --output json` prints of the entries, one or more in each; `-` is standard

@@ -21,7 +21,7 @@ pub(super) fn texts() -> Texts {
     serde_json::from_str(include_str!("entries.json")).unwrap()
 }
 
-/// What `aws secretsmanager get-secret-value --output json` prints of an entry.
+/// The output of `aws secretsmanager get-secret-value --output json` for an entry.
 pub(super) fn answer(name: &str, text: &str) -> Value {
     json!({
         "ARN": format!("arn:aws:secretsmanager:us-west-2:123456789012:secret:{name}-Ab12Cd"), "Name": name,

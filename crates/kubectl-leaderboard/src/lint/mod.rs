@@ -1,7 +1,7 @@
 //! `lint`: manifests checked by the schemas and the CEL rules of this version's definitions, and results of evaluators by the reader of
 //! them, without a cluster.
 //!
-//! `findings` is pure. What an API server alone knows, such as other objects and a change of an existing one, is not checked.
+//! `findings` is pure. It leaves out checks that need an API server: other objects, and the change of an existing one.
 
 mod manifest;
 mod schema;
@@ -48,7 +48,7 @@ pub(super) struct Finding {
 pub(super) struct Checked {
     valid: usize,
     faulty: usize,
-    /// Those of other groups.
+    /// Objects of other groups, which are not checked.
     others: usize,
 }
 
@@ -71,7 +71,7 @@ pub fn lint(wanted: &Lint) -> Result<ExitCode, Error> {
     Ok(if is_well { ExitCode::SUCCESS } else { ExitCode::FAILURE })
 }
 
-/// What is printed of a file: each fault, and a sentence about all.
+/// Lines about one file: each fault, and a sentence about all objects.
 pub(super) fn lines(file: &str, findings: &[Finding], checked: &Checked) -> Vec<String> {
     let mut lines: Vec<String> = findings
         .iter()

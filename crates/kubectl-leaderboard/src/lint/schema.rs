@@ -185,7 +185,7 @@ fn list(schema: &Value, items: &[Value], path: &str) -> Option<Fault> {
     fault(path, text)
 }
 
-/// What a text must do and does not.
+/// The first rule of the schema that a text breaks, as the words after "must". None if it keeps all.
 fn string(schema: &Value, text: &str) -> Option<String> {
     let length = text.chars().count() as u64;
     if let Some(least) = schema["minLength"].as_u64().filter(|least| length < *least) {

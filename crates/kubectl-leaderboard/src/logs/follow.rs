@@ -23,7 +23,7 @@ use crate::text::log_line;
 type Life = (String, String, i32);
 type Lines = BoxStream<'static, (Source, Result<String, Error>)>;
 
-/// What is shown, and what was shown.
+/// The open logs, and the lives and lines that were shown.
 struct Following<'a> {
     cluster: &'a Cluster,
     wanted: &'a Logs,
@@ -60,7 +60,7 @@ pub(super) async fn follow(cluster: &Cluster, wanted: &Logs, submission: Submiss
 }
 
 impl Following<'_> {
-    /// Whether the submission has ended and all that was begun is shown.
+    /// True if the submission has ended and every open log is shown to its end.
     fn is_over(&self) -> bool {
         facts::has_ended(&self.submission) && self.lines.is_empty()
     }

@@ -1,13 +1,12 @@
 //! `report`: what a person who helps needs of a namespace, in one file, without secrets, logs and names of teams.
 //!
-//! `redact`, which is pure, takes out what is nobody's business.
+//! `redact`, which is pure, takes out secrets, routes and names of teams.
 
 mod redact;
 
 use std::path::PathBuf;
 
 use clap::Args;
-use jiff::Timestamp;
 use leaderboard_api::text::sentence;
 use serde_json::{Value, json};
 
@@ -38,7 +37,7 @@ struct Part {
 
 /// Writes the report.
 pub async fn report(cluster: &Cluster, wanted: &Report) -> Result<(), Error> {
-    let now = Timestamp::now();
+    let now = frame().now;
     let parts = ask(cluster).await;
     let submissions = parts.iter().find(|part| part.name == SUBMISSIONS);
     let names = submissions
@@ -58,7 +57,7 @@ pub async fn report(cluster: &Cluster, wanted: &Report) -> Result<(), Error> {
                 counts.push(counted(objects.len(), part.one, part.many));
                 document[part.name] = redact::objects(part.name, objects, &names);
             }
-            // A report of nothing helps nobody.
+            // Without credentials or an API server every other part would be empty too.
             Err(error @ (Error::Credentials(_) | Error::Unreachable { .. })) => return Err(error),
             // Without a right to one kind, the others help all the same.
             Err(error) => missing.push(format!("{}: {error}", part.name)),
@@ -67,7 +66,7 @@ pub async fn report(cluster: &Cluster, wanted: &Report) -> Result<(), Error> {
     document["missing"] = json!(missing);
     let default = || PathBuf::from(format!("leaderboard-report-{}.json", cluster.namespace));
     let file = wanted.file.clone().unwrap_or_else(default);
-    // Who reads it on a terminal is not commanded by a stranger's text.
+    // The document escapes control characters, so that a participant's text cannot command the reader's terminal.
     let text = output::document(Format::Json, &document).unwrap_or_default().concat();
     let path = file.display().to_string();
     std::fs::write(&file, text + "\n").map_err(|error| Error::File(path.clone(), error))?;
@@ -100,7 +99,7 @@ fn counted(number: usize, one: &str, many: &str) -> String {
     format!("{number} {}", if number == 1 { one } else { many })
 }
 
-/// What was written, what is not in it, and what to do before it is handed on.
+/// Lines about the file, the parts that are missing, and the check before it is handed on.
 pub(super) fn lines(file: &str, namespace: &str, counts: &[String], missing: &[String], frame: Frame) -> Vec<String> {
     let mut page = frame.page();
     page.paragraph(&format!(

@@ -5,7 +5,7 @@ use std::collections::BTreeSet;
 use leaderboard_api::Reason;
 use serde_json::{Value, json};
 
-/// What stands where something was taken out.
+/// Stands in place of a removed text.
 const REMOVED: &str = "<removed>";
 /// Fields that are dropped wherever they are: what Kubernetes repeats, whose a submission is, and what programs wrote before they ended.
 const DROPPED: [&str; 6] = [
@@ -45,7 +45,7 @@ pub(super) fn objects(part: &str, objects: Vec<Value>, names: &BTreeSet<String>)
     Value::Array(all.map(|object| redacted(object, names)).collect())
 }
 
-/// Of a Pod, how its containers fare: its spec has the plan and the environment.
+/// The state of a Pod's containers. Its spec stays out, because it has the plan and the environment.
 fn pod(pod: &Value) -> Value {
     let containers = |key: &str| {
         let all = pod["status"][key].as_array().map(Vec::as_slice).unwrap_or_default();

@@ -1,4 +1,4 @@
-//! What docs/plugin.md shows is what the plugin prints.
+//! docs/plugin.md shows the lines that the plugin prints.
 
 use jiff::Timestamp;
 use serde_json::json;

@@ -9,7 +9,7 @@ use crate::text::{Frame, columns};
 
 /// Columns of the terminals.
 pub(super) const WIDTHS: [usize; 2] = [80, 120];
-/// What is copied, and so not broken.
+/// Texts that people copy, and that no line may break.
 const COPIED: [&str; 5] = ["s3://", "aws ", "https://", "kubectl ", "`kubectl "];
 
 /// Compares what one command prints with its file: for a narrow and a wide terminal, without and with colours.

@@ -24,7 +24,7 @@ fn the_help_of_each_command_fits_a_narrow_terminal() {
     }
     let text: Vec<&str> = text.lines().map(str::trim_end).collect();
     assert_golden("help", &format!("{}\n", text.join("\n")));
-    // What is copied is not broken.
+    // Addresses that people copy stay in one line.
     let is_long = |line: &&&str| columns(line) > NARROW && !line.contains("https://");
     assert_eq!(text.iter().filter(is_long).collect::<Vec<_>>(), Vec::<&&str>::new());
 }

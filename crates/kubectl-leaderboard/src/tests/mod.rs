@@ -1,4 +1,4 @@
-//! What the plugin prints and decides, as tables: objects in, lines out.
+//! The plugin's output and decisions as tables: objects in, lines out.
 
 mod change;
 mod check;
@@ -27,7 +27,7 @@ fn now() -> Timestamp {
     "2026-11-01T12:00:00Z".parse().unwrap()
 }
 
-/// The same on a page of the usual width.
+/// A page of the usual width, at the time of `now`.
 fn frame() -> Frame {
     Frame {
         now: now(),

@@ -60,7 +60,7 @@ fn a_cancelled_run_says_who_cancelled_it_next_to_its_progress() {
     );
 }
 
-/// What follows `Next:`.
+/// The text after `Next:`.
 fn next_of(page: &str) -> &str {
     let (_, next) = page.split_once("\nNext:").unwrap_or_else(|| panic!("{page}"));
     next
@@ -171,7 +171,7 @@ fn the_log_is_read_where_the_run_was_stored() {
     );
 }
 
-/// Each reason in each state: there is a next step, and no line is too long (but for a command with a name of 52 letters).
+/// Each reason in each state has a next step, and no line is too long. A command with a name of 52 letters may be.
 #[test]
 fn every_reason_has_a_next_step_within_the_width() {
     for reason in Reason::ALL {

@@ -21,7 +21,7 @@ use leaderboard_api::{
     Attempt, EndReason, FailureClass, LastEnd, Reason, ReasonName, Submission, SubmissionStatus, WorkerStatus, reasons,
 };
 
-/// What is known, and the lines about it so far.
+/// The known facts of a submission, and the lines about it so far.
 struct Explanation<'a> {
     submission: &'a Submission,
     status: &'a SubmissionStatus,
@@ -32,7 +32,7 @@ struct Explanation<'a> {
     steps: Vec<String>,
 }
 
-/// The same for programs.
+/// The explanation as JSON.
 pub fn value(submission: &Submission, leaderboard: Observed<'_>) -> Value {
     let empty = SubmissionStatus::default();
     let status = submission.status.as_ref().unwrap_or(&empty);
@@ -281,8 +281,8 @@ pub(super) fn meaning(reason: &ReasonName) -> String {
     known.map_or_else(String::new, |reason| reasons::plain(reason.meaning()))
 }
 
-/// How a worker crashed. The message of a failure has the count at which the worker failed; its containers may end once more before
-/// the Job is gone, so that the count is left out where both are shown.
+/// How a worker crashed. The count is left out beside a failure, whose message has the count at which the worker failed. Its containers
+/// may end once more before the Job is gone.
 fn crashes(worker: &WorkerStatus, is_failed: bool, now: Timestamp) -> String {
     let times = match worker.crashes {
         _ if is_failed => String::new(),

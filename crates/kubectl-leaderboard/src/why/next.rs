@@ -11,7 +11,7 @@ pub(super) fn of_worker(text: &str, worker: Option<i32>) -> String {
     worker.map_or(text.clone(), |worker| text.replace("<n>", &worker.to_string()))
 }
 
-/// What to do next; the step of the reason comes first.
+/// The next steps; that of the present reason comes first.
 pub(super) fn next_steps(submission: &Submission, status: &SubmissionStatus, leaderboard: Observed<'_>) -> Vec<String> {
     let mut reasons: Vec<Reason> = status
         .present_reason()

@@ -9,7 +9,7 @@ use std::thread;
 
 use serde_json::{Value, json};
 
-/// What a method and a path with its query are answered: a status code and a text.
+/// Answers a method and a path with its query with a status code and a text.
 pub type Answers = fn(&str, &str) -> (u16, String);
 
 /// The server, and the kubeconfig of a person who uses it.
@@ -47,7 +47,7 @@ impl Stub {
 
 impl Drop for Stub {
     fn drop(&mut self) {
-        // Nobody reads it any more.
+        // The test is over, so the file has no reader any more.
         let _ = std::fs::remove_file(&self.kubeconfig);
     }
 }

@@ -59,7 +59,7 @@ pub(super) fn started(container: &Value, image: &[(&str, &str)]) -> (Vec<String>
     (words, env)
 }
 
-/// What the runner parses from its words, and the command behind it as it starts that.
+/// The job that the runner parses from its words, and the command that it starts. `env` becomes that command's variables.
 pub(super) fn behind_runner(words: &[String], env: &mut BTreeMap<String, String>) -> (args::Job, Vec<String>) {
     assert_eq!(words[0], "/leaderboard-tools/leaderboard-runner");
     let args::Request::Run(job) = args::parse(words[1..].iter().map(OsString::from)).unwrap() else {
@@ -156,7 +156,7 @@ impl Image {
 
 impl Drop for Image {
     fn drop(&mut self) {
-        // What is left over lies in the temporary folder and hurts nobody.
+        // A folder that stays behind is in the temporary folder and does no harm.
         let _ = fs::remove_dir_all(&self.folder);
     }
 }

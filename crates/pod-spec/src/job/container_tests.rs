@@ -1,4 +1,4 @@
-//! What each container of a built Job gets, and what it must not get.
+//! The variables, mounts and rights that each container of a built Job gets, and those that it must not get.
 
 use serde_json::{Value, json};
 

@@ -9,17 +9,17 @@ use serde_json::{Value, json};
 use leaderboard_api::names;
 
 const DISK: &str = "ephemeral-storage";
-/// Request and limit of an agent. What its image holds does not count.
+/// Request and limit of an agent. The layers of its image do not count.
 const AGENT: [&str; 2] = ["2Gi", "20Gi"];
-/// Of a host's container.
+/// Request and limit of a host's container.
 const HOST: [&str; 2] = ["2Gi", "10Gi"];
-/// What the volumes usually hold.
+/// Request for the volumes: the usual size of their content.
 const VOLUMES_REQUEST: &str = "1Gi";
 
 /// Fills in what is missing. `volumes` is the limit of all volumes in bytes.
 ///
-/// What a host names stays as it is, with nothing of ours added. A request alone is the choice to have no limit; then the other side
-/// gets none of ours either, since the sum would be the limit of both.
+/// A container whose host names a disk stays as it is, with nothing added. A request alone is the choice to have no limit. Then the
+/// other containers get no limit either, since the sum would limit the whole Pod.
 pub(super) fn fill(pod: &mut Value, volumes: u64) {
     let mut nothing = Vec::new();
     let workers = pod["containers"].as_array_mut().unwrap_or(&mut nothing);

@@ -21,7 +21,7 @@ use leaderboard_protocol::graphics::{INDEX, Needs};
 const DEVICES: &str = "NVIDIA_VISIBLE_DEVICES";
 const CAPABILITIES: &str = "NVIDIA_DRIVER_CAPABILITIES";
 const NO_DEVICE: &str = "void";
-/// What the resources of NVIDIA's device plugin begin with: whole GPUs, shared ones, MIG slices.
+/// Prefix of the resources of NVIDIA's device plugin: whole GPUs, shared ones, MIG slices.
 const RESOURCES: &str = "nvidia.com/";
 /// The variables of a container of a worker.
 pub(super) fn variables(source: GpuSource<'_>, member: Member) -> Vec<EnvVar> {
@@ -43,7 +43,7 @@ pub(super) fn variables(source: GpuSource<'_>, member: Member) -> Vec<EnvVar> {
         .collect()
 }
 
-/// What a container of a worker requests, with its GPU.
+/// Requests and limits of a container of a worker: the host's own, and its GPU.
 pub(super) fn resources(
     source: GpuSource<'_>,
     member: Member,
@@ -130,7 +130,7 @@ fn requested<'a>(container: &'a Value, source: GpuSource<'_>) -> Vec<&'a str> {
     named.map(|(name, _)| name.as_str()).collect()
 }
 
-/// Whether a resource is a GPU.
+/// True if a resource is a GPU: NVIDIA's, or the one that `gpu.resourceName` names.
 pub(super) fn is_gpu(resource: &str, source: GpuSource<'_>) -> bool {
     let own = match source {
         GpuSource::PerContainer(own) | GpuSource::NodeIndex(own) => Some(own),

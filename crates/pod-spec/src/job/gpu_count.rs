@@ -37,7 +37,7 @@ fn claimed(source: GpuSource<'_>, plan: &RunPlan) -> i64 {
     }
 }
 
-/// What a container requests of GPUs: the limit of such a resource is its request.
+/// Number of GPUs that a container requests. The limit of such a resource is its request.
 fn requested(resources: &Value, source: GpuSource<'_>) -> i64 {
     let of_list = |list: &str| {
         let named = resources[list].as_object().into_iter().flatten();
@@ -75,14 +75,20 @@ mod tests {
         gpus(&spec, Some(&track), &plan)
     }
 
-    /// What a container with one GPU asks for.
+    /// The resources of a container with one GPU.
     fn one() -> Value {
         json!({"limits": {"nvidia.com/gpu": "1", "cpu": "4"}})
     }
 
+    fn assert_counted<const N: usize>(cases: [(&str, Value, i64); N]) {
+        for (what, fields, expected) in cases {
+            assert_eq!(counted(&fields), expected, "{what}");
+        }
+    }
+
     #[test]
-    fn gpus_are_counted_as_they_are_requested() {
-        let cases = [
+    fn gpus_are_counted_by_the_mode() {
+        assert_counted([
             ("nothing is requested", json!({}), 0),
             (
                 "one for each container",
@@ -100,6 +106,12 @@ mod tests {
                 json!({"gpu": {"mode": "Claim", "claim": {"deviceClassName": "gpu.nvidia.com"}}}),
                 4,
             ),
+        ]);
+    }
+
+    #[test]
+    fn gpus_are_counted_as_containers_request_them() {
+        assert_counted([
             (
                 "one a simulator",
                 json!({"evaluation": {"carla": {"simulator": {"resources": one()}}}}),
@@ -137,10 +149,7 @@ mod tests {
                 json!({"evaluation": {"carla": {"simulator": {"resources": {"limits": {"cpu": "2"}}}}}}),
                 0,
             ),
-        ];
-        for (what, fields, expected) in cases {
-            assert_eq!(counted(&fields), expected, "{what}");
-        }
+        ]);
     }
 
     #[test]

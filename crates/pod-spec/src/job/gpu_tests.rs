@@ -1,4 +1,4 @@
-//! What each container of a built Job gets of its node's GPUs and of a screen, mode by mode.
+//! The GPUs and the screen that each container of a built Job gets from its node, mode by mode.
 
 use serde_json::{Value, json};
 
@@ -19,7 +19,7 @@ fn words(container: &Value) -> Vec<&str> {
     words.iter().map(|word| word.as_str().unwrap()).collect()
 }
 
-/// What a container has of a GPU: devices by variable, capabilities, index, its request, its claims.
+/// GPU settings of a container: devices by variable, capabilities, index, its request, its claims.
 #[derive(Debug, PartialEq, Eq)]
 struct Given<'a> {
     devices: Option<&'a str>,
@@ -212,7 +212,7 @@ fn a_container_that_requests_a_gpu_itself_is_left_to_the_plugin() {
     }
 }
 
-/// What the runner of simulator 2 checks, and which adapter is in the server's words.
+/// The graphics API that the runner of simulator 2 checks, and the adapter in the server's words.
 fn drawn_with(version: &str, more: Value) -> (Option<String>, Option<String>) {
     let job = Case::new(version, more).json();
     let words = words(container(&job, "simulator-2"));

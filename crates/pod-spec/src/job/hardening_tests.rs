@@ -1,4 +1,4 @@
-//! What keeps a stranger's container from the node and from its neighbors: security contexts, disk, name files.
+//! Barriers between a participant's container, the node and its neighbors: security contexts, disk, name files.
 
 use std::collections::BTreeSet;
 
@@ -75,63 +75,65 @@ fn a_platform_or_a_host_may_choose_the_user_of_our_own_containers() {
     }
 }
 
+/// The default security context with other fields laid over it; null removes one.
+fn default_with(more: &Value) -> Value {
+    let mut context = json!({
+        "allowPrivilegeEscalation": false,
+        "capabilities": {"drop": ["ALL"]},
+        "seccompProfile": {"type": "RuntimeDefault"},
+    });
+    for (key, value) in more.as_object().unwrap() {
+        context[key] = value.clone();
+    }
+    context.as_object_mut().unwrap().retain(|_, value| !value.is_null());
+    context
+}
+
+/// Fails unless a host's context changes the containers of its side alone, to the expected one.
+fn assert_laid_over(side: &str, hosts: &Value, expected: &Value) {
+    let run = json!({"image": "own:1", "securityContext": hosts});
+    let more = match side {
+        "agent" => json!({"agent": {"securityContext": hosts}}),
+        side => json!({"evaluation": {"carla": {side: run}}}),
+    };
+    let job = Case::new("V2", more).json();
+    for container in containers(&job).into_iter().filter(|container| !is_own(container)) {
+        let is_addressed = container["name"].as_str().unwrap().starts_with(side);
+        let expected = if is_addressed {
+            expected
+        } else {
+            &default_with(&json!({}))
+        };
+        assert_eq!(&container["securityContext"], expected, "{side} {hosts}");
+    }
+}
+
 #[test]
 fn a_hosts_security_context_is_laid_over_the_default_field_by_field() {
-    let with = |more: Value| {
-        let mut expected = json!({
-            "allowPrivilegeEscalation": false,
-            "capabilities": {"drop": ["ALL"]},
-            "seccompProfile": {"type": "RuntimeDefault"},
-        });
-        for (key, value) in more.as_object().unwrap() {
-            expected[key] = value.clone();
-        }
-        expected.as_object_mut().unwrap().retain(|_, value| !value.is_null());
-        expected
-    };
-    for (hosts, expected) in [
-        (json!({}), with(json!({}))),
-        (json!({"runAsUser": 1000}), with(json!({"runAsUser": 1000}))),
+    let localhost = json!({"seccompProfile": {"type": "Localhost", "localhostProfile": "carla.json"}});
+    for (hosts, changed) in [
+        (json!({}), None),
+        (json!({"runAsUser": 1000}), None),
         (
             json!({"runAsNonRoot": true, "runAsUser": 1000, "readOnlyRootFilesystem": true}),
-            with(json!({"runAsNonRoot": true, "runAsUser": 1000, "readOnlyRootFilesystem": true})),
+            None,
         ),
         (
             json!({"capabilities": {"add": ["SYS_NICE"]}}),
-            with(json!({"capabilities": {"drop": ["ALL"], "add": ["SYS_NICE"]}})),
+            Some(json!({"capabilities": {"drop": ["ALL"], "add": ["SYS_NICE"]}})),
         ),
-        (
-            json!({"capabilities": {"drop": []}}),
-            with(json!({"capabilities": {"drop": []}})),
-        ),
-        (
-            json!({"seccompProfile": {"type": "Localhost", "localhostProfile": "carla.json"}}),
-            with(json!({"seccompProfile": {"type": "Localhost", "localhostProfile": "carla.json"}})),
-        ),
-        (
-            json!({"allowPrivilegeEscalation": true}),
-            with(json!({"allowPrivilegeEscalation": true})),
-        ),
+        (json!({"capabilities": {"drop": []}}), None),
+        (localhost, None),
+        (json!({"allowPrivilegeEscalation": true}), None),
         // Kubernetes refuses the two together.
         (
             json!({"privileged": true}),
-            with(json!({"privileged": true, "allowPrivilegeEscalation": null})),
+            Some(json!({"privileged": true, "allowPrivilegeEscalation": null})),
         ),
     ] {
+        let expected = default_with(changed.as_ref().unwrap_or(&hosts));
         for side in ["contents", "simulator", "agent"] {
-            let run = json!({"image": "own:1", "securityContext": hosts});
-            let more = match side {
-                "agent" => json!({"agent": {"securityContext": hosts}}),
-                side => json!({"evaluation": {"carla": {side: run}}}),
-            };
-            let job = Case::new("V2", more).json();
-            for container in containers(&job) {
-                let is_addressed = container["name"].as_str().unwrap().starts_with(side);
-                let expected = if is_addressed { &expected } else { &with(json!({})) };
-                if !is_own(container) {
-                    assert_eq!(&container["securityContext"], expected, "{side} {hosts}");
-                }
-            }
+            assert_laid_over(side, &hosts, &expected);
         }
     }
 }
@@ -183,7 +185,7 @@ fn a_pod_requests_and_may_fill_so_much_of_its_nodes_disk() {
     };
     let named = |list: &str, amount: &str| json!({list: {"ephemeral-storage": amount, "memory": "1Gi"}});
     for (simulator, agent, expected) in [
-        // Nothing is said of the disk.
+        // The host names no disk.
         (
             json!({}),
             json!({"limits": {"memory": "1Gi"}}),

@@ -34,7 +34,7 @@ pub(super) fn contents(input: &JobInput<'_>) -> Option<Container> {
     })
 }
 
-/// What it prints is in a file too, from which `logcopy` sends it to CloudWatch.
+/// Adds the runner, which writes the output of `contents` to a file too. `logcopy` sends that file to CloudWatch.
 fn kept(command: Vec<String>) -> Vec<String> {
     let file = CONTENTS_LOG.rsplit('/').next().unwrap_or(CONTENTS_LOG);
     let flags = [
@@ -47,8 +47,8 @@ fn kept(command: Vec<String>) -> Vec<String> {
     flags.into_iter().chain(command).collect()
 }
 
-/// What the contents of the old pipeline were given; a command of the host's may read it. The host's own variables replace ours of the
-/// same name, and come behind them, so that they can refer to them.
+/// Variables of the contents in the old pipeline, which a command of the host's may read. The host's own variables replace
+/// those of the same name. They come last, so that they can refer to ours.
 fn contents_env(input: &JobInput<'_>, hosts: &[EnvVar]) -> Vec<EnvVar> {
     let plan = input.plan;
     let ours = [

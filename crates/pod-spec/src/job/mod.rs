@@ -54,7 +54,7 @@ use leaderboard_evaluation::workload::{Asked, Workload, literal};
 const GRACE_SECONDS: i64 = 600;
 /// Seconds a Pod stays on a node that is not ready or not reachable; Kubernetes' own default is 300.
 const LOST_NODE_SECONDS: i64 = 60;
-/// What the net under all deadlines allows beyond their sum, in seconds.
+/// Seconds that the Pod's `activeDeadlineSeconds` allows beyond the sum of the other deadlines.
 const NET_SECONDS: i64 = 1800;
 /// Restarts beyond those of the workers that do not end the Job: `contents`, `workspace` and `logcopy` count too.
 const SPARE_RESTARTS: i32 = 20;
@@ -72,14 +72,14 @@ pub struct OwnImage {
     pub checksums: Option<String>,
 }
 
-/// What a Job is built from.
+/// Input of a Job.
 #[derive(Clone, Copy, Debug)]
 pub struct JobInput<'a> {
     /// Whose attempt it is; name, namespace and UID are used.
     pub submission: &'a Submission,
     /// How it is run.
     pub leaderboard: &'a Leaderboard,
-    /// What is run, pinned at acceptance.
+    /// The images and routes of the run, pinned at acceptance.
     pub plan: &'a RunPlan,
     /// Which Job it is.
     pub number: JobNumber,
@@ -147,7 +147,7 @@ pub fn build_object(input: &JobInput<'_>) -> DynamicObject {
     }
 }
 
-/// What the Pod receives as `LEADERBOARD_RUN`.
+/// The content of `LEADERBOARD_RUN`.
 fn run_document(input: &JobInput<'_>) -> Run {
     let unsigned = |seconds: i64| u64::try_from(seconds).unwrap_or_default();
     let (spec, meta) = (input.spec(), &input.submission.metadata);
@@ -173,7 +173,8 @@ fn run_document(input: &JobInput<'_>) -> Run {
     }
 }
 
-/// How the Pod measures whether its policy is enforced. What policies of the cluster's own forbid is not known.
+/// How the Pod measures whether its policy is enforced. None if it is not to measure, and for an external policy: the operator does
+/// not know what that one forbids.
 fn isolation(leaderboard: &Leaderboard, now: Timestamp) -> Option<Isolation> {
     let network = &leaderboard.spec.network;
     if network.policy == PolicySource::External || network.enforcement == Enforcement::Disabled {
@@ -336,7 +337,7 @@ fn tolerations(input: &JobInput<'_>) -> Vec<Toleration> {
     lost_node.into_iter().chain(track).collect()
 }
 
-/// What depends on all that the host says: filled in where nothing is said, in the containers of the overlay too.
+/// Fills in the fields that depend on the host's: where the host sets none, and in the containers of the overlay too.
 fn settle(template: &mut Value, input: &JobInput<'_>, workloads: &[Workload]) {
     let pod = &mut template["spec"];
     let gpus = source(input.spec());

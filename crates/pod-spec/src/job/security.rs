@@ -1,4 +1,4 @@
-//! What every container of a Pod may do and use at most. Pure.
+//! Security context of every container of a Pod, and the resources of our own. Pure.
 
 use std::collections::BTreeMap;
 

@@ -10,7 +10,7 @@ use leaderboard_api::{FailedNode, JobNumber, effective};
 
 pub(super) const OPERATOR_IMAGE: &str = "registry.example/leaderboard-operator:1";
 
-/// What a test builds a Job from.
+/// The input of a test's Job.
 pub(super) struct Case {
     pub(super) submission: Submission,
     pub(super) leaderboard: Leaderboard,

@@ -165,19 +165,19 @@ pub(super) fn of_contents(input: &JobInput<'_>) -> Vec<VolumeMount> {
     written.chain(own).collect()
 }
 
-/// What `workspace` prepares.
+/// Mounts of `workspace`, which prepares the volumes.
 pub(super) fn of_workspace(input: &JobInput<'_>) -> Vec<VolumeMount> {
     let own = [mount(LOGS_VOLUME, LOGS), mount(TOOLS_VOLUME, TOOLS)];
     own.into_iter().chain(token(input)).collect()
 }
 
-/// What `logcopy` reads and writes.
+/// Mounts of `logcopy`: the logs to write, the stop request to read.
 pub(super) fn of_logcopy(input: &JobInput<'_>) -> Vec<VolumeMount> {
     let own = [mount(LOGS_VOLUME, LOGS), read_only(mount(PODINFO_VOLUME, PODINFO))];
     own.into_iter().chain(token(input)).collect()
 }
 
-/// What a container of a worker sees.
+/// Mounts of a worker's container: the runner, the status files, its own volumes, and its shared memory.
 pub(super) fn of_member(member: Member, role: &Role) -> Vec<VolumeMount> {
     let is_of_node = |mount: &&Mount| matches!(mount, Mount::OfNode { .. });
     let (of_node, of_pod): (Vec<&Mount>, Vec<&Mount>) = role.mounts.iter().partition(is_of_node);

@@ -1,4 +1,4 @@
-//! What an overlay may not say, and why. Pure; the messages are shown in a Leaderboard's `InvalidPod`.
+//! Fields that an overlay may not set, and why. Pure; the messages are shown in a Leaderboard's `InvalidPod`.
 
 use std::borrow::Cow;
 
@@ -21,13 +21,13 @@ pub enum OverlayError {
     Shape {
         /// Where.
         path: String,
-        /// What belongs there.
+        /// The shape that is needed there.
         expected: &'static str,
     },
     /// A field of another type than Kubernetes' own.
     #[error("podOverrides is not a partial Pod template: {message}")]
     Template {
-        /// What the types reports.
+        /// The error of Kubernetes' types.
         message: String,
     },
     /// A field that is the operator's.
@@ -319,7 +319,7 @@ fn mounts(path: &str, container: &Map<String, Value>, reserved: &Reserved) -> Ch
     Ok(())
 }
 
-/// Whether `target` is `ours` or lies below it, however it is written.
+/// True if `target` is `ours` or lies below it, however it is spelled.
 fn below(target: &str, ours: &str) -> bool {
     let mut parts: Vec<&str> = Vec::new();
     for part in target.split('/').filter(|part| !part.is_empty() && *part != ".") {

@@ -190,7 +190,7 @@ pub(super) fn refused_by(kind: &dyn Evaluation, cases: &[(&str, &str)]) {
     }
 }
 
-/// The same within one entry of `list`.
+/// Overlays with one entry in `list`, each with how the message goes on behind that list's path.
 #[track_caller]
 fn refused_in(list: &str, cases: &[(&str, &str)]) {
     for (entry, expected) in cases {
@@ -400,6 +400,10 @@ fn what_may_not_be_mounted_is_refused() {
             refused_in(list, &[(&entry, &expected)]);
         }
     }
+}
+
+#[test]
+fn mounts_of_another_shape_are_refused() {
     refused_in(
         "containers",
         &[

@@ -87,7 +87,7 @@ struct Opened {
 }
 
 impl Opened {
-    /// None if there is no such file. Of one that has grown since it was counted, no more than the counted bytes are there: the
+    /// None if there is no such file. If the file has grown since it was counted, only the counted bytes are there: the
     /// next round counts and sends the others.
     fn open(tree: &Tree, path: &str, known_size: u64, counted: u64) -> Result<Option<Self>, TreeError> {
         let Some((file, found)) = tree.file(path)? else {

@@ -158,7 +158,7 @@ impl Uploader {
             self.complaints.say(&bill.key, &Why::Shortened(job.wanted.stamp.size));
         }
         let new = self.count_new(&jobs).await;
-        // What is in the air comes to its end or is cut, so that it is remembered; nothing new is begun.
+        // After a failure, or the end of the window, no upload begins. Uploads under way end or are cut, so that each is remembered.
         let broken = Arc::new(AtomicBool::new(false));
         let work = jobs.into_iter().map(|(job, bill)| {
             let broken = Arc::clone(&broken);
@@ -340,7 +340,7 @@ fn due(file: &Wanted, known: Option<&Stored>, ledger: &Ledger<'_>, now: Duration
     let size = ledger.admit(&file.key, before, file.stamp.size).map_err(Why::Limit)?;
     let stamp = Stamp { size, ..file.stamp };
     let is_whole = size == file.stamp.size;
-    // Of a log that is too large the beginning is stored, and that does not change while it grows.
+    // The beginning of a log that is too large is stored, and that does not change while the log grows.
     if !is_whole && known.is_some_and(|known| known.stamp.inode == stamp.inode && known.stamp.size >= size) {
         return Ok(None);
     }

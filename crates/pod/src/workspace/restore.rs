@@ -1,6 +1,6 @@
 //! Brings back what earlier Pods of a run have stored, so that the workers go on where they were.
 //!
-//! Called by `workspace`. What is stored came from strangers' containers: keys are checked like paths, sizes against the
+//! Called by `workspace`. Foreign containers wrote the stored objects: keys are checked like paths, sizes against the
 //! run's limit. Status files speak of containers that are gone; they are dropped on both sides.
 //!
 //! The newest pipeline before this operator (carla-simulator/leaderboard-cloud, one Job for each worker) has the checkpoints of its
@@ -82,7 +82,7 @@ pub async fn restore(
         bytes: memory.bytes(),
         left_out: chosen.left_out,
     };
-    // What is not restored is stored all the same, and counts.
+    // An object that is not restored stays stored all the same, and counts.
     memory.stored.extend(others);
     memory.save(tree).map_err(|error| volume("logcopy", error))?;
     if restored.left_out > 0 {
@@ -190,7 +190,7 @@ fn evaluator_of(key: &str) -> Option<Pair> {
 
 /// True if a key is one that the run goes on with.
 fn is_restored(key: &str, pairs: usize) -> bool {
-    // What logcopy makes from the checkpoints it makes again, and evidence is for people.
+    // Logcopy makes its files from the checkpoints again, and evidence is for people.
     let unread = [&format!("{STATUS_FOLDER}/"), "logcopy/.", EVALAI, REFUSED];
     key != MERGED && !unread.iter().any(|folder| key.starts_with(folder)) && !is_foreign_agent(key, pairs)
 }
@@ -327,7 +327,7 @@ mod tests {
             (vec![partial("1"), partial("2")], vec![partial("1"), partial("2")]),
             // The second worker has begun, and has no route yet.
             (vec![partial("1"), "logs/uploader-2.log".into()], vec![partial("1")]),
-            // Of two pairs and one worker, or three workers, each has other routes.
+            // The routes of one worker, or of three, are not the routes of two pairs.
             (vec![partial("1")], vec![]),
             (vec![partial("1"), partial("2"), partial("3")], vec![]),
             (vec![partial("1"), partial("2"), "logs/agent-3.log".into()], vec![]),

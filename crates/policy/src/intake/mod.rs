@@ -1,4 +1,4 @@
-//! What becomes of a message: what it says (`message`), and for which Leaderboard it is (`route`).
+//! The way of a message: its content (`message`), and the Leaderboard that it is for (`route`).
 
 #[cfg(any(test, feature = "fixtures"))]
 #[allow(clippy::unwrap_used)]

@@ -1,4 +1,4 @@
-//! What becomes of each message: all of the bridge's policy, as pure functions.
+//! The outcome of each message: all of the bridge's policy, as pure functions.
 //!
 //! Called by the poller. Knows no queue, no cluster and no clock: times are handed in as milliseconds since 1970.
 
@@ -17,7 +17,7 @@ const SHORT_WAIT: i32 = 60;
 /// A message as the policy sees it.
 #[derive(Clone, Debug)]
 pub struct Envelope {
-    /// What it holds.
+    /// The parsed message, or why it cannot be parsed.
     pub content: Result<Message, Malformed>,
     /// When it was sent.
     pub sent_ms: i64,
@@ -36,7 +36,7 @@ pub enum Hindrance {
     Hidden,
 }
 
-/// What the Leaderboards that share a queue want done with its messages.
+/// The rules for the messages of a queue, from all Leaderboards that share it.
 #[derive(Clone, Debug, PartialEq, Eq, Default)]
 pub struct Rules {
     /// Where messages go that can't be used: the oldest Leaderboard's that names one.
@@ -96,7 +96,7 @@ pub const OUTCOMES: [&str; 11] = [
     "blocked",
 ];
 
-/// What becomes of a message.
+/// The outcome of a message.
 #[derive(Clone, Debug, PartialEq, Eq)]
 pub enum MessageOutcome {
     /// It is for this Leaderboard.
@@ -158,7 +158,7 @@ impl MessageOutcome {
     }
 }
 
-/// The Leaderboards that read a queue, the oldest first. Those being deleted take nothing more.
+/// The Leaderboards that read a queue, the oldest first. One that is being deleted takes no further message.
 pub fn readers(url: &str, leaderboards: &[Arc<Leaderboard>]) -> Vec<Arc<Leaderboard>> {
     let mut readers: Vec<_> = leaderboards
         .iter()
@@ -237,7 +237,7 @@ pub fn route(
     )))
 }
 
-/// What becomes of a message after its Submission was, or could not be, created or bumped.
+/// The outcome of a message after its Submission was, or could not be, created or bumped.
 pub fn settle(
     envelope: &Envelope,
     outcome: &Result<Outcome, NotIngested>,
@@ -286,7 +286,7 @@ pub enum NotIngested {
     Unknown,
 }
 
-/// What was done.
+/// The change that a message made, or why it made none.
 #[derive(Clone, Debug, PartialEq, Eq)]
 pub enum Outcome {
     /// A Submission was created.

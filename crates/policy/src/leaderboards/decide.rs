@@ -1,4 +1,4 @@
-//! What a Leaderboard's status shows, and when it may go: a pure function of what one reconcile has read.
+//! The status of a Leaderboard, and when it may go: a pure function of one reconcile's view.
 
 use std::sync::Arc;
 
@@ -20,10 +20,10 @@ use leaderboard_contract::verdict::WorkspaceVerdict;
 const CLAIMS_NOT_SERVED: &str = "gpu.mode is Claim, and the API server does not serve resource.k8s.io/v1, which Kubernetes has from 1.34 on. \
                                  Update the cluster, or choose another gpu.mode.";
 const FIRST_LOOK: &str = "The bucket and whatever else the Leaderboard names are being asked for the first time, and not all have answered yet.";
-/// What the host of a Leaderboard that only observes is to know.
+/// Note for the host of a Leaderboard that only observes.
 const OBSERVES: &str = "evalai.mode is Observe: nothing is written to EvalAI.";
 
-/// What one reconcile has read of a Leaderboard.
+/// One reconcile's view of a Leaderboard.
 #[derive(Clone, Debug)]
 pub struct LeaderboardView {
     pub now: Timestamp,
@@ -45,21 +45,21 @@ pub struct LeaderboardView {
     pub pods: usize,
     /// How the NetworkPolicy of its Pods stands.
     pub policy: Policy,
-    /// What the last of its Pods has found of its isolation.
+    /// The last finding of its Pods about its isolation.
     pub measured: Option<WorkspaceVerdict>,
-    /// What it names and may not; nothing of it is asked or read then.
+    /// The name that it may not use. With one, none of its services is asked or read.
     pub refusal: Option<Refusal>,
-    /// Whether all that follows was looked at as the present spec has it. Until then it is no ground for anything.
+    /// True if all that follows was read for the present spec. Until then it decides nothing.
     pub is_looked_at: bool,
     /// Why its Pods could not be made.
     pub invalid_pod: Option<String>,
-    /// What its host should know of its Pods all the same.
+    /// Warnings about Pods that can be made all the same.
     pub pod_notes: Vec<String>,
     /// How the template of its claims stands.
     pub claims: Claims,
-    /// What of its bucket, table and queues cannot be reached.
+    /// The places among its bucket, table and queues that cannot be reached.
     pub unreachable: Option<Unreachable>,
-    /// What its host should know of places that it can do without.
+    /// Warnings about places that it can do without.
     pub place_notes: Vec<String>,
     pub evalai: EvalaiStanding,
     /// Until when nothing is written to EvalAI, because the controller before may still have requests under way.
@@ -70,7 +70,7 @@ pub struct LeaderboardView {
     pub rows_waiting: Option<usize>,
 }
 
-/// What a reconcile has to do.
+/// The result of a reconcile.
 #[derive(Clone, Debug, PartialEq)]
 pub struct LeaderboardPlan {
     pub status: LeaderboardStatus,
@@ -124,7 +124,7 @@ fn table_use(waiting: usize) -> TableUse {
     }
 }
 
-/// What keeps a Leaderboard that is being deleted. With it goes its NetworkPolicy, which has to outlive the last Pod.
+/// Message for a Leaderboard that is being deleted and still in use. Its NetworkPolicy goes with it, and has to outlive the last Pod.
 fn in_use(view: &LeaderboardView) -> String {
     match (view.in_use, view.pods) {
         (0, pods) => {
@@ -136,8 +136,8 @@ fn in_use(view: &LeaderboardView) -> String {
     }
 }
 
-/// The first thing that is wrong, the gravest first; what nobody knows comes after what is surely wrong. None: what was shown of an earlier
-/// spec, or by the controller before, stays until the first look has ended.
+/// The first problem, the gravest first; an unknown state comes after a sure problem. None during the first look if there is a
+/// condition of an earlier spec, or of the controller before: it stays.
 fn ready(view: &LeaderboardView) -> Option<(Truth, Reason, String)> {
     if let Some(wrong) = of_spec(view) {
         return Some(wrong);
@@ -149,7 +149,7 @@ fn ready(view: &LeaderboardView) -> Option<(Truth, Reason, String)> {
     is_new.then(|| (Truth::Unknown, Reason::Checking, FIRST_LOOK.to_owned()))
 }
 
-/// What the looks at its places and EvalAI have found.
+/// The condition by the looks at its places and EvalAI.
 fn found(view: &LeaderboardView) -> (Truth, Reason, String) {
     let unreachable = |truth| view.unreachable.as_ref().filter(|found| found.truth == truth);
     let (evalai_truth, reason, message) = evalai(&view.evalai);
@@ -185,7 +185,7 @@ fn with_notes(view: &LeaderboardView, ready: (Truth, Reason, String)) -> (Truth,
     (truth, reason, texts.join(" "))
 }
 
-/// What is wrong with the Leaderboard as it is written.
+/// The first problem of the Leaderboard as it is written. None if there is none.
 fn of_spec(view: &LeaderboardView) -> Option<(Truth, Reason, String)> {
     let no = |reason, message: String| Some((Truth::False, reason, message));
     if let Some(refusal) = &view.refusal {

@@ -1,11 +1,11 @@
-//! What the condition `Isolated` of a Leaderboard shows. Pure.
+//! The condition `Isolated` of a Leaderboard. Pure.
 
 use super::view::Policy;
 use leaderboard_api::conditions::Truth;
 use leaderboard_api::{Enforcement, Leaderboard, Reason};
 use leaderboard_contract::verdict::{WorkspaceReason, WorkspaceVerdict};
 
-/// What `Isolated` shows.
+/// Truth, reason and message of the condition `Isolated`.
 pub fn condition(
     leaderboard: &Leaderboard,
     policy: &Policy,

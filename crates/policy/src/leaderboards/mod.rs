@@ -1,4 +1,4 @@
-//! What a Leaderboard's status shows (`decide`, `standings`), and what it names and may not (`refusal`).
+//! The status of a Leaderboard (`decide`, `standings`), and the names that it may not use (`refusal`).
 
 pub mod decide;
 pub mod isolated;

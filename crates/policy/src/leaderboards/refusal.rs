@@ -1,4 +1,4 @@
-//! What a Leaderboard names and may not: then its token is not read, its queues are not asked, and EvalAI is not spoken to. Pure.
+//! Names that a Leaderboard may not use. With one the operator reads no token, asks no queue and sends EvalAI nothing. Pure.
 
 use std::net::IpAddr;
 
@@ -33,7 +33,7 @@ pub fn of(allowed: &Allowed, leaderboard: &Leaderboard) -> Option<Refusal> {
     })
 }
 
-/// Whether a token would go to the internet in clear.
+/// True if a token would go over the internet unencrypted.
 fn is_exposed(server: &str) -> bool {
     let Some(rest) = server.strip_prefix("http://") else {
         return false;
@@ -47,7 +47,7 @@ fn is_exposed(server: &str) -> bool {
         return ranges::is_public(address);
     }
     let host = host.trim_end_matches('.').to_ascii_lowercase();
-    // A name of one label is completed by the resolver's own search list. What ends in a number is an address in another spelling.
+    // The resolver's own search list completes a name of one label. A name that ends in a number is an address in another spelling.
     let is_number = host
         .rsplit('.')
         .next()

@@ -1,4 +1,4 @@
-//! Who leads each track, and by which metric, as the status shows it. Pure.
+//! The standings of each track and their metric, as the status shows them. Pure.
 
 use std::collections::{BTreeMap, BTreeSet};
 use std::sync::Arc;
@@ -81,7 +81,7 @@ fn stored<'a>(leaderboard: &'a Leaderboard, track: &Track) -> Option<&'a TrackSt
     tracks.find(|stored| stored.name == track.name)
 }
 
-/// What the host should know of tracks that EvalAI ranks by a metric that no status shows.
+/// Warnings about tracks that EvalAI ranks by a metric that no status shows.
 pub fn notes(leaderboard: &Leaderboard, named: &Named) -> Vec<String> {
     let note = |track: &Track| {
         let Ranked { ranking, lacking } = ranked(leaderboard, track, named);
@@ -94,7 +94,7 @@ pub fn notes(leaderboard: &Leaderboard, named: &Named) -> Vec<String> {
     leaderboard.spec.tracks.iter().filter_map(note).collect()
 }
 
-/// Whether the standings are settled without an object that is about to be deleted: they hold its result exactly if it is one of the best.
+/// True if the standings no longer need an object: they hold its result exactly if that is one of the best.
 pub fn can_spare(leaderboard: &Leaderboard, submission: &Submission) -> bool {
     let name = track_of(submission).unwrap_or_default();
     let Some(track) = leaderboard.spec.tracks.iter().find(|track| track.name == name) else {

@@ -23,14 +23,14 @@ impl Claims {
     }
 }
 
-/// What is shown of a Leaderboard whose places cannot all be reached.
+/// The condition of a Leaderboard whose places cannot all be reached.
 #[derive(Clone, Debug, PartialEq, Eq)]
 pub struct Unreachable {
     /// Never True.
     pub truth: Truth,
-    /// Of the gravest.
+    /// Reason of the gravest problem.
     pub reason: Reason,
-    /// Of all.
+    /// Messages of all problems.
     pub message: String,
 }
 

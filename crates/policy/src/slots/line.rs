@@ -34,7 +34,7 @@ struct Entry {
 }
 
 impl Line {
-    /// Whether it may start, as it was worked out last. Under other limits a reservation counts no more, unless its start is under way.
+    /// Its turn, as last worked out. Under other limits a reservation counts no more, unless its start is under way.
     pub fn turn(&self, uid: &str, attempt: Attempt, limits: Limits) -> Turn {
         let entry = self.entries.get(uid).filter(|entry| entry.attempt == attempt);
         let counts = |entry: &&Entry| !entry.may_be_taken_back() || self.limits == limits;
@@ -126,7 +126,7 @@ impl Line {
             } else {
                 is_let_through || member.is_leaving
             };
-            // What is shown of an earlier attempt ends nothing.
+            // The state of an earlier attempt ends nothing.
             entry.is_kept = !is_over || member.attempt < entry.attempt;
             if is_reserved && entry.is_kept {
                 occupied_by = Some(&entry.place.team);
@@ -147,7 +147,7 @@ impl Entry {
         self.is_reserved() && !self.is_started
     }
 
-    /// Whether its submission has to be woken for a turn.
+    /// True if the turn is a reason to wake its submission.
     fn is_news(&self, turn: &Turn) -> bool {
         let Some(known) = &self.turn else { return true };
         let position = turn.position();

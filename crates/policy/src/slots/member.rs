@@ -1,4 +1,4 @@
-//! What of a Submission, as the cache shows it, counts for the others of its Leaderboard. Pure.
+//! The part of a cached Submission that counts for the others of its Leaderboard. Pure.
 
 use std::borrow::Cow;
 
@@ -41,7 +41,7 @@ impl<'a> Member<'a> {
         };
         let times = status.map(|status| &status.times).filter(|_| !spec.check);
         let began = times.and_then(|times| times.scheduled.as_ref().or(times.started.as_ref()));
-        // What never ran shows nothing of how long a run takes.
+        // A submission that never ran does not show how long a run takes.
         let ended = times.and_then(|times| times.started.as_ref().and(times.finished.as_ref()));
         Self {
             uid: meta.uid.as_deref().unwrap_or_default(),
@@ -93,7 +93,7 @@ pub fn check_team(name: &str) -> String {
     format!("check/{name}")
 }
 
-/// What of a Submission counts for the others, as a text: what leaves it as it was concerns nobody else.
+/// The part of a Submission that counts for the others, as a text. An equal text means that no other submission has to look.
 pub fn mark(submission: &Submission) -> String {
     format!("{:?}", Member::of(submission, |_| false))
 }

@@ -1,4 +1,4 @@
-//! Whose turn it is: the order of turns (`turns`), the line of a Leaderboard (`line`), and who stands in it (`member`).
+//! The order of waiting submissions (`turns`), the line of a Leaderboard (`line`), and its members (`member`).
 
 pub mod line;
 pub mod member;

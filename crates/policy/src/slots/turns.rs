@@ -1,4 +1,4 @@
-//! Whose turn it is: which waiting submissions start now, the place of the others, and how long they may have to wait.
+//! The order of waiting submissions: which of them start now, the place of the others, and the estimate of their wait.
 //!
 //! Pure; called by `slots`. Fair between teams: each pick goes to the team that has the least running
 //! and picked so far, and among these to the one whose last run began longest ago. So a team with a hundred submissions
@@ -17,7 +17,7 @@ mod day_tests;
 /// Runs of a track that its waiting times are estimated from.
 pub const RUNS: usize = 20;
 
-/// Whether a submission may start.
+/// A submission's permission to start, or its place in line.
 #[derive(Clone, Debug, Default, PartialEq, Eq)]
 pub enum Turn {
     /// It waits for no slot yet, as far as is known.
@@ -64,7 +64,7 @@ pub struct Limits {
     pub paused: bool,
 }
 
-/// What a Leaderboard runs and has run.
+/// The present and past runs of a Leaderboard.
 #[derive(Clone, Debug, Default)]
 pub struct Past {
     /// The team of each submission that has a slot.
@@ -75,7 +75,7 @@ pub struct Past {
     pub runs: HashMap<String, Vec<(Timestamp, i64)>>,
 }
 
-/// What decides between teams, the least first: no check, running and picked, the number of the last pick, the last start.
+/// Order of teams, the least first: no check, running and picked, the number of the last pick, the last start.
 type Rank<'a> = (bool, usize, usize, Option<Timestamp>, Timestamp, &'a str);
 
 /// The teams in line.
@@ -167,7 +167,7 @@ impl<'a> Teams<'a> {
         Some((pick, running))
     }
 
-    /// None: nobody of it is in line.
+    /// None if no submission of the team is in line.
     fn rank(&self, team: &'a str) -> Option<Rank<'a>> {
         let load = self.load.get(team).copied().unwrap_or(0);
         let picked = self.picked.get(team).copied().unwrap_or(0);
@@ -192,7 +192,7 @@ struct Quartiles {
 }
 
 impl Quartiles {
-    /// Of the runs that ended last. None without runs.
+    /// The quartiles of the runs that ended last, in seconds. None without runs.
     fn of(mut runs: Vec<(Timestamp, i64)>) -> Option<Self> {
         runs.sort_by_key(|run| std::cmp::Reverse(*run));
         runs.truncate(RUNS);

@@ -340,7 +340,7 @@ fn again(draft: &PlanBuilder<'_>, leaderboard: &LeaderboardSpec, pinned: RunPlan
     }
     // The host's images belong to the attempt and follow the Leaderboard until its first Job is made; all else belongs to the submission.
     RunPlan {
-        // The same, unless an earlier attempt had none.
+        // It changes only if an earlier attempt had none.
         image,
         ..pinned.renewed(leaderboard)
     }

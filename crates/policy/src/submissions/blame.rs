@@ -1,4 +1,4 @@
-//! Whose fault the last crash of a worker was: one table over both containers. Pure.
+//! The fault for the last crash of a worker: one table over both containers. Pure.
 //!
 //! No participant's program runs in the host's container, so its verdict, and what the kubelet reports of it,
 //! decide. An agent's processes can replace or suppress the agent's verdict; it therefore only names the agent's fault more closely.
@@ -347,7 +347,7 @@ fn take_crash(worker: &mut WorkerStatus, counted: i32, crash: Option<Crash>) {
             exit_code: Some(crash.exit_code),
             time: crash.at.map(Time),
         };
-        // The same end is seen in each reconcile. One side's may have been counted as a crash before the other's was seen.
+        // Each reconcile sees an end again. One side's end may have been counted as a crash before the other side's was seen.
         if crash.cause == EndReason::EndedFromOutside && worker.last.as_deref() != Some(&last) {
             worker.ended_from_outside = worker.ended_from_outside.saturating_add(1);
             worker.crashes = worker.crashes.saturating_sub(1).max(0);
@@ -434,7 +434,7 @@ pub(super) fn too_many(draft: &mut PlanBuilder<'_>) -> Option<Failure> {
         };
         let pod = draft.view.pod.as_ref();
         let crash = pod.and_then(|pod| last_crash_of(pod, kind, worker.id, draft.now()));
-        // Who goes on to fail while the other side's word is waited for puts its end off no further.
+        // Further failures while the other side's end is awaited put the end of the run off no further.
         match crash.filter(|crash| !crash.is_settled && worker.crashes <= limit) {
             None => return Some(failure::of_worker(worker, cause, &draft.status)),
             Some(crash) => awaited = awaited.or(crash.at),

@@ -1,8 +1,9 @@
-//! Whose fault it is that a container does not start, or that a Pod's disk is full: by the words of the kubelet, the container engine, the GPU
-//! toolkit, runc and the registries.
+//! The fault for a container that does not start, or for a full disk of a Pod. The words of the kubelet, the container engine, the GPU
+//! toolkit, runc and the registries show it.
 //!
-//! An image is the cause only where the words prove it. A node without disk, driver or memory must charge nobody, and its words are endless; so
-//! what the table does not know is the node's, or the registry's. Of disks only what was measured of agents alone is evidence against them.
+//! An image is the cause only where the words prove it. A node without disk, driver or memory must charge no team, and its words are
+//! endless. So words that the table does not know are the node's, or the registry's. Only a measurement of the agents' own disk use
+//! is evidence against them.
 //! Workers that started and crashed are judged by `blame`.
 
 use serde_json::Value;

@@ -27,7 +27,7 @@ pub(super) fn decide(draft: &mut PlanBuilder<'_>, job_end: Option<&JobEnd>) {
     if let Some(left) = stop::requested_fence_left(draft) {
         return draft.requeue_in(left);
     }
-    // Without a plan nobody knows where a report would be.
+    // Without a plan the place of a report is unknown.
     let is_read = run::is_of(draft, Stage::JobEnded) && view.report.stored != ObservedReport::NotRead;
     if draft.status.plan.is_some() && !is_read {
         if let Some(left) = run::answer_left(draft) {
@@ -243,7 +243,7 @@ pub(super) fn note_failed_node(nodes: &mut Vec<FailedNode>, node_name: String, j
 }
 
 fn finished(draft: &mut PlanBuilder<'_>, report: &ReportDigest) {
-    // Without its Job nobody has taken it in yet.
+    // Without a Job no reconcile has taken the report in yet.
     run::take_report(draft, report);
     let score = draft.status.score.as_ref();
     let score = score.map_or_else(String::new, |score| format!(", {} {}", score.name, score.text));
@@ -355,7 +355,7 @@ fn explained(draft: &PlanBuilder<'_>, found: Failure) -> Failure {
     }
 }
 
-/// Units of the attempt that are stored. What an earlier attempt has reached counts among them.
+/// Number of stored units of the attempt. Units that an earlier attempt has reached count among them.
 fn stored_units(draft: &PlanBuilder<'_>) -> i32 {
     let reached = draft.status.progress.as_ref().map_or(0, |progress| progress.done);
     draft.view.report.ours().map_or(reached, |report| clamp(report.done))

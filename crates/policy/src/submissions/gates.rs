@@ -289,7 +289,7 @@ fn adoption() -> String {
     )
 }
 
-/// True if a Pod of the submission has found results of something else below the prefix, and nobody has handed it over since.
+/// True if a Pod of the submission found foreign results below the prefix, and no person has handed it over since.
 fn is_held_by_prefix(draft: &PlanBuilder<'_>) -> bool {
     draft.status.plan.is_some() && draft.is_held()
 }

@@ -1,4 +1,4 @@
-//! What follows an end in the cluster: the Job's time to live, the object's own, the finalizer.
+//! The steps in the cluster after an end: the Job's time to live, the object's own, the finalizer.
 
 use jiff::Timestamp;
 

@@ -1,4 +1,4 @@
-//! What is to be done for one submission: a pure function from a `View` to a `Plan`. It knows no client, no `async`, and no clock but
+//! The next step of one submission: a pure function from a `View` to a `Plan`. It knows no client, no `async`, and no clock but
 //! the view's.
 //!
 //! ```text
@@ -50,7 +50,7 @@ const MAX_RECREATED: i32 = 3;
 pub fn decide(view: &View) -> Plan {
     let mut draft = PlanBuilder::new(view);
     if draft.begin_attempt() {
-        // What was observed is of another attempt.
+        // The view is of another attempt.
         leave::leave_job(&mut draft);
         draft.requeue_in(Duration::ZERO);
     } else {
@@ -71,7 +71,7 @@ fn life(draft: &mut PlanBuilder<'_>) {
     let was_live = !draft.is_finished();
     match &view.job {
         _ if !was_live => {}
-        // What was seen is of an earlier try; the next reconcile looks at the present one.
+        // The view is of an earlier try; the next reconcile looks at the present one.
         ObservedJob::Ours(job) if job.name != draft.job_name() => draft.look_again(Wait::EARLIER_JOB),
         ObservedJob::Ours(job) => with_job(draft, job),
         ObservedJob::Created => draft.look_again(Wait::JOB),
@@ -156,7 +156,7 @@ fn under_way(draft: &mut PlanBuilder<'_>, job: &JobView) {
 
 /// The Job was made, or was about to be, and is not there: we ended it, somebody deleted it, or we crashed in between.
 fn without_its_job(draft: &mut PlanBuilder<'_>) {
-    // What the run has stored last decides whether it is made again.
+    // The last stored report of the run decides if the Job is made again.
     let is_read = run::is_of(draft, Stage::JobEnded);
     if !draft.is_to_stop()
         && (draft.was_job_seen() || draft.is_first_job())
@@ -198,7 +198,7 @@ fn without_its_job(draft: &mut PlanBuilder<'_>) {
     start::start_job(draft);
 }
 
-/// True if Kubernetes may have removed the Job by its time to live, after an end that nobody has read.
+/// True if Kubernetes may have removed the Job by its time to live, after an end that no reconcile has read.
 fn has_expired(draft: &PlanBuilder<'_>) -> bool {
     let times = &draft.status.times;
     let known = [&times.scheduled, &times.started, &times.accepted];

@@ -1,4 +1,4 @@
-//! What a reconcile has to do for one submission: the result of `decide`, which `act` carries out.
+//! The steps of one reconcile of a submission: the result of `decide`, which `act` carries out.
 
 use std::time::Duration;
 

@@ -1,4 +1,4 @@
-//! What other systems get of an end: EvalAI first, then the table's row.
+//! The report of an end to other systems: EvalAI first, then the table's row.
 //!
 //! The cancel race ([`CancelRace`]): EvalAI's own end wins until our result is answered (`amend`), and changes no state after it
 //! (`note_late_cancel`).
@@ -327,7 +327,7 @@ fn keep_at_end(draft: &mut PlanBuilder<'_>) -> Option<Duration> {
         let places = failure::log_places(&draft.status, draft.view.pod.as_ref());
         if !places.is_empty() {
             draft.act(Action::KeepLog { places });
-            // What is known is of the time before the end.
+            // The known log is from before the end.
             let log = if has_just_ended {
                 ObservedLog::NotRequested
             } else {

@@ -46,7 +46,7 @@ pub(super) fn watch(draft: &mut PlanBuilder<'_>) {
     if let Some(found) = found.or_else(|| blame::too_many(draft)) {
         return draft.fail(found);
     }
-    // One that outlives its Leaderboard is charged for no limit that nobody has set; the Pod has a net of its own.
+    // A run that outlives its Leaderboard has no limit that a host has set, and is charged for none. The Pod has a deadline of its own.
     let Some(ran) = run_seconds(draft).filter(|_| draft.leaderboard().is_some()) else {
         return;
     };
@@ -283,7 +283,7 @@ fn stage_of_live(draft: &PlanBuilder<'_>) -> Option<Stage> {
         ObservedJob::Created => None,
         // One that is created only now is not there either, and what is stored is not its own.
         ObservedJob::Absent { .. } if draft.does(|action| matches!(action, Action::CreateJob(_))) => None,
-        // Whether the first Job of an attempt was there, its report shows.
+        // The report shows if the first Job of an attempt was there.
         ObservedJob::Absent { .. } if draft.is_first_job() => Some(Stage::JobEnded),
         ObservedJob::Absent { .. } | ObservedJob::Foreign => {
             (draft.is_to_stop() || draft.was_job_seen()).then_some(Stage::JobEnded)
@@ -303,7 +303,7 @@ pub(super) fn answer_left(draft: &PlanBuilder<'_>) -> Option<Duration> {
 
 /// Asks for the report of an ended run.
 pub(super) fn report_of_end(draft: &mut PlanBuilder<'_>) -> Reading {
-    // What never had a Job has stored nothing.
+    // A submission that never had a Job has stored nothing.
     if draft.status.plan.is_none() || !draft.status.has_run() {
         return Reading::Done;
     }
@@ -312,7 +312,7 @@ pub(super) fn report_of_end(draft: &mut PlanBuilder<'_>) -> Reading {
     let is_read = is_of(draft, stage_after_end(draft)) && view.report.stored != ObservedReport::NotRead;
     match &view.report.stored {
         _ if !is_read && (draft.is_successful() || may_wait(draft)) => Reading::Waits(None),
-        // What is Finished is nothing without its result.
+        // A Finished submission needs its result.
         ObservedReport::Unreadable(why) if draft.is_successful() || may_wait(draft) => {
             Reading::Waits(Some(why.clone()))
         }
@@ -327,7 +327,7 @@ pub fn awaits_publication(status: &SubmissionStatus) -> bool {
     status.has_ended() && published.is_some_and(is_open)
 }
 
-/// Until when an end waits for what cannot be read of its result. What is Finished is nothing without its results.
+/// Deadlines of the wait for results that cannot be read, or cannot be used. A Finished submission waits without a limit.
 pub fn patience(view: &View, status: &SubmissionStatus) -> Patience {
     let unread = waits_until(view, status, Wait::UNREAD);
     let is_successful = status.state_of_conditions() == State::Finished;
@@ -354,7 +354,7 @@ fn waits_until(view: &View, status: &SubmissionStatus, wait: Wait) -> Timestamp 
     patience.min(after(deleted.0, seconds - Wait::BEFORE_RELEASE.longest))
 }
 
-/// Notes when the Pod got its node. What the Pod before it has run and used is counted.
+/// Notes when the Pod got its node, and counts the run and the use of the Pod before it.
 fn take_node(draft: &mut PlanBuilder<'_>, pod: &PodView) {
     let Some(scheduled) = pod.scheduled else { return };
     if let Some(before) = scheduled_at(draft) {
@@ -370,8 +370,8 @@ fn take_node(draft: &mut PlanBuilder<'_>, pod: &PodView) {
     draft.status.times.scheduled = Some(Time(scheduled));
 }
 
-/// Notes when the first agent of the attempt started, and that of its present Pod. What a Pod shows of it moves when its containers are
-/// started again.
+/// Notes when the first agent of the attempt started, and that of its present Pod. The time that a Pod shows moves when its
+/// containers are started again.
 fn take_agents(draft: &mut PlanBuilder<'_>, pod: &PodView) {
     let Some(first) = pod.agent_started.map(Time) else {
         return;

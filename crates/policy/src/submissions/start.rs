@@ -415,7 +415,7 @@ pub(super) fn limit(pod: &PodView, deadlines: &Deadlines, stalled: Option<Timest
 
 /// The containers that wait for an image, if the Pod is at a pull.
 pub(super) fn waiting(pod: &PodView) -> Vec<&str> {
-    // Ours before the agents go one by one. Those of an overlay hold them up, wherever they stand.
+    // Ours before the agents go one by one. Containers of an overlay hold them up, wherever they stand.
     let mut before = pod.containers.iter().filter(|container| container.is_before_agents());
     match before.find(|container| !is_through(container)) {
         Some(next) if is_before_its_pull(next) => vec![&next.name],

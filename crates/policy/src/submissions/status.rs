@@ -226,7 +226,7 @@ impl<'a> PlanBuilder<'a> {
     /// The status of a new attempt, with what was pinned and what earlier attempts reached.
     fn start_status(&mut self, wanted: Attempt) {
         let old = std::mem::take(&mut self.status);
-        // What Pods of before a restore have stored is of earlier attempts.
+        // Objects that Pods from before a restore have stored belong to earlier attempts.
         let submission_uid = self.submission().metadata.uid.clone();
         let next = |plan: RunPlan| RunPlan {
             resume: true,

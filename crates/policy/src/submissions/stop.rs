@@ -131,7 +131,7 @@ pub(super) fn delete(job: &JobView, grace_seconds: i64) -> Action {
     }
 }
 
-/// Removes a Pod that we can't reach. The fence goes first: what it still writes counts for nobody. Returns whether it did.
+/// Removes a Pod that we can't reach. The fence goes first, so that its later writes do not count. Returns true once it deletes the Pod.
 fn force(draft: &mut PlanBuilder<'_>, pod: &PodView) -> bool {
     draft.act(Action::TakeOwnership);
     if let Some(left) = fence_left(draft) {
@@ -183,8 +183,8 @@ fn given_up_at(node: ObservedNode, pod: &PodView) -> Option<Timestamp> {
     Some(at.min(Wait::STUCK_POD.over_at(by)))
 }
 
-/// Ends the Job of a Pod that goes away although nobody asked it to stop, on a node that is gone: the Job would wait for the node. Once it is
-/// gone, the infrastructure's retry follows. Returns whether it did.
+/// Ends the Job of a Pod that goes away unasked, on a node that is gone: the Job would wait for the node. Once it is
+/// gone, the infrastructure's retry follows. Returns true if the Pod is given up.
 pub(super) fn leaves_lost_pod(draft: &mut PlanBuilder<'_>, job: &JobView) -> bool {
     let failure = draft.status.failure.as_deref();
     let other_end = draft.is_cancelled() || failure.is_some_and(|f| f.reason != Reason::NodeLost);
@@ -209,7 +209,7 @@ pub(super) fn leaves_lost_pod(draft: &mut PlanBuilder<'_>, job: &JobView) -> boo
 /// How long a lost Pod still waits for the fence.
 fn fence_left(draft: &PlanBuilder<'_>) -> Option<Duration> {
     let waited = match draft.view.fence {
-        // Without a plan nobody knows where it would be.
+        // Without a plan the place of the fence is unknown.
         _ if draft.status.plan.is_none() => return None,
         ObservedFence::Held => return None,
         ObservedFence::NotRequested => Duration::ZERO,
@@ -230,7 +230,7 @@ fn keep_while_there(draft: &mut PlanBuilder<'_>) -> Option<Duration> {
         return None;
     }
     let mut places = failure::log_places(&draft.status, draft.view.pod.as_ref());
-    // What is in S3 is complete only when the Pod has ended; it is read then, and the best place first.
+    // The log in S3 is complete only when the Pod has ended; it is read then, and the best place first.
     if !places.first().is_some_and(failure::is_on_node) {
         return None;
     }
@@ -239,7 +239,7 @@ fn keep_while_there(draft: &mut PlanBuilder<'_>) -> Option<Duration> {
     log_left(draft.view.log, Wait::LOG.left(Duration::ZERO))
 }
 
-/// How long a log is still waited for; `at_first`: while nobody has been asked for it.
+/// How long a log is still waited for, None if not at all. `at_first` is the answer before the log is requested.
 pub(super) fn log_left(log: ObservedLog, at_first: Option<Duration>) -> Option<Duration> {
     match log {
         ObservedLog::NotRequested => at_first,

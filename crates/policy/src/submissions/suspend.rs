@@ -25,7 +25,7 @@ pub(super) fn holds(draft: &mut PlanBuilder<'_>, job: &JobView) -> bool {
         return false;
     };
     if draft.is_running() {
-        // What passes from here on is no time of the run.
+        // Time from here on does not count as time of the run.
         let since = suspension.since.map_or(draft.now(), |since| since.min(draft.now()));
         draft.condition_at(&Time(since), conditions::RUNNING, Truth::False, Reason::Suspended, "");
     } else if is_new(draft, job) {
@@ -45,7 +45,7 @@ pub(super) fn holds(draft: &mut PlanBuilder<'_>, job: &JobView) -> bool {
     true
 }
 
-/// Shows that the Job is resumed. What its next Pod waits for is shown over it.
+/// Shows that the Job is resumed. A later step may show the wait of its next Pod instead.
 fn goes_on(draft: &mut PlanBuilder<'_>) {
     if !draft.status.shows(Reason::Suspended) {
         return;

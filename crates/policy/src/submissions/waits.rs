@@ -47,11 +47,11 @@ impl Wait {
     pub(super) const NODE: Self = row(5, NONE, 15 * 60);
     /// The agents of a Pod: less than the minute in which people want to see a cause.
     pub(super) const PREPARATION: Self = row(45, NONE, NONE);
-    /// A live run. What a stage does by the clock it asks for itself.
+    /// A live run. A stage that works by the clock asks for its own time.
     pub(super) const RUN: Self = row(NONE, 300, NONE);
     /// The other side's end of a round. A runner ends within moments of its peer.
     pub(super) const PEER: Self = row(NONE, NONE, 120);
-    /// The report of a run that has ended. What its bucket stores can still be taken up by a resume after `longest`.
+    /// The report of a run that has ended. After `longest` a resume can still take up the results in its bucket.
     pub(super) const REPORT: Self = row(15, 10, DAY);
     /// The report of a run that was cancelled, if `deadlines.cancelSeconds` is not longer: a bucket that hung is left alone for up to half of
     /// it.

@@ -1,4 +1,4 @@
-//! Whether a changed status is worth a write now: API writes are what a submission costs its cluster.
+//! Decides if a changed status is worth a write now: API writes are the cost of a submission for its cluster.
 //!
 //! Pure. Progress moves all the time and may wait; whatever a decision or a person needs goes out at once.
 

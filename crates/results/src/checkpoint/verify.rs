@@ -2,7 +2,7 @@
 //! this is the cheap answer to an edited file; it does not see an infraction that was removed together with its penalty.
 //! Pure; called by the checkpoint reader.
 //!
-//! Only what makes a score better than it can be is reported. A lower penalty is nobody's gain, and forks have more to punish.
+//! It reports only values that make a score better than it can be. A lower penalty gains nothing, and forks have more to punish.
 
 use super::record::Record;
 use crate::json::Value;

@@ -9,7 +9,7 @@ use crate::{Format, Refusal};
 
 const SCORE_DIGITS: usize = 6;
 const DIGITS: usize = 3;
-/// Nobody drives less than a meter, or the rates would have no value.
+/// Least length of a drive, in kilometers: a shorter one counts as this long, or the rates would have no value.
 const LEAST_KILOMETERS: f64 = 0.001;
 
 /// `records`: in the order of the merged file.

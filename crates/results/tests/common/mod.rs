@@ -152,7 +152,7 @@ pub fn merged(plan: &Plan, files: &[Option<Value>]) -> Result<Merged, Refusal> {
 
 /// Prints how many cases ran, past the harness, which hides what a passing test prints.
 pub fn say(line: &str) {
-    // In one piece, among the lines of the harness. A test does not fail because nobody reads it.
+    // In one piece, among the lines of the harness. A closed standard error does not fail a test.
     let _ = std::io::stderr().write_all(format!("{line}\n").as_bytes());
 }
 

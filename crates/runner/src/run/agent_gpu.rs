@@ -1,7 +1,7 @@
 //! GPU of an agent that is given one of its node by its number: only its own container shows whether it sees one. For `run`.
 //!
-//! Nothing of the agent's image runs before its host has announced its command for the first time, and nobody else can write
-//! into its folder. So the host asks for the report of the agent's runner before that, believes it, and asks no more afterwards.
+//! No process of the agent's image runs before its host has announced its command for the first time. No other container can write
+//! into its folder. So the host asks for the report of the agent's runner before that, believes it, and asks no more later.
 
 use leaderboard_protocol::files::{Mark, StatusFile};
 use leaderboard_runner::args::Role;

@@ -1,4 +1,4 @@
-//! Attacks on the verdict and on what is stored: each is a way for an agent to end, with the end that the submission must have.
+//! Attacks on the verdict and on the stored files. Each is a way for an agent to end, with the end that the submission must have.
 
 /// Which image the attack comes in.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
@@ -38,12 +38,12 @@ impl Image {
     }
 }
 
-/// Whether it gains anything.
+/// The gain of an attack.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 pub enum Gain {
     /// Nothing: it ends like any other failure of the agent, or like a run without it.
     None,
-    /// What cannot be told from honest work: this is what a host can do.
+    /// It looks like honest work; the text is the host's countermeasure.
     Inherent(&'static str),
 }
 
@@ -87,7 +87,7 @@ const TWICE: &str = r#"{"retries": {"perWorker": 2}}"#;
 const TWO_PAIRS: &str = r#"{"evaluation": {"carla": {"pairs": 2}}, "retries": {"perWorker": 1}}"#;
 const NOT_ROOT: &str = r#"{"agent": {"securityContext": {"runAsNonRoot": true}}}"#;
 
-/// All of them. Those that take longest come first.
+/// All endings, the longest first.
 pub const ENDINGS: &[Ending] = &[
     Ending {
         change: TWO_PAIRS,

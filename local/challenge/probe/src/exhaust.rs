@@ -1,7 +1,7 @@
 //! Limits of the kernel that containers share: by user, or with the whole machine. An image that uses one up must cost another team's run
 //! nothing, and never an attempt.
 //!
-//! What is used up is given back: each process holds it for a time of its own, however the others end. The test runs these alone.
+//! Each process gives its part back after a time of its own, however the others end. The test runs these alone.
 
 use std::fs::{self, File};
 use std::io::{self, BufRead as _, BufReader, Write as _};
@@ -44,7 +44,7 @@ pub const LIMITS: &[Limit] = &[
     },
 ];
 
-/// What the log of an image says once a limit is used up, and where the machine has none that could be.
+/// Beginnings of a log line: of one when a limit is used up, and of one when the machine has no such limit.
 pub const USED_UP: &str = "probe: used up: ";
 pub const NOT_SHOWN: &str = "probe: not shown: ";
 
@@ -59,7 +59,7 @@ const PROCESSES: usize = 200;
 /// `EPOLL_CTL_ADD`
 const ADD: usize = 1;
 
-/// Whether this is one of them: then it is carried out, and given back.
+/// Uses a limit up and gives it back. None for the id of another attack.
 pub(crate) fn run(id: &str) -> Option<io::Result<()>> {
     LIMITS.iter().find(|limit| limit.id == id).map(|limit| {
         let mut child = Command::new("/proc/self/exe")
@@ -69,7 +69,7 @@ pub(crate) fn run(id: &str) -> Option<io::Result<()>> {
     })
 }
 
-/// What runs in the background; `None` for work of another name.
+/// Does the work of a background process; `None` for work of another name.
 pub(crate) fn background_work(name: &str) -> Option<io::Result<()>> {
     match name {
         "epoll-watches" => Some(watches()),

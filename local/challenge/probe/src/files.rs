@@ -14,7 +14,7 @@ use crate::probe::{Probe, held, inherent};
 use crate::seen::Seen;
 
 const READ_ONLY: &str = "mounted read-only";
-/// What every container has in /dev.
+/// The devices that every container has in /dev.
 const DEVICES: [&str; 8] = ["console", "full", "null", "ptmx", "random", "tty", "urandom", "zero"];
 const STATUS: &str = "/tmp/status";
 const TOOLS: &str = "/leaderboard-tools";

@@ -1,4 +1,4 @@
-//! What an agent that runs as root may do to its own status folder, which the kubelet made as root. Called by `modes`.
+//! Attacks of an agent that runs as root on its own status folder, which the kubelet made as root. Called by `modes`.
 
 use std::ffi::{CStr, CString};
 use std::fs;

@@ -14,7 +14,7 @@ const TOKENS: [&str; 4] = [
     "/var/run/secrets/eks.amazonaws.com",
     "/var/run/secrets/pods.eks.amazonaws.com",
 ];
-/// Of `podIdentity.roleARN`, in our own containers.
+/// Folder of the token for `podIdentity.roleARN`, in our own containers.
 const ROLE_TOKEN: &str = "/var/run/secrets/leaderboard";
 const CLOUD: [&str; 6] = ["AWS_", "ECS_", "GOOGLE_", "AZURE_", "OCI_", "EVALAI_"];
 const SECRET: [&str; 5] = ["SECRET", "PASSWORD", "TOKEN", "CREDENTIAL", "ACCESS_KEY"];

@@ -1,5 +1,5 @@
-//! What the kernel would do for a container with more rights. Where it would, each probe asks for something that does no harm:
-//! wrong sizes, folders of its own, values that are set already.
+//! Requests that the kernel grants to a container with more rights. Each probe asks for something harmless: wrong sizes, folders of its
+//! own, values that are set already.
 
 use std::ffi::CStr;
 use std::fs;

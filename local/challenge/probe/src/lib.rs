@@ -1,5 +1,5 @@
-//! A hostile agent image: the table of attacks that an image can try from within its container, what must be seen of each, and
-//! the code that tries them.
+//! A hostile agent image: the table of attacks that an image can try from within its container, and the code that tries them. Each attack
+//! has the result that must be seen.
 //!
 //! One table serves three: the program in the image runs it, `tests/cluster/probes.rs` judges what it printed, and
 //! docs/reference/probes.md is written from it. Nothing here uses the operator's code: paths are those that a container finds

@@ -1,4 +1,4 @@
-//! The program of the probe images, installed as `/usr/bin/python3`: it tries every attack of the table, or the one ending that
+//! The program of the probe images, installed as `/usr/bin/python3`. It tries every attack of the table, or the one ending that
 //! `PROBE_ENDING` names, and becomes an honest agent.
 
 use std::env;

@@ -26,7 +26,7 @@ const TERMINATION_LOG: &str = "/dev/termination-log";
 const WORK: &str = "/tmp/agent";
 const LOG: &str = "/tmp/agent/leaderboard.log";
 const CHECKPOINT: &str = "/tmp/agent/agent_results.json";
-/// What a runner takes for complete results, and nobody else.
+/// Results that a runner takes for complete, and that no other program does.
 const COMPLETE: &str = r#"{"_checkpoint": {"global_record": {"index": -1}}}"#;
 /// A file that `workspace` has copied, as the user of `logcopy`.
 const RUNNER: &str = "/leaderboard-tools/leaderboard-runner";
@@ -38,11 +38,11 @@ const FIRST_PORT: u16 = 2000;
 const PORT_STEP: u16 = 100;
 /// Where an agent listens that is about to take a port.
 const SIGN: u16 = 7777;
-/// How long whatever outlives the agent goes on, if nobody ends it.
+/// Longest life of a process that outlives the agent.
 const LIFE: Duration = Duration::from_mins(1);
 const CRASHES: u32 = 1000;
 const CHAINS: usize = 8;
-/// What a growing file comes to.
+/// Final size of a growing file, in bytes.
 const GROWN: usize = 64 << 20;
 /// 1 MiB of log.
 const LOG_LINES: usize = (1 << 20) / 9;
@@ -125,7 +125,7 @@ fn folder_listed() -> io::Result<()> {
     folders::forbid(&folders::of_agent(pair()), &[logcopy, SIMULATOR]).and_then(|()| exit(1))
 }
 
-/// What runs in the background, as `--background NAME`.
+/// Does the work of a background process, which was started as `--background NAME`.
 pub fn background_work(name: &str) -> io::Result<()> {
     if let Some(done) = exhaust::background_work(name) {
         return done;
@@ -153,7 +153,7 @@ fn status(mark: &str) -> String {
     format!("{}/agent-{pair}.{mark}", folders::of_agent(pair).display())
 }
 
-/// Nobody else could see the end, if the folder stayed shut; and nothing but the mark of the end shows that no results will come.
+/// Shuts the folder: while it stays shut, no other container can see the end. Only the mark of the end shows that no results will come.
 fn shut() -> io::Result<()> {
     fs::write(CHECKPOINT, COMPLETE)?;
     fs::set_permissions(folders::of_agent(pair()), Permissions::from_mode(0o700))?;
@@ -304,6 +304,7 @@ fn survive() -> io::Result<()> {
 }
 
 /// Seconds since 1970: the processes of a chain need one clock.
+#[allow(clippy::disallowed_methods, reason = "the program of a stranger")]
 fn now() -> u64 {
     let since = SystemTime::now().duration_since(UNIX_EPOCH);
     since.map_or(0, |since| since.as_secs())

@@ -1,6 +1,6 @@
 //! Attacks that nothing in a container can hold: what must be seen of the objects that do. The cluster's test looks at them.
 
-/// What an object must say.
+/// The statement that an object must make.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 pub enum Check {
     /// The NetworkPolicy that selects the Pod lets none of these addresses through, whatever else `network.egress` opens.
@@ -17,7 +17,7 @@ pub struct Object {
     pub attack: &'static str,
     /// The object that holds it, and what enforces that.
     pub by: &'static str,
-    /// What the test finds in it, and whether that was enforced there.
+    /// The finding of the test, and if the cluster of the test enforces it.
     pub shown: &'static str,
     pub check: Check,
 }

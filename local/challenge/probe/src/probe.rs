@@ -2,12 +2,12 @@
 
 use crate::seen::Seen;
 
-/// What must be seen of an attack, and why.
+/// The expected result of an attack, and why.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 pub enum Expected {
     /// It fails, because of this.
     Held(&'static str),
-    /// Whether it fails is decided by the cluster: by this.
+    /// The cluster decides if it fails: by this.
     ByPolicy(&'static str),
     /// It works and is no leak: this is why.
     Inherent(&'static str),
@@ -23,14 +23,14 @@ impl Expected {
         }
     }
 
-    /// What holds it, or why it need not be held.
+    /// The thing that holds it, or the reason why it need not be held.
     pub const fn why(self) -> &'static str {
         match self {
             Self::Held(why) | Self::ByPolicy(why) | Self::Inherent(why) => why,
         }
     }
 
-    /// Whether this may be seen. What is inherent must work, else the table shows less than is true.
+    /// True if this result is allowed. An inherent attack must work, or else the table shows less than is true.
     pub const fn allows(self, seen: &Seen) -> bool {
         matches!(
             (self, seen),

@@ -12,7 +12,7 @@ use crate::seen::Seen;
 
 const RUNNER: usize = 1;
 const NOT_DUMPABLE: &str = "the runner is not dumpable";
-/// What runs in the Pod's other containers, as the kernel cuts it short.
+/// Names of the programs in the Pod's other containers, as the kernel cuts them short.
 const FOREIGN: [&str; 4] = ["leaderboard-ope", "challenge-simul", "CarlaUE4", "pause"];
 
 pub(crate) const PROBES: &[Probe] = &[

@@ -1,11 +1,11 @@
-//! What a probe saw, and the one line of the log that shows it.
+//! The result of a probe, and the one line of the log that shows it.
 
 use std::fmt;
 use std::io;
 
 use nix::errno::Errno;
 
-/// What came of an attack.
+/// The result of an attack.
 #[derive(Debug, Clone, PartialEq, Eq)]
 pub enum Seen {
     /// It was refused, or there was nothing to take.
@@ -20,8 +20,8 @@ pub enum Seen {
 const MARK: &str = "probe";
 
 impl Seen {
-    /// Of a system call: what the kernel or a filter of the runtime forbids is denied, and everything else, wrong arguments
-    /// too, has come past the check.
+    /// The result of a system call. It is denied if the kernel or a filter of the runtime forbids it. Any other error has come past the
+    /// check, also one about wrong arguments.
     pub(crate) fn of_call<T>(result: &Result<T, Errno>) -> Self {
         match result {
             Ok(_) => Self::Open("done".to_owned()),
@@ -61,7 +61,7 @@ impl Seen {
         }
     }
 
-    /// Of several ways to the same end: open if one is, unclear if one is.
+    /// The result of several ways to one end: open if one is, else unclear if one is.
     pub(crate) fn of_all(all: impl IntoIterator<Item = (String, Self)>) -> Self {
         let (mut open, mut unclear, mut denied) = (Vec::new(), Vec::new(), Vec::new());
         for (way, seen) in all {

@@ -1,6 +1,6 @@
-//! Evaluators that are started again, step by step against the files of real ones. Those of 2.0 are in `contents`: pair 4's
-//! simulation crashes in its last route (`crashed`), the pair is started again (`resumed`); an evaluator dies before its global
-//! record (`last`); all evaluators are started once more on complete files (`done-1` to `done-4`).
+//! Evaluators that are started again, step by step against the files of real ones. The files of 2.0 are in `contents`. Pair 4's simulation
+//! crashes in its last route (`crashed`), and the pair is started again (`resumed`). An evaluator dies before its global record (`last`).
+//! All evaluators are started once more on complete files (`done-1` to `done-4`).
 
 use std::{fs, os::unix::process::ExitStatusExt};
 

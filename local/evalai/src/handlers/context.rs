@@ -57,7 +57,7 @@ fn listable(text: &str) -> Result<Status, Reply> {
     status.ok_or_else(|| Reply::error(&errors::LIST_STATUS, &[text]))
 }
 
-/// A bound of a list. What has the shape of a date and is none raises in the server.
+/// A bound of a list. A text in the shape of a date that is no date raises in the server.
 fn date(name: &str, text: &str) -> Result<Timestamp, Reply> {
     views::parse_time(text).map_err(|error| match error {
         BadTime::Shape => Reply::error(&errors::LIST_DATE, &[name]),

@@ -60,7 +60,7 @@ async fn pause(millis: u64) {
     }
 }
 
-/// Starts the clock of a submission again. Nobody is refused.
+/// Starts the clock of a submission again. Any user may.
 pub(super) fn started_at(call: &Call, pk: u64) -> Answer {
     let row = {
         let mut state = call.app.state();

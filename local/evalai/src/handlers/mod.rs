@@ -1,5 +1,5 @@
-//! What each endpoint of the API answers. Called by `server` once a request has passed path, signing in, throttle and
-//! method; reads and writes the state under its lock and never waits while it holds it.
+//! The answers of each endpoint of the API. `server` calls them once a request has passed path, signing in, throttle and method. They
+//! read and write the state under its lock and never wait while they hold it.
 
 mod context;
 mod evaluation;

@@ -123,7 +123,7 @@ impl Stand {
         self.call(Method::POST, path, auth, body).await
     }
 
-    /// What `evalai push` does: a form with a file.
+    /// Sends a form with a file, as `evalai push` does.
     pub(crate) async fn upload(&self, path: &str, auth: &str, content: &str) -> Got {
         let body = format!(
             "--b\r\nContent-Disposition: form-data; name=\"status\"\r\n\r\nsubmitting\r\n\

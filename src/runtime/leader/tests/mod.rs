@@ -7,11 +7,13 @@ use std::sync::Arc;
 use std::sync::atomic::{AtomicU64, Ordering};
 use std::time::Duration;
 
+use jiff::{SignedDuration, Timestamp};
 use tokio::sync::watch;
 use tokio::time::{Instant, sleep, timeout};
 
 use super::*;
 use fake_server::{FakeServer, Fault};
+use leaderboard_base::clock::Clock;
 use leaderboard_base::shutdown::Stop;
 
 /// Longer than anything an election may take.
@@ -27,15 +29,19 @@ struct Candidate {
 
 impl Candidate {
     fn start(server: &FakeServer, identity: Identity) -> Self {
+        Self::with_clock(server, identity, Clock::system())
+    }
+
+    fn with_clock(server: &FakeServer, identity: Identity, wall: Clock) -> Self {
         let (sender, stop) = Stop::new();
-        let telemetry = Observability::new(stop);
         let (begin, paused) = (Instant::now(), Arc::new(AtomicU64::new(1000)));
         let ahead = paused.clone();
-        let clock = Clock::new(move || begin.elapsed() + Duration::from_secs(ahead.load(Ordering::SeqCst)));
-        let settings = Settings {
-            clock,
-            ..Settings::new("ns", "operator", identity)
+        let boot = move || begin.elapsed() + Duration::from_secs(ahead.load(Ordering::SeqCst));
+        let telemetry = Observability {
+            clock: wall.with_boot(boot),
+            ..Observability::new(stop)
         };
+        let settings = Settings::new("ns", "operator", identity);
         let leader = start(server.client(), settings, &telemetry);
         Self {
             leader,
@@ -138,6 +144,24 @@ async fn a_live_leader_is_left_alone_whatever_its_clock_shows() {
     }
     assert_eq!(*candidate.leader.leadership().borrow(), Leadership::Standby);
     assert!(!candidate.may_write());
+}
+
+#[tokio::test(start_paused = true)]
+async fn each_replica_writes_the_time_of_its_own_clock_and_a_difference_takes_no_lease() {
+    let server = FakeServer::default();
+    let renewed = || -> Timestamp { serde_json::from_value(server.with(|state| state.spec("renewTime"))).unwrap() };
+    let noon = Timestamp::from_second(1_800_000_000).unwrap();
+    let day = SignedDuration::from_hours(24);
+    let clock = Clock::system().with_wall(move || noon);
+    let old = Candidate::with_clock(&server, someone(), clock.clone());
+    old.leads().await;
+    let new = Candidate::with_clock(&server, someone(), clock.ahead(day));
+    sleep(Duration::from_mins(1)).await;
+    assert!(old.may_write() && !new.may_write());
+    assert_eq!(renewed(), noon);
+    old.leader.release().await;
+    assert_eq!(new.leads_in().await, (2, true));
+    assert_eq!(renewed(), noon + day);
 }
 
 #[tokio::test(start_paused = true)]

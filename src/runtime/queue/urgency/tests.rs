@@ -33,7 +33,7 @@ fn a_submission_is_as_urgent_as_what_it_shows() {
     use Class::{New, Refresh, Urgent};
     let time = "2026-01-01T00:00:00Z";
     let failure = json!({"class": "Participant", "reason": "AgentCrashed", "message": "m"});
-    // What it shows; the urgency of a change of its own, of an answer, and of news of EvalAI.
+    // A name, a change, and the urgency of that change, of an answer, and of news of EvalAI.
     for (what, change, expected) in [
         ("just created", json!({}), [New, New, New]),
         ("accepted", json!({"status": {"attempt": 1}}), [New, New, New]),

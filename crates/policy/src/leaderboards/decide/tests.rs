@@ -1,4 +1,4 @@
-//! What a Leaderboard's status shows, as tables.
+//! The status of a Leaderboard, as tables.
 
 use serde_json::json;
 

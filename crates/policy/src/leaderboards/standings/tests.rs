@@ -70,70 +70,52 @@ fn rows(submissions: &[Submission]) -> Vec<Standing> {
     )
 }
 
+fn driving() -> Ranking {
+    ranking("Driving score", Order::Descending)
+}
+
+fn completion() -> Ranking {
+    ranking("Route completion", Order::Ascending)
+}
+
+/// A Leaderboard of EvalAI whose status has this ranking of the first track.
+fn known(stored: Option<&Ranking>) -> Leaderboard {
+    leaderboard(true, &track(stored, &[]))
+}
+
+/// Fails unless the first track ranks as expected, and the second, which has no phase, as its evaluation.
+fn assert_ranked(name: &str, board: &Leaderboard, named: &Named, ranking: Ranking, lacking: Option<Ranking>) {
+    let notes = notes(board, named);
+    assert_eq!(notes.len(), usize::from(lacking.is_some()), "{name}: {notes:?}");
+    let found = ranked(board, &board.spec.tracks[0], named);
+    assert_eq!(found, Ranked { ranking, lacking }, "{name}");
+    let local = ranked(board, &board.spec.tracks[1], named);
+    assert_eq!(local.ranking, driving(), "{name}: a track without a phase");
+}
+
 #[test]
 fn a_track_ranks_as_evalai_does_then_as_before_then_as_its_evaluation() {
-    let driving = || ranking("Driving score", Order::Descending);
-    let completion = || ranking("Route completion", Order::Ascending);
-    let comfort = || ranking("Comfort", Order::Descending);
-    let named = |ranking: Option<Ranking>| Some(ranking.map(|ranking| (7, ranking)).into_iter().collect());
-    let known = |stored: Option<Ranking>| Box::new(leaderboard(true, &track(stored.as_ref(), &[])));
-    for (name, board, named, expected, lacking) in [
-        ("EvalAI's", known(None), named(Some(completion())), completion(), None),
-        (
-            "EvalAI's new one",
-            known(Some(driving())),
-            named(Some(completion())),
-            completion(),
-            None,
-        ),
-        (
-            "EvalAI names none",
-            known(Some(completion())),
-            named(None),
-            driving(),
-            None,
-        ),
-        ("not asked yet", known(None), None, driving(), None),
-        (
-            "not asked yet by a new leader",
-            known(Some(completion())),
-            None,
-            completion(),
-            None,
-        ),
-        (
-            "not shown here",
-            known(None),
-            named(Some(comfort())),
-            driving(),
-            Some(comfort()),
-        ),
-        (
-            "local",
-            Box::new(leaderboard(false, &track(Some(&completion()), &[]))),
-            None,
-            driving(),
-            None,
-        ),
+    let named = || Some([(7, completion())].into());
+    for (name, stored, named, expected) in [
+        ("EvalAI's", None, named(), completion()),
+        ("EvalAI's new one", Some(driving()), named(), completion()),
+        ("EvalAI names none", Some(completion()), Some([].into()), driving()),
+        ("not asked yet", None, None, driving()),
+        ("not asked yet by a new leader", Some(completion()), None, completion()),
     ] {
-        let found = ranked(&board, &board.spec.tracks[0], &named);
-        let ranking = expected;
-        assert_eq!(
-            found,
-            Ranked {
-                ranking,
-                lacking: lacking.clone()
-            },
-            "{name}"
-        );
-        let notes = notes(&board, &named);
-        assert_eq!(notes.len(), usize::from(lacking.is_some()), "{name}: {notes:?}");
-        let local = ranked(&board, &board.spec.tracks[1], &named);
-        assert_eq!(local.ranking, driving(), "{name}: a track without a phase");
+        assert_ranked(name, &known(stored.as_ref()), &named, expected, None);
     }
-    let said = notes(&known(None), &named(Some(comfort())));
+    let local = leaderboard(false, &track(Some(&completion()), &[]));
+    assert_ranked("local", &local, &None, driving(), None);
+}
+
+#[test]
+fn a_metric_that_results_do_not_show_is_noted_and_ranks_nothing() {
+    let comfort = ranking("Comfort", Order::Descending);
+    let (board, named) = (known(None), Some([(7, comfort.clone())].into()));
+    assert_ranked("not shown here", &board, &named, driving(), Some(comfort));
     assert_eq!(
-        said,
+        notes(&board, &named),
         [
             "EvalAI ranks the phase of track sensors by Comfort, which the status of a submission does not show: the standings here go by \
              Driving score, the highest first."

@@ -300,7 +300,7 @@ fn a_leaderboard_that_is_gone_wants_what_it_wanted() {
     );
     assert!(plan.requeue.is_some() && evalai_updates(&plan).is_empty());
 
-    // What never ran under it needs nothing from it.
+    // A submission that never ran under it needs nothing from it.
     let mut world = World::evalai();
     world.view.leaderboard = None;
     world.pass();

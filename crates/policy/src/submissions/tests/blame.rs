@@ -51,7 +51,7 @@ fn claims(round: Option<u32>, mut agent: ContainerView) -> ContainerView {
     agent
 }
 
-/// The same container whose life began at this second.
+/// This container with a life that began at this second.
 pub(super) fn since(second: i64, mut container: ContainerView) -> ContainerView {
     container.last.as_mut().unwrap().began = Some(at(second));
     container

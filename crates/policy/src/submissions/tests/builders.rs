@@ -72,7 +72,7 @@ fn submission(evalai: bool) -> Submission {
     submission
 }
 
-/// What EvalAI shows of a submission that wants to run.
+/// EvalAI's row of a submission that wants to run.
 pub fn info() -> EvalaiInfo {
     EvalaiInfo {
         standing: Standing::Wanted,
@@ -108,7 +108,7 @@ impl World {
                 submission: Arc::new(submission(evalai)),
                 leaderboard: Some(Arc::new(leaderboard(evalai))),
                 is_policy_in_place: true,
-                // Nobody else runs it; the tests of foreign runs set it otherwise.
+                // No other program runs it; the tests of foreign runs set it otherwise.
                 row: foreign::free(1),
                 turn: Turn::Go,
                 node: NodeView::default(),
@@ -126,7 +126,7 @@ impl World {
         }
     }
 
-    /// A submission of nobody's but ours.
+    /// A submission that only this cluster knows.
     pub fn local() -> Self {
         Self::new(false)
     }
@@ -211,7 +211,7 @@ impl World {
         self.see_alone(container);
     }
 
-    /// The same without what follows from it.
+    /// Puts the container in its place, without the reaction of its simulator.
     pub fn see_alone(&mut self, container: ContainerView) {
         let containers = &mut self.pod().containers;
         containers.retain(|c| c.name != container.name);

@@ -7,7 +7,7 @@ use leaderboard_api::State::{Pending, Running};
 
 /// When the first Pod is lost. Its agents had begun at second 10.
 const LOST: i64 = 72_000;
-/// What the run has had by then.
+/// Seconds that the run has had by then.
 const RAN: i64 = LOST - 10;
 /// When the next one gets its node.
 const BACK: i64 = 90_000;
@@ -34,7 +34,7 @@ fn gets_node(world: &mut World, second: i64) {
     world.see_agents();
 }
 
-/// The same on a node, whose images are pulled.
+/// Such a Pod on a node, whose images are pulled.
 fn pulling_pod(second: i64) -> PodView {
     PodView {
         scheduled: Some(at(second)),

@@ -82,7 +82,7 @@ fn a_farewell_that_never_ends_does_not_keep_the_job() {
     let mut lost = world.clone();
     world.go_to(621);
     assert!(deletes(&world.pass()));
-    // Its node is gone: nobody says farewell.
+    // Its node is gone, so no kubelet ends the Pod.
     lost.pod().delete_by = Some(at(500));
     let plan = lost.pass();
     assert!(deletes(&plan));
@@ -214,7 +214,7 @@ fn results_that_name_a_crash_that_the_simulator_had_are_nobodys_fault() {
         world.leaderboard().retries.infrastructure = 0;
         world.see(ended("simulator-2", 0, what, 1, 100));
         world.pass();
-        // What it ended with later, and that another Pod of the Job has none of it, takes nothing back.
+        // A later end, and another Pod of the Job without a crash, take nothing back.
         world.see_alone(ended("simulator-2", 1, "peerCrashed", 1, 200));
         world.see_alone(ended("agent-2", 1, "exited", 1, 200));
         world.pass();

@@ -1,4 +1,4 @@
-//! What another program still runs is left alone until it has ended there, or a person hands it over.
+//! A run of another program is left alone until it has ended there, or a person hands it over.
 
 use std::sync::Arc;
 use std::time::Duration;
@@ -110,7 +110,7 @@ fn the_row_is_read_before_the_first_write_and_an_answer_within_five_seconds_cost
     assert!(writes_nothing(&plan));
     world.view.row = free(1);
     assert!(creates(&world.pass_to(Pending, Reason::Preparing)));
-    // With its Job, and between two of them, nobody reads it.
+    // With its Job, and between two of them, no reconcile asks for the row.
     world.view.row = Lookup::default();
     assert_eq!(asked(&world.pass()), None);
     let status = world.submission().status.as_mut().unwrap();
@@ -176,11 +176,11 @@ fn when_the_other_run_has_ended_evalai_decides_what_follows() {
         world.in_evalai().read_at = Some(at(29));
         world
     };
-    // What EvalAI answered before the row was read may be older than the end: it is asked anew.
+    // EvalAI's answer from before the row was read may be older than the end: EvalAI is asked anew.
     let mut world = ended();
     let plan = world.pass_to(Pending, Reason::Foreign);
     assert!(writes_nothing(&plan) && has(&plan, |a| *a == Action::Ask(Question::EvalaiAnew)));
-    // Resumed there: what is stored is taken up.
+    // Resumed there: the stored results are taken up.
     let mut world = ended();
     world.in_evalai().info.as_mut().unwrap().standing = Standing::Resumed;
     world.in_evalai().read_at = Some(at(30));
@@ -195,7 +195,7 @@ fn when_the_other_run_has_ended_evalai_decides_what_follows() {
     });
     let plan = world.pass_to(Cancelled, Reason::EndedInEvalAI);
     assert!(writes_nothing(&plan) && plan.status.plan.is_none());
-    // The same while the row is not ended yet.
+    // A cancel in EvalAI has this effect before the row has ended, too.
     let mut world = ended();
     world.view.row = runs();
     world.in_evalai().cancelled = true;

@@ -20,7 +20,7 @@ fn evalai(image: &str) -> World {
     world
 }
 
-/// What the node calls an agent's image, from second 10 on.
+/// The node's name of an agent's image, from second 10 on.
 fn runs(world: &mut World, agent: &str, image_id: &str) {
     let containers = &mut world.pod().containers;
     let found = containers.iter_mut().find(|container| container.name == agent);
@@ -121,7 +121,7 @@ fn only_a_digest_of_the_submitted_repository_is_pinned() {
     for (one, other, wanted) in [
         (of("docker.io/team/agent"), String::new(), Some('a')),
         (of("team/agent"), of("team/agent"), Some('a')),
-        // The same content under another name, as a node may show it.
+        // One content under two names, as a node may show it.
         (
             of("docker.io/other/agent"),
             format!("team/agent@{}", digest('b')),

@@ -105,7 +105,7 @@ fn a_run_goes_on_whatever_becomes_of_the_policy() {
 
 #[test]
 fn a_pod_that_was_not_isolated_ends_at_once_and_is_tried_again_uncharged() {
-    // Of one that was not known to be isolated the run shows the same.
+    // The run shows the same for a Pod that was not known to be isolated.
     for found in ["NotIsolated", "NotKnownIsolated"] {
         let mut world = World::local().with_pod();
         let mut workspace = ended("workspace", 0, found, 1, 5);

@@ -1,5 +1,5 @@
-//! What looks like a further crash of a pair and is none, or neither side's: an end that was counted, a sandbox made anew, a node or a Pod that
-//! lacks what a start needs.
+//! Ends that look like a further crash of a pair, and are none or are neither side's. Examples are an end that was counted, a sandbox
+//! made anew, and a node or a Pod that lacks what a start needs.
 
 use super::builders::*;
 use crate::view::ContainerView;

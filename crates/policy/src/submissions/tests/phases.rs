@@ -10,7 +10,7 @@ use crate::submissions::{Plan, decide};
 use leaderboard_api::State::{Finished, Pending, Running};
 use leaderboard_api::{Attempt, names};
 
-/// What ends with the next reconcile: phase, and the seconds at which it began and ended.
+/// The phases that end with the next reconcile, each with the seconds at which it began and ended.
 type Lengths = Vec<(&'static str, i64, i64)>;
 
 fn pass(world: &mut World) -> (Plan, Lengths) {

@@ -45,7 +45,7 @@ enum Change {
     StatusLost,
 }
 
-/// What is seen where the Job of the present attempt should be.
+/// The Job that a reconcile sees in place of the present attempt's.
 #[derive(Clone, Debug)]
 enum JobCase {
     Absent,
@@ -220,7 +220,7 @@ fn observed_report() -> impl Strategy<Value = ObservedReport> {
     ]
 }
 
-/// What the bucket's worker has answered, and how long it has been asked.
+/// The answers of the bucket's worker, and for how long it has been asked.
 fn answers() -> impl Strategy<Value = Change> {
     let waited = || select([0, 5, 15, 59, 60].map(Duration::from_secs).to_vec());
     let stage = select(vec![

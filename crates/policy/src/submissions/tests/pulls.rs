@@ -76,7 +76,7 @@ fn pair(containers: [ContainerView; 2]) -> Vec<ContainerView> {
 
 const PAIR: [&str; 2] = ["simulator-1", "agent-1"];
 
-/// What a Pod that starts goes through, with who waits for an image, and by when it has to be further.
+/// The stages of a Pod that starts, each with the containers that wait for an image, and by when it has to be further.
 fn stages() -> [(&'static str, Vec<ContainerView>, &'static [&'static str], i64); 9] {
     const WORKSPACE: [&str; 4] = ["workspace", "logcopy", "simulator-1", "agent-1"];
     const ALL: [&str; 5] = ["contents", "workspace", "logcopy", "simulator-1", "agent-1"];

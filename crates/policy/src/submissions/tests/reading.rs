@@ -1,4 +1,4 @@
-//! What is waited for before an end is decided, a Pod is given up, a Job is deleted and an end is published; and how long.
+//! The waits before an end is decided, a Pod is given up, a Job is deleted and an end is published, with their lengths.
 
 use std::sync::Arc;
 use std::time::Duration;
@@ -203,7 +203,7 @@ fn a_job_is_deleted_after_a_failure_when_its_log_is_kept_or_was_waited_for() {
             assert_eq!(plan.requeue, Some(left * SECOND), "{log:?}");
         }
     }
-    // Nobody needs the log of one that was cancelled.
+    // A cancelled run needs no log.
     let mut world = World::local().with_pod();
     world.view.log = ObservedLog::NotRequested;
     world.submission().spec.cancel = true;

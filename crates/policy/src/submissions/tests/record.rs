@@ -18,7 +18,7 @@ pub(super) fn finished() -> World {
     world
 }
 
-/// The same after EvalAI has refused its result.
+/// Such a run after EvalAI has refused its result.
 pub(super) fn refused() -> World {
     let mut world = finished();
     world.in_evalai().end = Some(EvalaiEnd::Refused {

@@ -12,7 +12,7 @@ use leaderboard_api::State::{Failed, Finished};
 use leaderboard_api::conditions::{FINISHED, PUBLISHED, RECORDED};
 use leaderboard_api::{Attempt, Reason, TrackStatus};
 
-/// What a host keeps, in seconds.
+/// How long a host keeps a finished submission, in seconds.
 const KEPT: i64 = 3600;
 
 /// A run that has just ended well, kept for [`KEPT`].
@@ -28,7 +28,7 @@ fn ended_well() -> World {
     world
 }
 
-/// The same, known to every system.
+/// Such a run, whose end every system has.
 fn known_to_all() -> World {
     let mut world = ended_well();
     world.published();
@@ -115,7 +115,7 @@ fn what_is_far_from_its_end_is_decided_on_again_within_the_hour() {
     assert_eq!(world.pass().requeue, Some(Duration::from_hours(1)));
 }
 
-/// What is changed of a world that is known to all, and what it is.
+/// A change of such a run, and its name.
 type Keeps = (&'static str, fn(&mut World));
 
 #[test]

@@ -1,4 +1,4 @@
-//! What holds for every reconcile in every world.
+//! Rules for every reconcile in every world.
 
 use std::collections::HashSet;
 
@@ -35,7 +35,7 @@ fn the_state_is_for_people(view: &View, plan: &Plan) {
     if let Some(status) = &mut std::sync::Arc::make_mut(&mut view.submission).status {
         status.state = None;
     }
-    // What is stored is written over.
+    // A new state replaces the stored one.
     let decided = decide(&view);
     let (write, requeue) = (plan.write, plan.requeue);
     let decided = Plan {
@@ -145,7 +145,7 @@ fn only_what_every_system_has_is_deleted(view: &View, plan: &Plan) {
     assert!(!runs, "its Job runs");
 }
 
-/// As long as its kubelet reports, a Pod that nobody here stops has the whole of its grace.
+/// As long as its kubelet reports, a Pod that the operator does not stop has the whole of its grace.
 fn a_reporting_node_has_its_grace(view: &View, plan: &Plan) {
     let before = view.submission.status.clone().unwrap_or_default();
     let is_live = !is_finished(&before) && before.failure.is_none();
@@ -267,7 +267,7 @@ fn live_ones_are_looked_at_again(plan: &Plan) {
     }
 }
 
-/// What EvalAI lets run is ended when EvalAI ends it, whatever it waits for: its end is looked for.
+/// A submission that EvalAI lets run ends when EvalAI ends it, at any wait: each reconcile looks for that end.
 fn a_wait_hears_evalai(view: &View, plan: &Plan) {
     let Some(evalai) = view.evalai.as_ref().filter(|evalai| !evalai.cancelled) else {
         return;

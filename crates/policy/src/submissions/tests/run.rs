@@ -274,7 +274,7 @@ fn deadlines_and_retries_are_the_leaderboards_of_this_moment() {
     world.go_to(1110);
     let failure = world.pass_to(Running, Reason::Stopping).status.failure.unwrap();
     assert_eq!(failure.reason, Reason::TimeLimit);
-    // What was recorded stands.
+    // The recorded failure stands.
     world.leaderboard().deadlines.run_seconds = Some(90_000);
     world.pass_to(Running, Reason::Stopping);
 

@@ -1,4 +1,4 @@
-//! Cancels and deletions at every stage, and stops that nobody obeys.
+//! Cancels and deletions at every stage, and stops that no program obeys.
 
 use super::builders::*;
 use crate::submissions::{Action, EvalaiUpdate, TableUpdate};
@@ -11,7 +11,7 @@ use leaderboard_contract::run::Stop;
 
 type Request = fn(&mut World);
 
-/// Who requests the end, and which reason it gets.
+/// The requests that end a submission, each with the reason that it gets.
 const REQUESTS: [(Request, Reason); 3] = [
     (|world| world.submission().spec.cancel = true, Reason::Cancelled),
     (World::delete, Reason::Deleted),
@@ -92,7 +92,7 @@ fn between_two_tries_it_ends_at_once() {
     }
 }
 
-/// What a cancel does at once: nothing is to be stopped, the Job is deleted, or its Pod is asked to stop.
+/// The first effect of a cancel: the end, the deletion of the Job, or a stop request to its Pod.
 #[derive(Debug, PartialEq)]
 enum Done {
     Ended,

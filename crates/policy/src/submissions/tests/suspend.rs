@@ -152,7 +152,7 @@ fn a_suspension_in_mid_run_takes_no_time_and_no_retry() {
 fn a_controller_that_was_away_counts_from_the_suspension_too() {
     let mut world = suspended_in_mid_run();
     world.view.pod = None;
-    // Nobody has looked for longer than the run may take.
+    // No reconcile runs for longer than the run may take.
     world.go_to(50_000);
     world.pass_to(Running, Reason::Suspended);
     resume(&mut world, 50_010);

@@ -1,4 +1,4 @@
-//! What a submission has used of GPUs, over all its Jobs.
+//! The GPU use of a submission, over all its Jobs.
 
 use serde_json::json;
 

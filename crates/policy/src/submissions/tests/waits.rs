@@ -1,4 +1,4 @@
-//! What a run waits for before its Pod is prepared, a node, a quota or a slot, and what shows it.
+//! The waits of a run before its Pod is prepared, for a node, a quota or a slot, and how they show.
 
 use std::time::Duration;
 

@@ -3,7 +3,7 @@
 
 use crate::submissions::cause::{Cause, of_config, of_pull, of_start};
 
-/// What stands before the words of a row.
+/// Prefixes of the words of a row.
 const PREFIXES: [(&str, &str); 3] = [
     (
         "TASK…",
