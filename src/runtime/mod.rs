@@ -1,7 +1,7 @@
 //! Wires the controller: watches, lease, services, reconciles. Called by the command line; decides nothing.
 //!
-//! Standbys keep warm caches and are ready. A process that has led and no longer does ends with an error, and so does one
-//! that has lost one of its tasks: the kubelet starts it again with empty hands.
+//! Standbys keep warm caches and are ready. A process that loses the lead, or one of its tasks, ends with an error: the kubelet starts it
+//! again with empty hands.
 
 pub mod backoff;
 pub mod context;
@@ -58,7 +58,7 @@ use leaderboard_aws::clients::Aws;
 use leaderboard_aws::table::Tables;
 use leaderboard_base::object_key::ObjectKey;
 use leaderboard_base::tasks::TaskFailed;
-use leaderboard_evalai::{Changed, Hub, Options, PayloadReader, SweepRow, Timeouts, Timing};
+use leaderboard_evalai::{Changed, Hub, Network, Options, PayloadReader, SweepRow, Timeouts, Timing};
 use leaderboard_policy::phases::Phase;
 use queue::{Class, urgency};
 use reconciles::Queues;
@@ -389,6 +389,8 @@ fn hub(
     let not_before = fence.evalai_not_before().unwrap_or_else(Instant::now);
     let writes = fence.clone();
     Hub::new(Options {
+        connect: Arc::new(Network::connect),
+        clock: telemetry.clock.clone(),
         write_guard: Arc::new(move || writes.may_write()),
         payloads,
         not_before,

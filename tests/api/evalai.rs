@@ -26,6 +26,7 @@ use tokio::sync::mpsc;
 use tokio::time::Instant;
 
 use leaderboard_api::Attempt;
+use leaderboard_base::clock::Clock;
 use leaderboard_base::meter::Meter;
 use leaderboard_base::shutdown::Stop;
 use leaderboard_base::spans::LogSpan;
@@ -33,8 +34,9 @@ use leaderboard_base::tasks::Tasks;
 use leaderboard_contract::report::ContentId;
 use leaderboard_evalai::token::Token;
 use leaderboard_evalai::{
-    Changed, DesiredUpdate, Ended, Hub, ImageAnswer, Key, Metrics, Misfit, Options, Outcome, Outline, Patience, Payload,
-    Progress, Publisher, Run, Status, StoredResult, Subject, SubmissionState, SweepRow, Target, Timeouts, Timing,
+    Changed, DesiredUpdate, Ended, Hub, ImageAnswer, Key, Metrics, Misfit, Network, Options, Outcome, Outline, Patience,
+    Payload, Progress, Publisher, Run, Status, StoredResult, Subject, SubmissionState, SweepRow, Target, Timeouts,
+    Timing,
 };
 
 /// A stand-in, a hub that speaks to it, and what the controller would hold.
@@ -106,6 +108,8 @@ impl World {
         let leads = Arc::new(AtomicBool::new(true));
         let guard = leads.clone();
         let hub = Hub::new(Options {
+            connect: Arc::new(Network::connect),
+            clock: Clock::system(),
             write_guard: Arc::new(move || guard.load(Ordering::SeqCst)),
             payloads: Arc::new(|outline| Box::pin(async move { Ok(stored(&outline)) })),
             not_before,
@@ -305,7 +309,7 @@ fn results(target: &Target, score: f64) -> Arc<Outline> {
     })
 }
 
-/// What that bucket gives out.
+/// The payload that this bucket gives out.
 fn stored(outline: &Outline) -> Payload {
     let bare = Payload::bare(outline);
     Payload {

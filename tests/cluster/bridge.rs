@@ -64,6 +64,42 @@ async fn bad_messages_land_in_the_dead_letter_queue_with_their_reasons() {
     .await;
 }
 
+/// Its message comes again and again, before and after its end, and it has one Job, which failed.
+async fn fails_once(scene: &Scene, name: &str) {
+    scene.gate.await_kept_back(3 * TRIES, LIMIT).await;
+    let failed = scene.settled(name, LIMIT).await;
+    let failure = failed.status.clone().unwrap().failure.unwrap();
+    assert_eq!(
+        (failure.class, failure.reason.as_str()),
+        (FailureClass::Participant, "AgentCrashed")
+    );
+    // The message that began it comes again although the run has ended; each deletion is tried three times.
+    scene.gate.await_kept_back(2 * TRIES, LIMIT).await;
+    assert_eq!(names(&scene.all::<Submission>().await), [name]);
+    assert_eq!(scene.jobs().await, [format!("{name}-1")]);
+    let still = scene.api::<Submission>().get(name).await.unwrap();
+    assert_eq!((still.spec.attempt, state(&still)), (Attempt(1), Some(State::Failed)));
+}
+
+/// Its second attempt goes on from the first one's results, and finishes.
+async fn finishes_resumed(scene: &Scene, name: &str) {
+    let resumed = |s: &Submission| s.status.as_ref().and_then(|status| status.attempt) == Some(Attempt(2));
+    scene
+        .submission(name, "the second attempt begins", LIMIT, resumed)
+        .await;
+    let running = scene.running(name, LIMIT).await;
+    assert_eq!(
+        (state(&running), reason(&running).as_str()),
+        (Some(State::Resumed), "Resumed")
+    );
+    let finished = scene.settled(name, LIMIT).await;
+    assert_eq!(
+        (state(&finished), score(&finished)),
+        (Some(State::Finished), SIX_ROUTES)
+    );
+    assert_eq!(scene.jobs().await, [format!("{name}-1"), format!("{name}-2")]);
+}
+
 #[tokio::test]
 async fn a_message_delivered_again_and_again_runs_once_and_only_a_resume_runs_again() {
     scenario("redelivery", async |scene: &Scene| {
@@ -80,41 +116,14 @@ async fn a_message_delivered_again_and_again_runs_once_and_only_a_resume_runs_ag
         let (_controller, _bridge) = (controller(scene), bridge(scene));
         let pk = evalai.submit(&scene.lab.challenge("agent:standard"), 1).await;
         let name = format!("submission-{pk}");
-        scene.gate.await_kept_back(3 * TRIES, LIMIT).await;
-
-        let failed = scene.settled(&name, LIMIT).await;
-        let failure = failed.status.clone().unwrap().failure.unwrap();
-        assert_eq!(
-            (failure.class, failure.reason.as_str()),
-            (FailureClass::Participant, "AgentCrashed")
-        );
-        // The message that began it comes again although the run has ended; each deletion is tried three times.
-        scene.gate.await_kept_back(2 * TRIES, LIMIT).await;
-        assert_eq!(names(&scene.all::<Submission>().await), [name.as_str()]);
-        assert_eq!(scene.jobs().await, [format!("{name}-1")]);
-        let still = scene.api::<Submission>().get(&name).await.unwrap();
-        assert_eq!((still.spec.attempt, state(&still)), (Attempt(1), Some(State::Failed)));
+        fails_once(scene, &name).await;
 
         scene.gate.reopen();
         scene.cloud.await_messages([0, 0], LIMIT).await;
         evalai.await_status(pk, Status::Failed, LIMIT).await;
         scene.change_leaderboard("lb", &json!({"agent": {"env": []}})).await;
         evalai.resume(pk).await;
-        let resumed = |s: &Submission| s.status.as_ref().and_then(|status| status.attempt) == Some(Attempt(2));
-        scene
-            .submission(&name, "the second attempt begins", LIMIT, resumed)
-            .await;
-        let running = scene.running(&name, LIMIT).await;
-        assert_eq!(
-            (state(&running), reason(&running).as_str()),
-            (Some(State::Resumed), "Resumed")
-        );
-        let finished = scene.settled(&name, LIMIT).await;
-        assert_eq!(
-            (state(&finished), score(&finished)),
-            (Some(State::Finished), SIX_ROUTES)
-        );
-        assert_eq!(scene.jobs().await, [format!("{name}-1"), format!("{name}-2")]);
+        finishes_resumed(scene, &name).await;
         assert_eq!(evalai.submission(pk).status, Status::Finished);
         let row = scene.cloud.row(&scene.cloud.table).await;
         assert_eq!(

@@ -50,20 +50,7 @@ async fn a_message_becomes_the_same_score_in_all_four_places() {
         assert_eq!(evalai.updates("PATCH", "running"), 1);
         assert_eq!(evalai.updates("PUT", "finished"), 1);
 
-        let row = scene.cloud.row(&scene.cloud.table).await;
-        assert_row(&row);
-        for (column, text) in [
-            ("team_id", "1"),
-            ("submission_id", pk.to_string().as_str()),
-            ("team_name", "team-a"),
-            ("submission_status", "FINISHED"),
-            ("track_id", "1"),
-            ("track_name", "SENSORS"),
-            ("attempt", "1"),
-            ("progress", "20/20"),
-        ] {
-            assert_eq!(row.get(column).map(String::as_str), Some(text), "{column} of {row:?}");
-        }
+        assert_recorded(scene, pk).await;
         assert_eq!(
             scene.cloud.messages().await,
             [0, 0],
@@ -71,6 +58,24 @@ async fn a_message_becomes_the_same_score_in_all_four_places() {
         );
     })
     .await;
+}
+
+/// The table has the one submission, with its metrics.
+async fn assert_recorded(scene: &Scene, pk: u64) {
+    let row = scene.cloud.row(&scene.cloud.table).await;
+    assert_row(&row);
+    for (column, text) in [
+        ("team_id", "1"),
+        ("submission_id", pk.to_string().as_str()),
+        ("team_name", "team-a"),
+        ("submission_status", "FINISHED"),
+        ("track_id", "1"),
+        ("track_name", "SENSORS"),
+        ("attempt", "1"),
+        ("progress", "20/20"),
+    ] {
+        assert_eq!(row.get(column).map(String::as_str), Some(text), "{column} of {row:?}");
+    }
 }
 
 /// EvalAI's row, its leaderboard and its files are what S3 holds.

@@ -1,23 +1,26 @@
 //! EvalAI over HTTP: one method a request, every answer classified.
 //!
-//! Called by `task` only. Knows no policy: it sends each request once, and follows no redirect of the API (the server
+//! Called by `task` only. Knows no policy: it hands each request to its [`Transport`] once, and follows no redirect of the API (the server
 //! drops the body of a redirected write).
 
 use std::collections::BTreeMap;
+use std::sync::Arc;
 
+use bytes::Bytes;
+use http::Method;
+use http::header::{AUTHORIZATION, CONTENT_TYPE};
 use jiff::Timestamp;
-use reqwest::Method;
-use reqwest::header::{AUTHORIZATION, CONTENT_TYPE};
 use serde::Serialize;
 use serde::de::DeserializeOwned;
+use tokio::time::Instant;
+use url::Url;
 
-use super::answer::Answer;
+use super::answer::{Answer, Silence};
 use super::files::Files;
-use super::http::{ClientError, Need, Timeouts, answer, builder, made};
 use super::request::{Reply, Request, SubmissionRef};
 use super::row::Row;
+use super::transport::{Need, Timeouts, Transport, answer, unsendable};
 use super::types::Payload;
-use crate::reach::Reach;
 use crate::token::Token;
 use leaderboard_base::meter::Meter;
 
@@ -27,9 +30,8 @@ const LARGEST_ROW: usize = 1 << 20;
 const LARGEST: usize = 8 << 20;
 
 /// A server of EvalAI.
-#[derive(Clone, Debug)]
 pub struct Client {
-    api: reqwest::Client,
+    transport: Arc<dyn Transport>,
     files: Files,
     base: String,
     timeouts: Timeouts,
@@ -60,21 +62,15 @@ struct Patch<'a> {
 }
 
 impl Client {
-    /// A client of one server, named by its root.
-    pub fn new(api_server: &str, timeouts: Timeouts) -> Result<Self, ClientError> {
-        Ok(Self {
-            api: made(builder(timeouts).redirect(reqwest::redirect::Policy::none()))?,
-            files: Files::new(api_server, timeouts, Reach::default())?,
+    /// A client of one server, named by its root, over the transport to it. The meter counts its requests.
+    pub fn new(transport: Arc<dyn Transport>, api_server: &str, timeouts: Timeouts, meter: Meter) -> Self {
+        Self {
+            files: Files::new(transport.clone(), timeouts),
+            transport,
             base: format!("{}/api/", api_server.trim_end_matches('/')),
             timeouts,
-            meter: Meter::default(),
-        })
-    }
-
-    /// This client, with its requests counted.
-    #[must_use]
-    pub fn counted_by(self, meter: Meter) -> Self {
-        Self { meter, ..self }
+            meter,
+        }
     }
 
     /// Sends a request and reads its answer.
@@ -158,8 +154,9 @@ impl Client {
     }
 
     async fn get_within<T: DeserializeOwned>(&self, largest: usize, token: &Token, path: &str) -> Answer<T> {
-        let request = self.api.get(format!("{}{path}", self.base)).timeout(self.timeouts.read);
-        let answer = answer(request.header(AUTHORIZATION, token.header()), largest, Need::Body).await;
+        let end = Instant::now() + self.timeouts.read;
+        let request = self.request(token, Method::GET, path, Bytes::new());
+        let answer = answer(&*self.transport, request, end, largest, Need::Body).await;
         answer.and_then(|(status, body)| match serde_json::from_slice(&body) {
             Ok(content) => Answer::Done(content),
             Err(_) => Answer::unusable(status, "something that is not EvalAI's"),
@@ -171,16 +168,23 @@ impl Client {
             Ok(body) => body,
             Err(error) => return Answer::unusable(0, &format!("nothing: the request could not be written ({error})")),
         };
-        let request = self
-            .api
-            .request(method, format!("{}{path}", self.base))
-            .timeout(self.timeouts.write)
-            .header(AUTHORIZATION, token.header())
-            .header(CONTENT_TYPE, "application/json")
-            .body(body);
-        answer(request, LARGEST_ROW, Need::Status)
+        let end = Instant::now() + self.timeouts.write;
+        let request = self.request(token, method, path, body.into());
+        answer(&*self.transport, request, end, LARGEST_ROW, Need::Status)
             .await
             .and_then(|_| Answer::Done(()))
+    }
+
+    fn request(&self, token: &Token, method: Method, path: &str, body: Bytes) -> Result<http::Request<Bytes>, Silence> {
+        let url = Url::parse(&format!("{}{path}", self.base)).map_err(|error| unsendable(&error))?;
+        let mut request = http::Request::builder()
+            .method(method)
+            .uri(url.as_str())
+            .header(AUTHORIZATION, token.header());
+        if !body.is_empty() {
+            request = request.header(CONTENT_TYPE, "application/json");
+        }
+        request.body(body).map_err(|error| unsendable(&error))
     }
 }
 

@@ -1,16 +1,19 @@
 //! The files that participants upload: read without the token, since they may lie with a storage provider, and from the internet
-//! alone, since what they lead to is not EvalAI's word. A file on EvalAI's own server is read wherever that server is.
+//! alone, since what they lead to is not EvalAI's word. A file on EvalAI's own server is read wherever that server is. The transport
+//! refuses the rest, at each redirect anew.
 
-use reqwest::header::LOCATION;
-use reqwest::{Response, StatusCode, Url};
+use std::sync::Arc;
+
+use bytes::Bytes;
+use http::header::LOCATION;
+use http::{Request, Response, StatusCode};
 use tokio::time::Instant;
+use url::Url;
 
 use super::answer::{About, Answer, Refusal};
-use super::http::{ClientError, Need, Timeouts, builder, made, read, silence};
 use super::row::image;
+use super::transport::{Body, Failure, Need, Timeouts, Transport, read, send, unsendable};
 use super::types::ImageAnswer;
-use crate::reach as public;
-use crate::reach::{NotPublic, Reach};
 
 /// Largest file that is read, in bytes.
 const LARGEST_UPLOAD: usize = 64 << 10;
@@ -18,44 +21,30 @@ const LARGEST_UPLOAD: usize = 64 << 10;
 const REDIRECTS: usize = 5;
 
 /// Reads uploaded files.
-#[derive(Clone, Debug)]
 pub(super) struct Files {
-    /// For EvalAI's own server.
-    own: reqwest::Client,
-    /// For every other one.
-    other: reqwest::Client,
-    reach: Reach,
-    server: Option<Url>,
+    transport: Arc<dyn Transport>,
     timeouts: Timeouts,
 }
 
 impl Files {
-    pub(super) fn new(api_server: &str, timeouts: Timeouts, reach: Reach) -> Result<Self, ClientError> {
-        Ok(Self {
-            own: made(builder(timeouts).redirect(reqwest::redirect::Policy::none()))?,
-            other: made(reach.limit(builder(timeouts)))?,
-            reach,
-            server: Url::parse(api_server).ok(),
-            timeouts,
-        })
+    pub(super) fn new(transport: Arc<dyn Transport>, timeouts: Timeouts) -> Self {
+        Self { transport, timeouts }
     }
 
     /// The image that an uploaded file names.
     pub(super) async fn image(&self, url: &str) -> Answer<ImageAnswer> {
-        match self.found(url).await {
-            Ok(response) => content(response).await,
+        let end = Instant::now() + self.timeouts.read;
+        match self.found(url, end).await {
+            Ok(response) => content(response, end).await,
             Err(answer) => answer,
         }
     }
 
     /// The first answer that is no redirect.
-    async fn found(&self, url: &str) -> Result<Response, Answer<ImageAnswer>> {
-        let end = Instant::now() + self.timeouts.read;
+    async fn found(&self, url: &str, end: Instant) -> Result<Response<Body>, Answer<ImageAnswer>> {
         let mut url = Url::parse(url).map_err(|_| refused("the address of the uploaded file is no URL"))?;
         for _ in 0..=REDIRECTS {
-            let left = end.saturating_duration_since(Instant::now());
-            let request = self.client(&url)?.get(url.clone()).timeout(left);
-            let response = request.send().await.map_err(failed)?;
+            let response = send(&*self.transport, get(&url)?, end).await.map_err(failed)?;
             match next(&url, &response) {
                 Some(next) => url = next?,
                 None => return Ok(response),
@@ -65,26 +54,18 @@ impl Files {
             "the uploaded file is more than {REDIRECTS} redirects away"
         )))
     }
+}
 
-    /// Client that may read this address; an error if none may.
-    fn client(&self, url: &Url) -> Result<&reqwest::Client, Answer<ImageAnswer>> {
-        if !["http", "https"].contains(&url.scheme()) {
-            return Err(refused("the address of the uploaded file is neither http nor https"));
-        }
-        if self
-            .server
-            .as_ref()
-            .is_some_and(|server| server.origin() == url.origin())
-        {
-            return Ok(&self.own);
-        }
-        self.reach.check(url).map_err(|error| elsewhere(&error))?;
-        Ok(&self.other)
+fn get(url: &Url) -> Result<Request<Bytes>, Answer<ImageAnswer>> {
+    if !["http", "https"].contains(&url.scheme()) {
+        return Err(refused("the address of the uploaded file is neither http nor https"));
     }
+    let request = Request::get(url.as_str()).body(Bytes::new());
+    request.map_err(|error| Answer::Unanswered(unsendable(&error)))
 }
 
 /// Where a redirect leads; None: this is the answer.
-fn next(url: &Url, response: &Response) -> Option<Result<Url, Answer<ImageAnswer>>> {
+fn next(url: &Url, response: &Response<Body>) -> Option<Result<Url, Answer<ImageAnswer>>> {
     let redirects = [
         StatusCode::MOVED_PERMANENTLY,
         StatusCode::FOUND,
@@ -100,8 +81,8 @@ fn next(url: &Url, response: &Response) -> Option<Result<Url, Answer<ImageAnswer
     Some(next.ok_or_else(|| refused("the uploaded file is redirected to no URL")))
 }
 
-async fn content(response: Response) -> Answer<ImageAnswer> {
-    match read(response, LARGEST_UPLOAD, Need::Body).await {
+async fn content(response: Response<Body>, end: Instant) -> Answer<ImageAnswer> {
+    match read(response, end, LARGEST_UPLOAD, Need::Body).await {
         // The file is there, and too large for what names an image.
         Answer::Refused(refusal) if (200..300).contains(&refusal.status) => {
             let why = format!("the uploaded file is larger than {LARGEST_UPLOAD} bytes");
@@ -118,17 +99,13 @@ async fn content(response: Response) -> Answer<ImageAnswer> {
     }
 }
 
-fn failed(error: reqwest::Error) -> Answer<ImageAnswer> {
-    match public::cause(&error) {
-        Some(cause) => elsewhere(cause),
-        None => Answer::Unanswered(silence(error)),
+fn failed(failure: Failure) -> Answer<ImageAnswer> {
+    match failure {
+        Failure::Silent(silence) => Answer::Unanswered(silence),
+        Failure::NotPublic(error) => refused(&format!(
+            "the uploaded file is not read: {error}, and no part of evalai.apiServer"
+        )),
     }
-}
-
-fn elsewhere(error: &NotPublic) -> Answer<ImageAnswer> {
-    refused(&format!(
-        "the uploaded file is not read: {error}, and no part of evalai.apiServer"
-    ))
 }
 
 fn refused(why: &str) -> Answer<ImageAnswer> {

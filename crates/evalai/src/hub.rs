@@ -13,21 +13,26 @@ use tokio::task::JoinHandle;
 use tokio::time::Instant;
 
 use super::client::Client;
-use super::http::{ClientError, Timeouts};
 use super::labels::Labels;
 use super::queue::{Now, Purse, Queue, Timing};
 use super::request::{Reply, Request};
 use super::task::{Outlets, Payloads, Shared, Task, now, run};
+use super::transport::{ClientError, Connect, Timeouts};
 use super::types::{
     Changed, DesiredUpdate, InboxTrouble, Key, Load, PayloadReader, Publisher, Subject, SubmissionState, SweepRow,
     Target, Usage, WriteGuard,
 };
+use leaderboard_base::clock::Clock;
 use leaderboard_base::lock::lock;
 use leaderboard_base::meter::Meter;
 use leaderboard_base::tasks::Tasks;
 
 /// Surroundings of a hub.
 pub struct Options {
+    /// Makes the transport of each token.
+    pub connect: Connect,
+    /// Tells the time of what EvalAI and people are shown.
+    pub clock: Clock,
     pub write_guard: Arc<dyn WriteGuard>,
     /// Reads what a bucket holds of a result.
     pub payloads: PayloadReader,
@@ -50,6 +55,8 @@ impl Options {
     /// Options of a hub without a listener to its news.
     pub fn unheard(tasks: &Tasks, write_guard: impl WriteGuard) -> Self {
         Self {
+            connect: Arc::new(super::Network::connect),
+            clock: Clock::system(),
             write_guard: Arc::new(write_guard),
             payloads: Arc::new(|outline| Box::pin(async move { Ok(super::Payload::bare(&outline)) })),
             not_before: Instant::now(),
@@ -190,6 +197,10 @@ impl Inner {
     fn state(&self) -> MutexGuard<'_, State> {
         lock(&self.state)
     }
+
+    fn now(&self) -> Now {
+        now(&self.options.clock, self.start)
+    }
 }
 
 impl Hub {
@@ -200,7 +211,7 @@ impl Hub {
             sweep: options.sweep.clone(),
         };
         Self(Arc::new(Inner {
-            writes_from: wall(options.not_before),
+            writes_from: wall(&options.clock, options.not_before),
             payloads: Payloads::new(options.payloads.clone()),
             options,
             start: Instant::now(),
@@ -289,7 +300,7 @@ impl Hub {
         let queues: Vec<_> = state.tokens.values().map(|entry| entry.shared.clone()).collect();
         let purses: Vec<_> = state.purses.values().filter_map(Weak::upgrade).collect();
         drop(state);
-        let now = now(self.0.start).at;
+        let now = self.0.now().at;
         let uses = purses.iter().map(|purse| purse.use_at(now));
         let (used, limit) = uses.fold((0, 0), |(used, limit), (one, of)| {
             (used + one as usize, limit + of as usize)
@@ -403,7 +414,7 @@ impl Hub {
 
     /// An object whose token is another one now: all that waits goes on with that, and what is on its way is waited out.
     fn move_over(&self, state: &mut State, key: &Key, old: &Shared, (account, new): (&Account, &Shared)) {
-        let (now, options) = (now(self.0.start), &self.0.options);
+        let (now, options) = (self.0.now(), &self.0.options);
         let settled = now.at + options.timing.hold + options.timeouts.write;
         let leaving = old.queue().part_with(key, settled, now);
         for submission in leaving.submissions().filter(|submission| *submission != key) {
@@ -416,17 +427,20 @@ impl Hub {
 
     fn start(&self, state: &mut State, target: &Target, account: &Account) -> Result<Entry, ClientError> {
         let inner = &self.0;
-        let client = Client::new(&target.api_server, inner.options.timeouts)?;
-        let (timing, now) = (inner.options.timing, now(inner.start));
-        let not_before = inner.options.not_before.saturating_duration_since(inner.start);
+        let options = &inner.options;
+        let transport = (options.connect)(&target.api_server, options.timeouts)?;
+        let meter = options.meter.clone();
+        let (timing, now) = (options.timing, inner.now());
+        let not_before = options.not_before.saturating_duration_since(inner.start);
         let share = state.purse_of(target, now).share(target.requests_per_minute, now.at);
         let queue = Queue::new(timing, share, not_before, now);
-        let shared = Arc::new(Shared::new(queue, target.token.clone(), inner.start));
+        let (token, clock) = (target.token.clone(), options.clock.clone());
+        let shared = Arc::new(Shared::new(queue, token, inner.start, clock));
         let (weak, account) = (Arc::downgrade(inner), account.clone());
         let work = run(Task {
             shared: shared.clone(),
-            client: client.counted_by(inner.options.meter.clone()),
-            guard: inner.options.write_guard.clone(),
+            client: Client::new(transport, &target.api_server, options.timeouts, meter),
+            guard: options.write_guard.clone(),
             payloads: inner.payloads.clone(),
             outlets: inner.outlets.clone(),
             closing: inner.closing.subscribe(),
@@ -434,7 +448,7 @@ impl Hub {
         });
         let name = format!("EvalAI requests of {}", target.token.label());
         // It ends when its token is no longer used.
-        let task = inner.options.tasks.may_end(name, work);
+        let task = options.tasks.may_end(name, work);
         Ok(Entry {
             shared,
             users: 0,
@@ -444,8 +458,8 @@ impl Hub {
 }
 
 /// A moment as wall-clock time, if it is still to come.
-fn wall(at: Instant) -> Timestamp {
-    let now = Timestamp::now();
+fn wall(clock: &Clock, at: Instant) -> Timestamp {
+    let now = clock.now();
     let wait = SignedDuration::try_from(at.saturating_duration_since(Instant::now())).unwrap_or_default();
     now.checked_add(wait).unwrap_or(now)
 }

@@ -1,20 +1,13 @@
-//! Connections to addresses that a stranger has named: to the internet alone, never into a network of the operator's.
+//! Which addresses a stranger may name: those of the internet alone, and none in a network of the operator's.
 //!
-//! A name is looked up once, and what was found is checked and connected to, so that a second look-up cannot lead elsewhere. An address
-//! that stands in the URL itself is looked up by nobody: ask [`check`] before each request, and follow no redirect without asking again.
-//! Where a proxy is set and used, it is the proxy that connects, and its rules that hold.
+//! Asked by `network`. Pure. An address that stands in the URL itself is looked up by nobody: ask [`Reach::check`] before each request,
+//! and follow no redirect without asking again.
 
-use std::error::Error;
 use std::net::{IpAddr, SocketAddr};
-use std::sync::Arc;
 
-use reqwest::dns::{Addrs, Name, Resolve, Resolving};
-use reqwest::{ClientBuilder, Url};
+use url::Url;
 
 use leaderboard_api::ranges;
-
-/// Variables with the address of a proxy, in capital letters.
-const PROXIES: [&str; 3] = ["HTTPS_PROXY", "HTTP_PROXY", "ALL_PROXY"];
 
 /// A host that has no address of the internet.
 #[derive(thiserror::Error, Debug, Clone, PartialEq, Eq)]
@@ -41,14 +34,6 @@ impl Reach {
         Self(rule)
     }
 
-    /// A client that connects nowhere else. It follows no redirect.
-    pub fn limit(self, builder: ClientBuilder) -> ClientBuilder {
-        let proxies = proxies(|name| std::env::var(name).ok());
-        builder
-            .redirect(reqwest::redirect::Policy::none())
-            .dns_resolver(Arc::new(Resolver { reach: self, proxies }))
-    }
-
     /// Refuses an address in a URL that may not be connected to. A name is judged when it is looked up.
     pub fn check(self, url: &Url) -> Result<(), NotPublic> {
         let host = url.host_str().unwrap_or_default();
@@ -63,35 +48,8 @@ impl Reach {
     }
 }
 
-/// Refused address, if a request has failed because of where it would have gone.
-pub fn cause(error: &reqwest::Error) -> Option<&NotPublic> {
-    std::iter::successors(error.source(), |error| (*error).source()).find_map(|cause| cause.downcast_ref())
-}
-
-struct Resolver {
-    reach: Reach,
-    proxies: Vec<String>,
-}
-
-impl Resolve for Resolver {
-    fn resolve(&self, name: Name) -> Resolving {
-        let is_proxy = self
-            .proxies
-            .iter()
-            .any(|proxy| proxy.eq_ignore_ascii_case(name.as_str()));
-        let reach = self.reach;
-        Box::pin(async move {
-            let found: Vec<SocketAddr> = tokio::net::lookup_host((name.as_str(), 0)).await?.collect();
-            if is_proxy {
-                let all: Addrs = Box::new(found.into_iter());
-                return Ok(all);
-            }
-            Ok(reached(reach, name.as_str(), found)?)
-        })
-    }
-}
-
-fn reached(reach: Reach, host: &str, found: Vec<SocketAddr>) -> Result<Addrs, NotPublic> {
+/// The addresses of a host that may be connected to. An error: all that were found may not.
+pub(super) fn reached(reach: Reach, host: &str, found: Vec<SocketAddr>) -> Result<Vec<SocketAddr>, NotPublic> {
     let (public, other): (Vec<SocketAddr>, Vec<SocketAddr>) =
         found.into_iter().partition(|found| (reach.0)(found.ip()));
     match (public.is_empty(), other.first()) {
@@ -99,24 +57,8 @@ fn reached(reach: Reach, host: &str, found: Vec<SocketAddr>) -> Result<Addrs, No
             host: host.to_owned(),
             address: address.ip(),
         }),
-        _ => Ok(Box::new(public.into_iter())),
+        _ => Ok(public),
     }
-}
-
-/// The hosts of the proxies that the environment sets.
-fn proxies(variable: impl Fn(&str) -> Option<String>) -> Vec<String> {
-    let set = PROXIES
-        .iter()
-        .flat_map(|name| [variable(name), variable(&name.to_lowercase())]);
-    let host = |text: String| {
-        let url = if text.contains("://") {
-            text
-        } else {
-            format!("http://{text}")
-        };
-        Url::parse(&url).ok()?.host_str().map(str::to_owned)
-    };
-    set.flatten().filter_map(host).collect()
 }
 
 #[cfg(test)]
@@ -150,23 +92,12 @@ mod tests {
                 .map(|address| (address.parse::<IpAddr>().unwrap(), 0).into())
                 .collect()
         };
-        let reached =
-            |addresses: &[&str]| reached(Reach::default(), "host", found(addresses)).map(Iterator::collect::<Vec<_>>);
+        let reached = |addresses: &[&str]| reached(Reach::default(), "host", found(addresses));
         assert_eq!(reached(&["1.1.1.1", "10.0.0.1", "::1"]).unwrap(), found(&["1.1.1.1"]));
         assert_eq!(
             reached(&["10.0.0.1", "::1"]).unwrap_err().to_string(),
             "host is at 10.0.0.1, which is no address of the internet"
         );
         assert_eq!(reached(&[]).unwrap(), []);
-    }
-
-    #[test]
-    fn a_proxy_may_be_anywhere() {
-        let set = |name: &str| match name {
-            "HTTPS_PROXY" => Some("http://proxy.internal:3128".to_owned()),
-            "http_proxy" => Some("10.0.0.2:3128".to_owned()),
-            _ => None,
-        };
-        assert_eq!(proxies(set), ["proxy.internal", "10.0.0.2"]);
     }
 }

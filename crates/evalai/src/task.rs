@@ -7,7 +7,6 @@ use std::sync::{Arc, Mutex, MutexGuard};
 use std::time::Duration;
 
 use futures::stream::{FuturesUnordered, StreamExt};
-use jiff::Timestamp;
 use tokio::sync::{Notify, Semaphore, mpsc, oneshot, watch};
 use tokio::time::Instant;
 
@@ -17,6 +16,7 @@ use super::queue::{Next, Now, PAYLOADS, Place, Queue, Ticket};
 use super::request::{Reply, Request};
 use super::types::{Changed, Key, Outline, Payload, PayloadProblem, PayloadReader, SweepRow, WriteGuard};
 use crate::token::Token;
+use leaderboard_base::clock::Clock;
 use leaderboard_base::lock::lock;
 
 /// How long answers are waited for at the end: longer than a write may take.
@@ -30,6 +30,7 @@ pub(super) struct Shared {
     pub notify: Notify,
     /// The queue's time counts from here.
     start: Instant,
+    clock: Clock,
     /// Waiters for the answers to requests that the queue makes for others, by their number.
     waiters: Mutex<HashMap<u64, oneshot::Sender<Reply>>>,
 }
@@ -42,12 +43,13 @@ pub(super) struct Outlets {
 }
 
 impl Shared {
-    pub fn new(queue: Queue, token: Arc<Token>, start: Instant) -> Self {
+    pub fn new(queue: Queue, token: Arc<Token>, start: Instant, clock: Clock) -> Self {
         Self {
             queue: Mutex::new(queue),
             token,
             notify: Notify::new(),
             start,
+            clock,
             waiters: Mutex::default(),
         }
     }
@@ -66,7 +68,7 @@ impl Shared {
 
     /// The moment on the queue's clock.
     pub fn now(&self) -> Now {
-        now(self.start)
+        now(&self.clock, self.start)
     }
 
     /// The queue. A panic elsewhere leaves it whole: every change of it is one call.
@@ -95,11 +97,11 @@ impl Shared {
     }
 }
 
-/// The moment on a clock that began at `start`.
-pub(super) fn now(start: Instant) -> Now {
+/// The moment, counted from `start`, and by the clock.
+pub(super) fn now(clock: &Clock, start: Instant) -> Now {
     Now {
         at: start.elapsed(),
-        wall: Timestamp::now(),
+        wall: clock.now(),
     }
 }
 

@@ -24,11 +24,9 @@ fn a_question_outlasts_the_longest_pause_between_two_reconciles() {
     assert!(crate::ask::state::KEPT > RESYNC.mul_f64(1.0 + SPREAD));
 }
 
-#[tokio::test(start_paused = true)]
-async fn cancels_do_not_wait_for_a_bucket_that_hangs() {
-    let silent = std::net::TcpListener::bind("127.0.0.1:0").unwrap();
-    let endpoint = format!("http://{}", silent.local_addr().unwrap());
-    let (hanging, other) = (leaderboard("hanging", &endpoint), leaderboard("other", &endpoint));
+/// First the submissions that wait for the bucket, then the cancelled ones.
+fn crowd(endpoint: &str) -> Cluster {
+    let (hanging, other) = (leaderboard("hanging", endpoint), leaderboard("other", endpoint));
     let mut cluster = Cluster::default();
     for number in 0..BEHIND {
         let (mut submission, job) = with_job(&format!("behind-{number}"), &hanging);
@@ -44,7 +42,14 @@ async fn cancels_do_not_wait_for_a_bucket_that_hangs() {
         cluster.jobs.push(job);
     }
     cluster.leaderboards = vec![hanging, other];
+    cluster
+}
 
+#[tokio::test(start_paused = true)]
+async fn cancels_do_not_wait_for_a_bucket_that_hangs() {
+    let silent = std::net::TcpListener::bind("127.0.0.1:0").unwrap();
+    let endpoint = format!("http://{}", silent.local_addr().unwrap());
+    let cluster = crowd(&endpoint);
     let (queue, mut queued) = mpsc::unbounded_channel();
     let event = |submission: &ObjectRef<Submission>, class| queue.send((submission.clone(), class)).unwrap();
     let mut all: Vec<_> = cluster.submissions.iter().map(ObjectRef::from_obj).collect();

@@ -8,17 +8,27 @@ use tokio::process::Command;
 use super::terminal::{Printed, Terminal, assert_has, condition, end, ended, finished, plugin, running, waiting};
 use crate::api::objects::Kind;
 
-#[tokio::test]
-async fn status_and_top_show_all_of_a_namespace_and_one_on_a_screen() {
+/// A namespace in which one submission runs, one waits, and one is done.
+async fn three() -> Terminal {
     let terminal = Terminal::new().await;
     terminal.leaderboard(&json!({"concurrency": {"total": 2}})).await;
     let team = |id: &str| json!({"team": {"id": id, "name": format!("Team {id}")}});
     terminal.submission("runs", &team("7"), &running()).await;
     terminal.submission("waits", &team("8"), &waiting()).await;
     terminal.submission("done", &team("7"), &finished()).await;
+    terminal
+}
+
+/// The first column of a table.
+fn firsts(text: &str) -> Vec<&str> {
+    text.lines().filter_map(|line| line.split_whitespace().next()).collect()
+}
+
+#[tokio::test]
+async fn status_and_top_show_all_of_a_namespace_and_one_on_a_screen() {
+    let terminal = three().await;
     let text = terminal.run(&["status"]).await.well();
-    let names: Vec<&str> = text.lines().filter_map(|line| line.split_whitespace().next()).collect();
-    assert_eq!(names, ["NAME", "runs", "waits", "done"]);
+    assert_eq!(firsts(&text), ["NAME", "runs", "waits", "done"]);
     let text = terminal.run(&["status", "runs"]).await.well();
     assert_has(
         &text,
@@ -35,6 +45,11 @@ async fn status_and_top_show_all_of_a_namespace_and_one_on_a_screen() {
     assert_eq!(value.as_array().unwrap().len(), 3);
     let text = terminal.run(&["why", "waits", "-o", "yaml"]).await.out;
     assert_has(&text, &["\"reason\": \"WaitingForSlot\"", "\"nextSteps\":\n  - "]);
+}
+
+#[tokio::test]
+async fn status_shows_what_its_flags_leave() {
+    let terminal = three().await;
     for (flags, expected) in [
         (&["--state", "running,pending"][..], &["runs", "waits"][..]),
         (&["--state", "Finished"], &["done"]),
@@ -46,12 +61,7 @@ async fn status_and_top_show_all_of_a_namespace_and_one_on_a_screen() {
         ),
     ] {
         let text = terminal.run(&[&["status"], flags].concat()).await.well();
-        let names: Vec<&str> = text
-            .lines()
-            .skip(1)
-            .filter_map(|line| line.split_whitespace().next())
-            .collect();
-        assert_eq!(names, expected, "{flags:?}");
+        assert_eq!(firsts(&text)[1..], *expected, "{flags:?}");
     }
     let text = terminal.run(&["status", "--team", "9", "--track", "map"]).await.well();
     assert_has(&text, &["has the track map and the team 9."]);

@@ -75,11 +75,9 @@ fn commands(world: &World, board: &str, file: &str) -> String {
     format!("cd \"$(dirname {file})\"; aws() {{ cat {file}; }}\n{lines}")
 }
 
-#[tokio::test(flavor = "multi_thread", worker_threads = 2)]
-async fn runs_that_are_newer_than_the_backup_go_on_from_their_rows() {
-    let world = World::new().await;
-    let tables = ["newer-rows", "newer-local-rows"].map(|name| world.aws.name(name));
-    for table in &tables {
+/// A Leaderboard of EvalAI and a local one, with their tables.
+async fn boards(world: &World, tables: &[String; 2]) {
+    for table in tables {
         make_table(&world.aws, table).await;
     }
     let spec = |table: &str| json!({"evaluation": {"carla": {"routes": ROUTES}}, "table": {"dynamoDB": {"name": table, "endpoint": world.aws.endpoint}}});
@@ -88,6 +86,24 @@ async fn runs_that_are_newer_than_the_backup_go_on_from_their_rows() {
     local["evalai"] = Value::Null;
     local["tracks"] = json!([{"name": "sensors"}]);
     world.leaderboard_with("local", 1, "Hosts", &local).await;
+}
+
+/// Waits for the Job of a run's second attempt, which takes up the stored results.
+async fn goes_on(world: &World, name: &str) {
+    let is_there = |job: Option<&Job>| job.is_some();
+    let job = format!("{name}-2");
+    let made = await_condition(world.api::<Job>(), &job, is_there);
+    let made = tokio::time::timeout(super::super::bridge::LIMIT, made).await;
+    made.expect("its second attempt has a Job").unwrap();
+    let status = world.api::<Submission>().get(name).await.unwrap().status.unwrap();
+    assert!(status.plan.unwrap().resume, "{name} takes up what is stored");
+}
+
+#[tokio::test(flavor = "multi_thread", worker_threads = 2)]
+async fn runs_that_are_newer_than_the_backup_go_on_from_their_rows() {
+    let world = World::new().await;
+    let tables = ["newer-rows", "newer-local-rows"].map(|name| world.aws.name(name));
+    boards(&world, &tables).await;
     let controller = world.controller();
     let (pk, name) = world.submit("lb", 1).await;
     local_submission(&world, LOCAL_RUNNING).await;
@@ -122,12 +138,6 @@ async fn runs_that_are_newer_than_the_backup_go_on_from_their_rows() {
 
     let _controller = world.controller();
     for name in [name.as_str(), LOCAL_RUNNING] {
-        let is_there = |job: Option<&Job>| job.is_some();
-        let job = format!("{name}-2");
-        let made = await_condition(world.api::<Job>(), &job, is_there);
-        let made = tokio::time::timeout(super::super::bridge::LIMIT, made).await;
-        made.expect("its second attempt has a Job").unwrap();
-        let status = world.api::<Submission>().get(name).await.unwrap().status.unwrap();
-        assert!(status.plan.unwrap().resume, "{name} takes up what is stored");
+        goes_on(&world, name).await;
     }
 }

@@ -6,6 +6,7 @@ use tokio::io::{AsyncReadExt, AsyncWriteExt};
 use tokio::net::TcpListener;
 
 use super::super::request::Purpose;
+use super::tests::over_network;
 use super::*;
 
 /// A server that gives each connection the same beginning of an answer, then the filling until the other side hangs up.
@@ -60,7 +61,7 @@ fn list() -> Request {
 }
 
 async fn send(server: &Server, request: &Request) -> Reply {
-    let client = Client::new(&server.url, Timeouts::default()).unwrap();
+    let client = over_network(&server.url);
     client.send(&Token::parse("the-token").unwrap(), request).await
 }
 

@@ -8,6 +8,8 @@ use tokio::io::{AsyncReadExt, AsyncWriteExt};
 use tokio::net::TcpListener;
 
 use super::*;
+use crate::network::Network;
+use crate::reach::Reach;
 
 const FILE: &str = r#"{"submitted_image_uri": "registry.example/agent:1"}"#;
 
@@ -59,8 +61,9 @@ impl Server {
 }
 
 async fn read_as(server: &str, url: &str) -> Answer<ImageAnswer> {
-    let files = Files::new(server, Timeouts::default(), Reach::of(is_internet)).unwrap();
-    files.image(url).await
+    let timeouts = Timeouts::default();
+    let network = Network::new(server, timeouts, Reach::of(is_internet)).unwrap();
+    Files::new(Arc::new(network), timeouts).image(url).await
 }
 
 fn named() -> Answer<ImageAnswer> {

@@ -1,3 +1,4 @@
+mod drain;
 mod tokens;
 
 use super::*;
@@ -54,6 +55,20 @@ async fn the_task_of_each_token_is_one_of_the_process() {
         "{failed}"
     );
     assert!(!hub.drain().await, "a write of it may have no answer");
+}
+
+#[tokio::test(start_paused = true)]
+async fn people_read_when_writes_begin_by_the_clock_of_the_process() {
+    let (_stop, signal) = Stop::new();
+    let wait = Duration::from_secs(75);
+    let hub = Hub::new(Options {
+        clock: Clock::system().with_wall(|| Timestamp::UNIX_EPOCH),
+        not_before: Instant::now() + wait,
+        ..Options::unheard(&Tasks::new(signal), || true)
+    });
+    assert_eq!(hub.writes_from(), Some(Timestamp::UNIX_EPOCH + wait));
+    tokio::time::advance(wait).await;
+    assert_eq!(hub.writes_from(), None);
 }
 
 #[test]

@@ -28,13 +28,21 @@ fn ended(reason: &str) -> Value {
     json!([{"type": "Finished", "status": "True", "reason": reason, "message": "", "lastTransitionTime": time}])
 }
 
+/// Each case has a name, a change, and the urgency of that change, of an answer, and of news of EvalAI.
+fn assert_urgency<const N: usize>(cases: [(&str, Value, [Class; 3]); N]) {
+    for (what, change, expected) in cases {
+        let object = submission(&change);
+        let found = [of_submission(&object), of_answer(&object), of_evalai(&object)];
+        assert_eq!(found, expected, "{what}");
+    }
+}
+
 #[test]
-fn a_submission_is_as_urgent_as_what_it_shows() {
+fn a_live_submission_is_as_urgent_as_what_it_shows() {
     use Class::{New, Refresh, Urgent};
     let time = "2026-01-01T00:00:00Z";
     let failure = json!({"class": "Participant", "reason": "AgentCrashed", "message": "m"});
-    // A name, a change, and the urgency of that change, of an answer, and of news of EvalAI.
-    for (what, change, expected) in [
+    assert_urgency([
         ("just created", json!({}), [New, New, New]),
         ("accepted", json!({"status": {"attempt": 1}}), [New, New, New]),
         (
@@ -64,6 +72,13 @@ fn a_submission_is_as_urgent_as_what_it_shows() {
             json!({"status": {"jobName": "j", "failure": failure}}),
             [Urgent; 3],
         ),
+    ]);
+}
+
+#[test]
+fn the_answers_about_an_end_are_urgent() {
+    use Class::{New, Refresh, Urgent};
+    assert_urgency([
         (
             "ended",
             json!({"status": {"attempt": 1, "jobName": "j", "conditions": finished()}}),
@@ -84,11 +99,7 @@ fn a_submission_is_as_urgent_as_what_it_shows() {
             json!({"spec": {"attempt": 2}, "status": {"attempt": 1, "jobName": "j", "conditions": finished()}}),
             [Refresh, Urgent, Urgent],
         ),
-    ] {
-        let object = submission(&change);
-        let found = [of_submission(&object), of_answer(&object), of_evalai(&object)];
-        assert_eq!(found, expected, "{what}");
-    }
+    ]);
 }
 
 #[test]

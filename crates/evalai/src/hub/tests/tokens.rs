@@ -103,7 +103,7 @@ fn token(signature: &str) -> String {
     )
 }
 
-fn board(server: &str, namespace: &str, challenge: i64, token: &str) -> Target {
+pub(super) fn board(server: &str, namespace: &str, challenge: i64, token: &str) -> Target {
     let uid = format!("board-{namespace}-{challenge}");
     Target {
         leaderboard: Key {
@@ -137,7 +137,7 @@ fn subject(target: &Target) -> Subject {
     }
 }
 
-fn cancelled(target: &Target, hub: &Hub) {
+pub(super) fn cancelled(target: &Target, hub: &Hub) {
     let publisher = Publisher::of(subject(target)).unwrap();
     let end = DesiredUpdate::Final(Outcome::Cancelled, Arc::new(Outline::default()));
     hub.update(&publisher, end).unwrap();
