@@ -34,9 +34,9 @@ use leaderboard_base::tasks::Tasks;
 use leaderboard_contract::report::ContentId;
 use leaderboard_evalai::token::Token;
 use leaderboard_evalai::{
-    Changed, DesiredUpdate, Ended, Hub, ImageAnswer, Key, Metrics, Misfit, Network, Options, Outcome, Outline, Patience,
-    Payload, Progress, Publisher, Run, Status, StoredResult, Subject, SubmissionState, SweepRow, Target, Timeouts,
-    Timing,
+    Changed, DesiredUpdate, Ended, Hub, ImageAnswer, Key, Metrics, Misfit, Network, Options, Outcome, Outline,
+    Patience, Payload, Progress, Publisher, Run, Status, StoredResult, Subject, SubmissionState, SweepRow, Target,
+    Timeouts, Timing,
 };
 
 /// A stand-in, a hub that speaks to it, and what the controller would hold.
@@ -292,7 +292,10 @@ fn run(pk: i64, attempt: i64) -> Run {
 
 /// Results whose bucket holds this score for each label.
 fn results(target: &Target, score: f64) -> Arc<Outline> {
-    let accuracies: BTreeMap<_, _> = target.labels.iter().map(|label| (label.clone(), score)).collect();
+    let Metrics::Fixed(labels) = &target.metrics else {
+        panic!("the target of these tests names its labels")
+    };
+    let accuracies: BTreeMap<_, _> = labels.iter().map(|label| (label.clone(), score)).collect();
     let result = json!([{"split": "leaderboard", "show_to_participant": true, "accuracies": accuracies}]);
     Arc::new(Outline {
         phase: 1,
@@ -422,7 +425,7 @@ async fn a_leaderboard_is_compared_with_its_challenge() {
     assert_eq!(labels.problems, []);
     let wrong = Target {
         phases: [1, 3].into(),
-        labels: ["Driving score".to_owned(), "Bogus".to_owned()].into(),
+        metrics: Metrics::Fixed(["Driving score".to_owned(), "Bogus".to_owned()].into()),
         ..world.target.clone()
     };
     world.hub.serve(&leaderboard(), &wrong).unwrap();

@@ -5,6 +5,7 @@ mod archives;
 mod checksums;
 mod cloudwatch;
 mod endpoints;
+mod evaluators;
 mod hostile;
 mod limits;
 mod measure;
@@ -186,7 +187,7 @@ impl Pod {
 
     fn uploader(&self) -> Uploader {
         let tree = Arc::new(Tree::open(self.logs()).unwrap());
-        Uploader::new(self.archive.clone(), tree, Quota::new(LIMIT, 2))
+        Uploader::new(self.archive.clone(), tree, Quota::new(LIMIT, 2, Host::Simulator))
     }
 
     /// Starts logcopy.

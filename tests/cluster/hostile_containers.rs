@@ -9,7 +9,7 @@ use futures::FutureExt;
 use leaderboard_api::Submission;
 use serde_json::{Value, json};
 
-use super::containers::{GUESSES, assert_own_words, game, submit};
+use super::containers::{assert_own_words, game, submit};
 use super::matrix::{Case, together};
 use crate::operator::controller;
 use crate::scene::{Scene, lay_over, scenario, score};

@@ -6,8 +6,8 @@ use k8s_openapi::api::core::v1::ResourceRequirements;
 
 use super::leaderboard_parts::{Deadlines, Evaluation, S3Bucket, Track, TrackContainer};
 use super::{
-    Carla, CarlaPlan, ContainerEvaluation, ContainerPlan, LeaderboardSpec, LeaderboardVersion, PlannedEvaluation, RouteSlice, RunId, RunPlan,
-    TrackEvaluator,
+    Carla, CarlaPlan, ContainerEvaluation, ContainerPlan, LeaderboardSpec, LeaderboardVersion, PlannedEvaluation,
+    RouteSlice, RunId, RunPlan, TrackEvaluator,
 };
 
 /// How many routes one track of the CARLA Leaderboard runs, and in how many pairs.

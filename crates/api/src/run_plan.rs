@@ -69,7 +69,8 @@ impl RunPlan {
                 container.image = now.image.as_str().into();
             }
             // The kind of a Leaderboard is immutable.
-            (PlannedEvaluation::Carla(_), Evaluation::Container(_)) | (PlannedEvaluation::Container(_), Evaluation::Carla(_)) => {}
+            (PlannedEvaluation::Carla(_), Evaluation::Container(_))
+            | (PlannedEvaluation::Container(_), Evaluation::Carla(_)) => {}
         }
         self
     }

@@ -9,8 +9,8 @@ use serde::{Deserialize, Serialize};
 
 use super::attempt::Attempt;
 use super::carla::CarlaPlan;
-use super::container::ContainerPlan;
 use super::conditions::Condition;
+use super::container::ContainerPlan;
 use super::failed_node::{FailedNode, MAX_FAILED_NODES};
 use super::leaderboard_parts::Storage;
 use super::progress::{MAX_METRICS, Metric, Progress, Score};

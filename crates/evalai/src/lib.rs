@@ -37,6 +37,6 @@ pub use queue::Timing;
 pub use row::Row;
 pub use transport::{Body, ClientError, Connect, Failure, Timeouts, Transport};
 pub use types::{
-    Changed, DesiredUpdate, Ended, ImageAnswer, InboxTrouble, Key, Metrics, Outline, Payload, PayloadProblem, PayloadReader,
-    Publisher, Run, StoredResult, Subject, SubmissionState, SweepRow, Swept, Target, Usage, WriteGuard,
+    Changed, DesiredUpdate, Ended, ImageAnswer, InboxTrouble, Key, Metrics, Outline, Payload, PayloadProblem,
+    PayloadReader, Publisher, Run, StoredResult, Subject, SubmissionState, SweepRow, Swept, Target, Usage, WriteGuard,
 };

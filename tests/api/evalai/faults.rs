@@ -119,7 +119,7 @@ async fn a_refused_end_shows_why() {
     let mut world = World::new().await;
     let pk = world.submit();
     let mut target = world.target.clone();
-    target.labels = ["Bogus".to_owned()].into();
+    target.metrics = Metrics::Fixed(["Bogus".to_owned()].into());
     world.target = target;
     world.finish(pk);
     let Ended::Refused(why) = world.ended(pk).await else {

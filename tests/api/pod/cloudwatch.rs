@@ -23,7 +23,14 @@ fn shipper(pod: &Pod, a_day: u64) -> ship::Shipper {
     let client = LogClient::of_group(&pod.aws, pod.setting.run.log_group().unwrap());
     let tree = Arc::new(Tree::open(pod.logs()).unwrap());
     let memory = pod.uploader().memory().clone();
-    ship::Shipper::new(client, tree, &"77".parse().unwrap(), 2, &memory, a_day)
+    ship::Shipper::new(
+        client,
+        tree,
+        &"77".parse().unwrap(),
+        (2, Host::Simulator),
+        &memory,
+        a_day,
+    )
 }
 
 #[tokio::test]

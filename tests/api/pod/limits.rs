@@ -85,7 +85,7 @@ async fn an_agent_that_fills_everything_hides_no_log() {
         pod.put(&format!("agent/agent1/{number}"), &noise(MIB / 4, number));
     }
     let first = "agent/agent1/leaderboard.log";
-    let logs: Vec<String> = known_logs(2).filter(|log| log != first).collect();
+    let logs: Vec<String> = known_logs(2, Host::Simulator).filter(|log| log != first).collect();
     let others = logs.iter().map(String::as_str).chain(["simulator/Logs/CarlaUE4.log"]);
     let others: Vec<&str> = others.collect();
     for log in &others {
@@ -141,7 +141,7 @@ async fn what_has_sent_enough_today_waits_for_the_end_also_after_a_restart() {
     const LOG: &str = "agent/agent1/leaderboard.log";
     let pod = Pod::new().await;
     let tree = Arc::new(Tree::open(pod.logs()).unwrap());
-    let mut quota = Quota::new(LIMIT, 2);
+    let mut quota = Quota::new(LIMIT, 2, Host::Simulator);
     quota.files_a_day.requests = 3;
     let uploader = || Uploader::new(pod.archive.clone(), Arc::clone(&tree), quota.clone());
     let mut first = uploader();

@@ -83,7 +83,11 @@ async fn a_log_that_was_written_anew_is_stored_anew() {
 async fn the_limit_leaves_files_out_and_keeps_the_rest() {
     let pod = Pod::new().await;
     let tree = Arc::new(Tree::open(pod.logs()).unwrap());
-    let mut uploader = Uploader::new(pod.archive.clone(), Arc::clone(&tree), Quota::new(8 * LEAST, 1));
+    let mut uploader = Uploader::new(
+        pod.archive.clone(),
+        Arc::clone(&tree),
+        Quota::new(8 * LEAST, 1, Host::Simulator),
+    );
     // Three quarters are for all but the known logs, and a small file counts as a page.
     pod.put("simulator/large", &vec![0; 6 * PAGE]);
     pod.put("simulator/small", &[0; 20]);
@@ -99,7 +103,11 @@ async fn the_limit_leaves_files_out_and_keeps_the_rest() {
 async fn a_file_that_grows_after_it_was_counted_is_sent_as_far_as_it_was_counted() {
     let pod = Pod::new().await;
     let tree = Arc::new(Tree::open(pod.logs()).unwrap());
-    let mut uploader = Uploader::new(pod.archive.clone(), Arc::clone(&tree), Quota::new(2 * LEAST, 1));
+    let mut uploader = Uploader::new(
+        pod.archive.clone(),
+        Arc::clone(&tree),
+        Quota::new(2 * LEAST, 1, Host::Simulator),
+    );
     let path = "agent/agent1/x.log";
     pod.put(path, b"0123456789");
     let counted = Wanted::new(path, tree.file(path).unwrap().unwrap().1, Haste::Now);
@@ -121,7 +129,11 @@ async fn a_file_that_grows_after_it_was_counted_is_sent_as_far_as_it_was_counted
 async fn two_files_under_one_key_are_stored_once_and_counted_once() {
     let pod = Pod::new().await;
     let tree = Arc::new(Tree::open(pod.logs()).unwrap());
-    let mut uploader = Uploader::new(pod.archive.clone(), Arc::clone(&tree), Quota::new(8 * LEAST, 1));
+    let mut uploader = Uploader::new(
+        pod.archive.clone(),
+        Arc::clone(&tree),
+        Quota::new(8 * LEAST, 1, Host::Simulator),
+    );
     let both = |first: &[u8], second: &[u8]| {
         pod.put("agent/agent1/first", first);
         pod.put("agent/agent1/second", second);

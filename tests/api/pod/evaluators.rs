@@ -1,0 +1,131 @@
+//! The Pod of a host's own evaluators: what it stores, reports and takes up.
+
+use leaderboard_contract::report::Outcome;
+use leaderboard_evaluation::fixtures::{container_run, put_result, result};
+
+use super::*;
+
+const EVALUATOR: Side = Side::Host(Host::Evaluator);
+
+/// Two workers.
+async fn evaluated() -> Pod {
+    let bucket = server().await.bucket().await;
+    let mut run = run(&bucket);
+    run.plan.evaluation = container_run().plan.evaluation;
+    let pod = Pod::on(&server().await.endpoint(), &bucket, run).await;
+    pod.prepare().await.unwrap();
+    pod
+}
+
+/// Both workers come to their end with these results.
+async fn ended(results: [&str; 2]) -> Report {
+    let pod = evaluated().await;
+    let logcopy = pod.logcopy();
+    pod.reported(|report| report.round >= 1).await;
+    for (worker, text) in (1..).zip(results) {
+        put_result(pod.logs(), worker, text);
+        pod.mark(EVALUATOR, u16::try_from(worker).unwrap(), Mark::Done);
+    }
+    pod.until_has(StatusFile::Stored).await;
+    logcopy.end().await;
+    pod.report().await.unwrap()
+}
+
+#[tokio::test]
+async fn a_whole_run_of_evaluators_ends_with_the_final_report_and_all_of_their_files() {
+    let pod = evaluated().await;
+    let logcopy = pod.logcopy();
+    pod.reported(|report| report.round >= 1).await;
+    for worker in [1, 2] {
+        pod.mark(EVALUATOR, worker, Mark::Start(0));
+        pod.mark(Side::Agent, worker, Mark::Start(0));
+    }
+    pod.append("evaluators/1/console.log", b"one\n");
+    pod.append("evaluators/2/episodes/1.json", b"{}");
+    put_result(pod.logs(), 1, &result(1, 2, 0.5));
+    let report = pod.reported(|report| report.done == 1).await;
+    let score = |report: &Report| {
+        report
+            .score
+            .as_ref()
+            .map(|score| (score.name.clone(), score.value.clone()))
+    };
+    let accuracy = |value: &str| Some(("accuracy".to_owned(), value.to_owned()));
+    assert_eq!(
+        (score(&report), report.is_final, report.unit.as_str()),
+        (accuracy("0.5"), false, "units")
+    );
+    let so_far = r#"[{"split":"test","show_to_participant":true,"accuracies":{"accuracy":0.5}}]"#;
+    assert_eq!(
+        (report.results.as_str(), report.partial_results.as_deref()),
+        ("[]", Some(so_far))
+    );
+    put_result(pod.logs(), 1, &result(2, 2, 1.0));
+    put_result(pod.logs(), 2, &result(2, 2, 0.25));
+    for worker in [1, 2] {
+        pod.mark(Side::Agent, worker, Mark::Done);
+        pod.mark(EVALUATOR, worker, Mark::Done);
+    }
+    pod.until_has(StatusFile::Stored).await;
+    let report = pod.report().await.unwrap();
+    assert!(report.is_final && report.eligible && report.refused.is_none() && report.unusable.is_none());
+    assert_eq!((report.done, report.total, report.outcome), (4, 4, Outcome::Finished));
+    assert_eq!(score(&report), accuracy("0.625"));
+    let stored = pod.stored("evalai/results.json").await.unwrap();
+    assert_eq!(stored, report.results.as_bytes());
+    logcopy.end().await;
+    let keys = pod.keys().await;
+    for key in [
+        "containers-status/evaluator-1.done",
+        "containers-status/agent-2.done",
+        "evaluators/1/console.log",
+        "evaluators/1/result.json",
+        "evaluators/2/episodes/1.json",
+        "evaluators/2/result.json",
+    ] {
+        assert!(keys.iter().any(|known| known == key), "{key}: {keys:?}");
+    }
+}
+
+#[tokio::test]
+async fn a_replaced_pod_gives_each_evaluator_its_own_files_back() {
+    let lost = evaluated().await;
+    let good = result(1, 2, 0.5);
+    for (key, bytes) in [
+        ("evaluators/1/result.json", good.as_bytes()),
+        ("evaluators/2/episodes/1.json", b"{}"),
+        ("evaluators/3/result.json", b"of another plan"),
+        ("evaluators/../escaped", b"x"),
+    ] {
+        lost.archive.put(key, bytes.to_vec()).await.unwrap();
+    }
+    let next = lost.replaced("pod-2").await;
+    next.prepare().await.unwrap();
+    let read = |path: &str| fs::read(next.path(path)).unwrap();
+    assert_eq!(read("evaluators/1/result.json"), good.as_bytes());
+    assert_eq!(read("evaluators/2/episodes/1.json"), b"{}");
+    assert!(!next.path("evaluators/3").exists() && !next.path("escaped").exists());
+}
+
+#[tokio::test]
+async fn results_that_no_reader_takes_are_the_hosts_fault_and_refused_ones_the_participants() {
+    let good = result(2, 2, 0.5);
+    let broken = ended([&good, r#"{"schema": 1, "done": 3, "total": 2}"#]).await;
+    assert!(
+        broken.is_final && !broken.eligible && broken.refused.is_none(),
+        "{broken:?}"
+    );
+    assert_eq!(broken.unusable.and_then(|unusable| unusable.worker), Some(2));
+    let refusal =
+        r#"{"schema": 1, "done": 0, "total": 2, "final": false, "splits": [], "refused": "It never answered."}"#;
+    let refused = ended([&good, refusal]).await;
+    assert!(
+        refused.is_final && !refused.eligible && refused.unusable.is_none(),
+        "{refused:?}"
+    );
+    let why = refused.refused.unwrap();
+    assert!(
+        why.worker == Some(2) && why.why.contains("It never answered."),
+        "{why:?}"
+    );
+}
