@@ -44,7 +44,7 @@ pub type Body = BoxStream<'static, Result<Bytes, Silence>>;
 
 /// Carries requests to one server of EvalAI, and to wherever the files of its participants are.
 pub trait Transport: Send + Sync {
-    /// Sends a request once, and follows no redirect. It may take for ever, and so may the body: the caller limits both.
+    /// Sends a request once, and follows no redirect. Neither the answer nor its body need ever end: the caller limits both.
     fn send(&self, request: Request<Bytes>) -> BoxFuture<'static, Result<Response<Body>, Failure>>;
 }
 

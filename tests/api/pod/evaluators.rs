@@ -110,7 +110,7 @@ async fn a_replaced_pod_gives_each_evaluator_its_own_files_back() {
 #[tokio::test]
 async fn results_that_no_reader_takes_are_the_hosts_fault_and_refused_ones_the_participants() {
     let good = result(2, 2, 0.5);
-    let broken = ended([&good, r#"{"schema": 1, "done": 3, "total": 2}"#]).await;
+    let broken = Box::pin(ended([&good, r#"{"schema": 1, "done": 3, "total": 2}"#])).await;
     assert!(
         broken.is_final && !broken.eligible && broken.refused.is_none(),
         "{broken:?}"
@@ -118,7 +118,7 @@ async fn results_that_no_reader_takes_are_the_hosts_fault_and_refused_ones_the_p
     assert_eq!(broken.unusable.and_then(|unusable| unusable.worker), Some(2));
     let refusal =
         r#"{"schema": 1, "done": 0, "total": 2, "final": false, "splits": [], "refused": "It never answered."}"#;
-    let refused = ended([&good, refusal]).await;
+    let refused = Box::pin(ended([&good, refusal])).await;
     assert!(
         refused.is_final && !refused.eligible && refused.unusable.is_none(),
         "{refused:?}"

@@ -214,7 +214,7 @@ mod tests {
     }
 
     #[test]
-    fn without_a_port_the_agent_is_told_no_address() {
+    fn without_a_port_the_agent_gets_no_address() {
         let Workload { host, agent } = of_second_worker(&spec(None), false).unwrap();
         assert!(!host.flags.iter().any(|flag| flag.starts_with("--port")));
         assert_eq!((value(&host, ADDRESS), value(&agent.unwrap(), ADDRESS)), (None, None));

@@ -295,7 +295,7 @@ fn results_that_do_not_fit_together_end_the_run_when_all_are_done() {
 /// A name, and how it is made.
 type Place<'a> = (&'a str, &'a dyn Fn(&Path) -> io::Result<()>);
 
-/// Each in place of the result: none is followed, opened for ever, or read whole.
+/// Each in place of the result: none is followed or read whole, and no open waits without an end.
 #[test]
 fn only_a_regular_file_of_few_bytes_is_read() {
     let outside = tempfile::NamedTempFile::new().unwrap();

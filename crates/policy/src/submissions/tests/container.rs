@@ -104,7 +104,7 @@ fn speaks_of_no_other_kind(plan: &Plan) {
     }
 }
 
-/// Its Job is over with this report, and no retry is left.
+/// The Job is over with this report, and no retry is left.
 #[track_caller]
 fn ends_with(report: Report, state: State, reason: Reason) -> Plan {
     let mut world = under_way();
