@@ -17,6 +17,7 @@ pub mod leaderboards;
 pub mod metrics;
 pub mod observability;
 pub mod page;
+mod revision;
 pub mod runtime;
 pub mod slots;
 pub mod submissions;

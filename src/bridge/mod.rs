@@ -5,7 +5,6 @@
 //! sweep.
 
 mod dead_letter;
-pub mod leaderboards;
 pub mod queue;
 mod sqs;
 
@@ -15,22 +14,16 @@ use kube::Client;
 use kube::runtime::events::{Recorder, Reporter};
 use kube::runtime::watcher::Config;
 
-use crate::intake::pollers::{Problems, Shared, follow};
-use crate::kubernetes::{Clients, Namespaces, Shape, spawn_watch};
+pub use crate::intake::leaderboards::Scope;
+use crate::intake::pollers::follow;
+use crate::intake::shared::{Problems, Shared};
+use crate::kubernetes::{Clients, Shape, spawn_watch};
 use crate::observability::Observability;
 use leaderboard_api::{GROUP, Leaderboard};
 use leaderboard_aws::clients::Aws;
 use leaderboard_base::tasks::TaskFailed;
-use leaderboard_policy::allowed::Allowed;
 use leaderboard_policy::intake::route;
 use sqs::{Connection, Pulse, SqsQueue, desired};
-
-/// Which Leaderboards are served, and which queues they may name.
-#[derive(Clone, Debug)]
-pub struct Scope {
-    pub namespaces: Namespaces,
-    pub allowed: Allowed,
-}
 
 /// Writes events for a program.
 pub fn events(client: &Client, program: &str) -> Recorder {

@@ -12,8 +12,10 @@ use tower_test::mock::{Handle, pair};
 
 use super::sqs::{PULSE_AGE, PULSE_LIMIT};
 use super::*;
+use crate::kubernetes::Namespaces;
 use crate::metrics::Program;
 use leaderboard_base::shutdown::Stop;
+use leaderboard_policy::allowed::Allowed;
 use leaderboard_policy::intake::fixtures::{board, with_queue};
 
 type Server = Handle<Request<Body>, Response<Body>>;

@@ -15,8 +15,8 @@ use std::sync::LazyLock;
 
 use clap::{Args, Parser, Subcommand};
 
-use crate::observability::REVISION;
 use crate::observability::logging::Format;
+use crate::revision::REVISION;
 use crate::runtime::leader::{self, Identity};
 use leaderboard_aws::clients as aws;
 use leaderboard_policy::allowed::Allowed;

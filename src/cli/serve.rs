@@ -12,12 +12,13 @@ use super::{Controller, InPod, Server};
 use crate::bridge;
 use crate::kubernetes::{Clients, Namespaces, watch_client};
 use crate::metrics::Program;
+use crate::observability::Observability;
 use crate::observability::health::HealthServer;
 use crate::observability::logging::{self, Format};
 #[cfg(feature = "otel")]
 use crate::observability::traces::otlp;
-use crate::observability::{Observability, REVISION};
 use crate::page::Page;
+use crate::revision::REVISION;
 use crate::runtime as run;
 use crate::runtime::leader::{self, Identity};
 use crate::runtime::settings::Settings;

@@ -11,7 +11,8 @@ use std::time::Duration;
 use jiff::Timestamp;
 use tokio::time::{Instant, sleep};
 
-use crate::intake::pollers::{Shared, follow};
+use crate::intake::pollers::follow;
+use crate::intake::shared::Shared;
 use crate::intake::source::{Received, SetAside, Source, named};
 use crate::leaderboards::operator;
 use crate::runtime::objects::key_of;

@@ -3,7 +3,9 @@
 pub mod ages;
 pub mod inbox;
 pub mod ingest;
+pub mod leaderboards;
 pub mod poller;
 pub mod pollers;
+pub mod shared;
 pub mod source;
 pub mod sweep;

@@ -15,9 +15,9 @@ use tracing::Instrument;
 
 use super::ages::Ages;
 use super::ingest::{self, Incoming, IngestError};
-use super::pollers::Shared;
+use super::leaderboards::Leaderboards;
+use super::shared::Shared;
 use super::source::{Received, Source, named};
-use crate::bridge::leaderboards::Leaderboards;
 use crate::kubernetes::call_within;
 use leaderboard_api::text::one_line;
 use leaderboard_api::{Leaderboard, Reason};

@@ -22,7 +22,7 @@ pub use prometheus_client::metrics::histogram::Histogram;
 use prometheus_client::metrics::info::Info;
 use prometheus_client::registry::Registry;
 
-use crate::observability::REVISION;
+use crate::revision::REVISION;
 use families::{Counters, Families, Gauges, Timings};
 use leader::{Leader, Samples};
 use leaderboard_base::clock::Clock;

@@ -20,12 +20,6 @@ use liveness::Liveness;
 use readiness::Readiness;
 use traces::Traces;
 
-/// The commit that was built; empty where the build was given none.
-pub const REVISION: &str = match option_env!("LEADERBOARD_REVISION") {
-    Some(revision) => revision,
-    None => "",
-};
-
 /// The parts that every task of a process gets: the time, its metrics, the checks of its health, and the signal to end.
 #[derive(Clone, Debug)]
 pub struct Observability {

@@ -34,7 +34,7 @@ use super::leaderboards::state::LeaderboardState;
 use super::leaderboards::{isolation, operator};
 use super::slots::Slots;
 use crate::bridge::{self, Scope};
-use crate::intake::pollers;
+use crate::intake::shared;
 use crate::kubernetes::objects::Event;
 use crate::kubernetes::preflight::{self, await_kinds};
 use crate::kubernetes::{Writer, spawn_uncached};
@@ -225,8 +225,8 @@ impl Parts {
     }
 
     /// Parts that take messages of EvalAI's queues in. A queue that cannot be read shows in its Leaderboards' `Ready`.
-    fn inbox(&self) -> Arc<pollers::Shared> {
-        Arc::new(pollers::Shared {
+    fn inbox(&self) -> Arc<shared::Shared> {
+        Arc::new(shared::Shared {
             client: self.client.clone(),
             scope: Scope {
                 namespaces: self.settings.namespaces.clone(),
@@ -235,7 +235,7 @@ impl Parts {
             leaderboards: self.watches.leaderboards.clone(),
             recorder: events(&self.client),
             telemetry: self.telemetry.clone(),
-            problems: pollers::Problems::new(Readiness::default()),
+            problems: shared::Problems::new(Readiness::default()),
         })
     }
 

@@ -9,10 +9,10 @@ use schemars::JsonSchema;
 use serde::{Deserialize, Serialize};
 
 use super::gpu::{Display, X11};
-use super::leaderboard_parts::TrackContainer;
 use super::route_slice::RouteSlice;
 pub use super::route_subset::RouteSubset;
 use super::shared_text::SharedText;
+use super::track_container::TrackContainer;
 
 /// A version of CARLA Leaderboard: it chooses the format of the checkpoints, the flags of the programs and some defaults.
 #[derive(Serialize, Deserialize, JsonSchema, Clone, Copy, Debug, PartialEq, Eq)]

@@ -9,10 +9,10 @@ use schemars::JsonSchema;
 use serde::{Deserialize, Serialize};
 
 use super::byte_quantity::ByteQuantity;
-use super::leaderboard_parts::TrackContainer;
+use super::order::Order;
 use super::progress::MAX_NAME;
 use super::shared_text::SharedText;
-use super::standings::Order;
+use super::track_container::TrackContainer;
 
 /// Ports of two evaluators of one Pod are so far apart.
 pub const PORT_STEP: i32 = 100;

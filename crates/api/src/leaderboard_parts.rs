@@ -22,6 +22,7 @@ pub use super::gpu::*;
 use super::image_pattern::ImagePattern;
 pub use super::leaderboard_network::*;
 pub use super::leaderboard_services::*;
+pub use super::track_container::TrackContainer;
 
 /// A kind of evaluation: exactly one of its members.
 #[derive(Serialize, Deserialize, JsonSchema, Clone, Debug, PartialEq)]
@@ -112,14 +113,6 @@ pub struct TrackDeadlines {
     #[serde(default, skip_serializing_if = "Option::is_none")]
     #[schemars(range(min = 1, max = 31_536_000))]
     pub run_seconds: Option<i64>,
-}
-
-/// What one track needs in place of the Leaderboard's.
-#[derive(Serialize, Deserialize, JsonSchema, Clone, Debug, Default, PartialEq)]
-pub struct TrackContainer {
-    /// Requests and limits, in place of all of the Leaderboard's.
-    #[serde(default, skip_serializing_if = "Option::is_none")]
-    pub resources: Option<ResourceRequirements>,
 }
 
 /// Image and settings that `kubectl leaderboard check` runs.

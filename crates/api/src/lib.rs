@@ -27,6 +27,7 @@ pub mod leaderboard_network;
 pub mod leaderboard_parts;
 pub mod leaderboard_services;
 pub mod names;
+mod order;
 mod progress;
 pub mod ranges;
 pub mod reasons;
@@ -43,6 +44,7 @@ pub mod submission_status;
 mod submission_use;
 mod team;
 pub mod text;
+mod track_container;
 mod waiting;
 mod worker_status;
 

@@ -12,6 +12,7 @@ use serde::{Deserialize, Serialize};
 
 use super::attempt::Attempt;
 use super::conditions;
+pub use super::order::Order;
 use super::progress::{MAX_NAME, Metric, Score};
 use super::reasons::Reason;
 use super::submission::Submission;
@@ -31,26 +32,6 @@ const MAX_NUMBER: usize = 33;
 /// Characters of the name of a Submission, and of its UID.
 const MAX_SUBMISSION: usize = 52;
 const MAX_UID: usize = 128;
-
-/// Direction in which a metric ranks.
-#[derive(Serialize, Deserialize, JsonSchema, Clone, Copy, Debug, Default, PartialEq, Eq, Hash)]
-pub enum Order {
-    /// The lowest value leads.
-    Ascending,
-    /// The highest value leads.
-    #[default]
-    Descending,
-}
-
-impl Order {
-    /// Its name in the status.
-    pub fn as_str(self) -> &'static str {
-        match self {
-            Self::Ascending => "Ascending",
-            Self::Descending => "Descending",
-        }
-    }
-}
 
 /// Metric that ranks the results of a track, and in which direction.
 #[derive(Serialize, Deserialize, JsonSchema, Clone, Debug, PartialEq, Eq, Hash)]

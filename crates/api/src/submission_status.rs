@@ -12,7 +12,7 @@ use super::carla::CarlaPlan;
 use super::conditions::Condition;
 use super::container::ContainerPlan;
 use super::failed_node::{FailedNode, MAX_FAILED_NODES};
-use super::leaderboard_parts::Storage;
+use super::leaderboard_services::Storage;
 use super::progress::{MAX_METRICS, Metric, Progress, Score};
 use super::reasons::ReasonName;
 use super::run_id::RunId;

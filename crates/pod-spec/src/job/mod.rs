@@ -8,6 +8,7 @@ mod failed_nodes;
 mod gpu;
 mod gpu_count;
 mod init;
+mod members;
 mod own_uid;
 mod security;
 mod volumes;
@@ -133,7 +134,7 @@ impl JobInput<'_> {
 /// survive there.
 pub fn build_object(input: &JobInput<'_>) -> DynamicObject {
     // Maps with text as keys and finite numbers always become JSON.
-    let workloads = workers::workloads(input);
+    let workloads = members::workloads(input);
     let mut spec = serde_json::to_value(ours(input, &workloads)).unwrap_or_default();
     let template = &mut spec["template"];
     pod_overlay::lay(template, input.spec(), input.kind());

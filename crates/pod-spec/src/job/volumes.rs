@@ -6,7 +6,7 @@ use k8s_openapi::api::core::v1::{
 };
 use k8s_openapi::apimachinery::pkg::api::resource::Quantity;
 
-use super::{JobInput, workers};
+use super::{JobInput, members};
 use crate::layout::{
     CONTENTS_LOG_FOLDER, IDENTITY_VOLUME, LOGS_VOLUME, PODINFO_VOLUME, SHM, SHM_VOLUME, STATUS, TOOLS_VOLUME,
 };
@@ -39,8 +39,8 @@ pub(super) fn all(input: &JobInput<'_>, workloads: &[Workload]) -> Vec<Volume> {
         podinfo(),
     ];
     let identity = input.spec().has_role().then(identity);
-    let shared = workers::members(input).filter_map(|member| {
-        let size = workers::role(workloads, member)?.shm?;
+    let shared = members::members(input).filter_map(|member| {
+        let size = members::role(workloads, member)?.shm?;
         Some(memory(member, size))
     });
     let all = contents.chain(own).chain(identity);

@@ -3,6 +3,7 @@
 use k8s_openapi::api::core::v1::{Container, EnvVar};
 use serde_json::Value;
 
+use super::members::{members, role};
 use super::security::context;
 use super::{JobInput, gpu, variable, volumes};
 use crate::gpu_claims::source;
@@ -10,30 +11,7 @@ use crate::layout::STATUS;
 use leaderboard_api::Part;
 use leaderboard_contract::run::{RUNNER, TOOLS};
 use leaderboard_evaluation::workload::{Role, Workload};
-use leaderboard_protocol::files::{Member, Pair, Side};
-
-/// Containers of all workers, in their order.
-pub(super) fn workloads(input: &JobInput<'_>) -> Vec<Workload> {
-    let (kind, asked) = (input.kind(), input.asked());
-    Pair::first(input.workers())
-        .filter_map(|worker| kind.workload(&asked, worker))
-        .collect()
-}
-
-/// The hosts' containers of all workers, then the agents'.
-pub(super) fn members(input: &JobInput<'_>) -> impl Iterator<Item = Member> {
-    let (host, workers) = (input.kind().host(), Pair::first(input.workers()));
-    let hosts = workers.clone().map(move |worker| worker.host(host));
-    hosts.chain(workers.map(Pair::agent))
-}
-
-pub(super) fn role(workloads: &[Workload], member: Member) -> Option<&Role> {
-    let workload = workloads.get(member.pair.index())?;
-    match member.side {
-        Side::Host(_) => Some(&workload.host),
-        Side::Agent => workload.agent.as_ref(),
-    }
-}
+use leaderboard_protocol::files::{Member, Side};
 
 pub(super) fn all(input: &JobInput<'_>, workloads: &[Workload]) -> Vec<Container> {
     members(input)

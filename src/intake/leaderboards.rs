@@ -1,14 +1,20 @@
-//! The Leaderboards as the bridge needs them: from the watch's cache, or read anew.
+//! The Leaderboards as the readers of queues need them: from the watch's cache, or read anew.
 
 use std::sync::Arc;
 
 use kube::Client;
 use kube::api::ListParams;
 
-use super::Scope;
-use crate::kubernetes::Watch;
+use crate::kubernetes::{Namespaces, Watch};
 use leaderboard_api::Leaderboard;
 use leaderboard_policy::allowed::Allowed;
+
+/// The Leaderboards that are served, and the queues that they may name.
+#[derive(Clone, Debug)]
+pub struct Scope {
+    pub namespaces: Namespaces,
+    pub allowed: Allowed,
+}
 
 /// The Leaderboards at one moment.
 #[derive(Clone, Debug)]
@@ -55,7 +61,6 @@ fn served(all: Vec<Arc<Leaderboard>>, allowed: &Allowed) -> Vec<Arc<Leaderboard>
 #[cfg(test)]
 mod tests {
     use super::*;
-    use crate::bridge::sqs::desired;
     use leaderboard_policy::intake::fixtures::{board, with_queue};
 
     #[test]
@@ -68,7 +73,8 @@ mod tests {
         };
         let urls = |allowed: &str| -> Vec<String> {
             let served = served(all(), &allowed.parse().unwrap());
-            desired(&served).into_keys().collect()
+            let queues = served.iter().filter_map(|leaderboard| leaderboard.spec.sqs());
+            queues.map(|queue| queue.url.clone()).collect()
         };
         assert_eq!(urls(""), ["https://q/ours", "https://q/theirs"]);
         let ours = r#"{"*": {"queues": ["ours"], "buckets": ["*"]}}"#;
