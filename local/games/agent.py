@@ -179,6 +179,14 @@ def provoke() -> None:
     play(session)
 
 
+def make_raise() -> None:
+    """Asks its evaluator to raise, in each life."""
+    begin()
+    with suppress(*BROKEN):
+        post("/raise")
+    signal.pause()
+
+
 def take_port() -> None:
     """As worker 2, makes its evaluator end once worker 1 is there; as worker 1, listens on that evaluator's port from then on."""
     if WORKER == 2:
@@ -210,6 +218,7 @@ KINDS = {
     "steal": steal,
     "other-worker": other_worker,
     "provoke": provoke,
+    "raise": make_raise,
     "take-port": take_port,
 }
 

@@ -136,7 +136,7 @@ fn without_score() -> Vec<Row> {
         hostile(
             "raise",
             "agent makes its evaluator raise, again and again",
-            "provoke",
+            "raise",
             evaluators,
         )
         .with(evaluator("none"))
