@@ -17,7 +17,7 @@ BENCH_FLAGS ?=
 help: ## Explain every target
 	@awk -F ':.*## ' '/^[a-z-]+:.*## / { printf "  %-14s %s\n", $$1, $$2 }' $(MAKEFILE_LIST)
 
-demo: ## Start everything on this machine, run one submission from SQS message to score, and check it (about 13 min the first time); REGISTRY=NAME: on the cluster of KUBECONFIG
+demo: ## Start everything on this machine, run one submission from SQS message to score, and check it (about 14 min the first time); REGISTRY=NAME: on the cluster of KUBECONFIG
 	$(LAB) demo $(if $(REGISTRY),--registry $(REGISTRY))
 
 test: ## Run all tests: formats, pure logic, API server, the real cluster (root, Linux; about 30 min the first time)
