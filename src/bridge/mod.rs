@@ -10,29 +10,18 @@ mod sqs;
 
 use std::sync::{Arc, Mutex};
 
-use kube::Client;
-use kube::runtime::events::{Recorder, Reporter};
 use kube::runtime::watcher::Config;
 
 pub use crate::intake::leaderboards::Scope;
 use crate::intake::pollers::follow;
 use crate::intake::shared::{Problems, Shared};
-use crate::kubernetes::{Clients, Shape, spawn_watch};
+use crate::kubernetes::{Clients, Shape, recorder, spawn_watch};
 use crate::observability::Observability;
-use leaderboard_api::{GROUP, Leaderboard};
+use leaderboard_api::Leaderboard;
 use leaderboard_aws::clients::Aws;
 use leaderboard_base::tasks::TaskFailed;
 use leaderboard_policy::intake::route;
 use sqs::{Connection, Pulse, SqsQueue, desired};
-
-/// Writes events for a program.
-pub fn events(client: &Client, program: &str) -> Recorder {
-    let reporter = Reporter {
-        controller: format!("{GROUP}/{program}"),
-        instance: std::env::var("POD_NAME").ok(),
-    };
-    Recorder::new(client.clone(), reporter)
-}
 
 fn shared(clients: Clients, scope: Scope, telemetry: Observability) -> Shared {
     let apis = scope.namespaces.apis(&clients.watch);
@@ -43,7 +32,7 @@ fn shared(clients: Clients, scope: Scope, telemetry: Observability) -> Shared {
     };
     Shared {
         leaderboards: spawn_watch(apis, Config::default(), shape, &telemetry),
-        recorder: events(&clients.api, "bridge"),
+        recorder: recorder(&clients.api, "bridge"),
         client: clients.api,
         scope,
         problems: Problems::new(telemetry.readiness.clone()),

@@ -3,6 +3,7 @@
 use std::time::Duration;
 
 use http::{Request, Response};
+use kube::Client;
 use kube::client::Body;
 use serde_json::{Value, json};
 use tokio::sync::watch;

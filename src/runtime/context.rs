@@ -61,6 +61,7 @@ impl Context {
 
     pub fn for_act(&self) -> act::Uses<'_> {
         act::Uses {
+            client: &self.client,
             writer: &self.writer,
             recorder: &self.recorder,
             settings: &self.settings,

@@ -33,16 +33,17 @@ use super::leaderboards::probe::Asks;
 use super::leaderboards::state::LeaderboardState;
 use super::leaderboards::{isolation, operator};
 use super::slots::Slots;
-use crate::bridge::{self, Scope};
+use crate::bridge::Scope;
 use crate::intake::shared;
 use crate::kubernetes::objects::Event;
 use crate::kubernetes::preflight::{self, await_kinds};
-use crate::kubernetes::{Writer, spawn_uncached};
+use crate::kubernetes::{Writer, recorder, spawn_uncached};
 use crate::observability::Observability;
 use crate::observability::readiness::Readiness;
 use crate::page::Page;
 use crate::runtime::objects::{Wake, by_key};
 use crate::runtime::settings::Settings;
+use crate::submissions::act::CONTROLLER;
 use crate::submissions::external::ExternalSystems;
 use crate::submissions::memory::Memory;
 use crate::submissions::observe::causes::{Causes, OF_JOBS, OF_PODS, Objects};
@@ -343,7 +344,7 @@ async fn end<T>(
 }
 
 fn events(client: &Client) -> Recorder {
-    bridge::events(client, "controller")
+    recorder(client, CONTROLLER)
 }
 
 /// Waits to become the leader. False if the stop comes before.

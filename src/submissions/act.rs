@@ -8,7 +8,7 @@ use std::time::Duration;
 use kube::api::{DeleteParams, Patch, PostParams, Preconditions};
 use kube::runtime::events::{Event as KubeEvent, EventType, Recorder};
 use kube::runtime::reflector::ObjectRef;
-use kube::{Resource, ResourceExt};
+use kube::{Client, Resource, ResourceExt};
 use serde_json::json;
 use tokio::time::Instant;
 
@@ -17,7 +17,7 @@ use super::memory::Memory;
 use super::observe::workers::Workers;
 use super::spans;
 use crate::kubernetes::objects::{Job, Meta, Pod};
-use crate::kubernetes::{CallError, Watchable, Writer, Writes, call, call_within};
+use crate::kubernetes::{CallError, Watchable, Writer, Writes, call, call_within, recorder};
 use crate::metrics::Metrics;
 use crate::observability::traces::Traces;
 use crate::runtime::objects::{key_of, log_span_of, uid};
@@ -34,13 +34,17 @@ use leaderboard_policy::phases::{self, Ended, Phase};
 use leaderboard_policy::submissions::{Action, Event, Plan, Question, StatusWrite, pinned};
 use leaderboard_policy::view::View;
 
+/// Name of the program in the events that it writes.
+pub const CONTROLLER: &str = "controller";
 /// Kubernetes refuses notes above 1 kB.
 const LONGEST_NOTE: usize = 900;
 
 /// The parts that carry a plan out.
 #[derive(Clone, Copy)]
 pub struct Uses<'a> {
+    pub client: &'a Client,
     pub writer: &'a Writer,
+    /// Writer of events that may repeat.
     pub recorder: &'a Recorder,
     pub settings: &'a Settings,
     pub stores: &'a Stores,
@@ -394,7 +398,9 @@ impl Actor<'_> {
             action: event.reason.as_str().to_owned(),
             secondary: None,
         };
-        let published = self.uses.recorder.publish(&note, &reference);
+        // Those of a good run do not repeat, and a recorder that is kept would hold each for minutes.
+        let fresh = (!event.warning).then(|| recorder(self.uses.client, CONTROLLER));
+        let published = fresh.as_ref().unwrap_or(self.uses.recorder).publish(&note, &reference);
         if let Err(error) = call("an event", &self.name(), published).await {
             tracing::warn!(reason = %event.reason, "{error}");
         }

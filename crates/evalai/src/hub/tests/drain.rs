@@ -29,7 +29,7 @@ fn server(writes_take: Option<Duration>, wrote: mpsc::UnboundedSender<()>) -> Ar
 
 #[tokio::test(start_paused = true)]
 async fn the_next_leader_may_write_at_once_only_if_the_last_write_was_answered() {
-    for (writes_take, took) in [(Some(Duration::from_secs(60)), 60), (None, 65)] {
+    for (writes_take, took) in [(Some(Duration::from_mins(1)), 60), (None, 65)] {
         let (wrote, mut written) = mpsc::unbounded_channel();
         let server = server(writes_take, wrote);
         let (_stop, signal) = Stop::new();
