@@ -37,7 +37,7 @@ pub struct ResultFile {
     pub total: u32,
     /// Nothing more comes, and no unit is missing.
     pub is_final: bool,
-    /// Whether the result counts.
+    /// True if the result counts.
     pub eligible: bool,
     /// In the order of the document; no two have one name.
     pub splits: Vec<Split>,
@@ -310,7 +310,7 @@ impl ResultFile {
         self.splits.iter().find(|split| split.name == name)
     }
 
-    /// Whether it has the score of a track, or may still get it.
+    /// An error unless it has the score of a track, or may still get it.
     pub fn check_score(&self, score: &ScoreMetric) -> Result<(), ResultError> {
         let (split, named) = match (&score.split, self.splits.as_slice()) {
             (None, all @ [_, _, ..]) => return Err(ResultError::SeveralSplits(all.len())),

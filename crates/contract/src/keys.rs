@@ -59,7 +59,7 @@ pub fn host_log_name(host: Host, pair: Pair) -> String {
     }
 }
 
-/// What the host's container of a pair has printed.
+/// The log of the host's container of a pair.
 pub fn host_log(host: Host, pair: Pair) -> String {
     format!("{}/{}", host_folder(host, pair), host_log_name(host, pair))
 }

@@ -1,8 +1,8 @@
 //! The results of all workers, read and merged round by round, whatever kind of evaluation they are of.
 //!
 //! Called by `logcopy` once a round. Reads the `logs` volume through [`Tree`] and writes nothing; knows no S3. Results that are torn,
-//! gone, refused or poorer leave the last good ones in place. What is to be stored is handed out from memory, so that no torn file and
-//! no full disk comes between the results and S3. [`Kind::limit`] bounds the memory.
+//! gone, refused or poorer leave the last good ones in place. These are handed out from memory to be stored, so that no torn file and no
+//! full disk comes between the results and S3. [`Kind::limit`] bounds the memory.
 
 use std::fmt::Debug;
 use std::path::PathBuf;
@@ -17,7 +17,7 @@ use leaderboard_protocol::files::{Host, Pair};
 use crate::judge::Ending;
 use crate::{Gathered, Object, Objects, Refused, Results, Summary, Texts, WorkerSeen};
 
-/// What a kind of evaluation knows of its results.
+/// A kind's own knowledge of its results.
 pub(crate) trait Kind: Debug + Send + Sized {
     /// The results of one worker, read and within bounds.
     type Found: Debug + Send;
@@ -27,7 +27,7 @@ pub(crate) trait Kind: Debug + Send + Sized {
     const FILE: &'static str;
     /// Next step after a file that is none.
     const NEXT_STEP: &'static str;
-    /// Whose fault it is that results can't be read, or are not complete.
+    /// The end that follows from results that can't be read, or are not complete.
     const FAULT: fn(RefusedResults) -> Ending;
 
     /// For a run whose plan holds.

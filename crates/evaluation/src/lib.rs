@@ -42,7 +42,7 @@ pub trait Evaluation {
     /// The numbers of a result, in EvalAI's order; empty where EvalAI's own labels are taken.
     fn columns(&self) -> Vec<Column>;
 
-    /// Whether a result's status shows the number of this name.
+    /// True if a result's status shows the number of this name.
     fn shows(&self, metric: &str) -> bool;
 
     /// The number that ranks a track, and its order, where EvalAI names none.
