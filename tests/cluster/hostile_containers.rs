@@ -165,7 +165,8 @@ fn without_score() -> Vec<Row> {
         )
         .with(evaluator("none"))
         .with(two_workers())
-        .with(json!({"retries": {"perWorker": 1}})),
+        // The other one has a moment for it after each of the first crashes.
+        .with(json!({"retries": {"perWorker": 2}})),
     ]
 }
 

@@ -38,7 +38,7 @@ fn check(terminal: &Terminal, arguments: &[&str]) -> Command {
 
 fn ended(reason: &str, changes: &Value) -> Value {
     let mut status = json!({
-        "state": "Finished", "attempt": 1, "reason": reason, "message": "It has ended.", "track": "sensors", "jobName": "a-1",
+        "state": "Finished", "attempt": 1, "reason": (reason != "Finished").then_some(reason), "message": "It has ended.", "track": "sensors", "jobName": "a-1",
         "resultsURL": "s3://results/check", "progress": {"done": 1, "total": 1, "unit": "routes", "text": "1/1"},
         "times": {"started": "2026-11-01T10:00:00Z", "finished": "2026-11-01T10:00:00Z"},
         "conditions": [condition("Accepted", "True", "Accepted"), condition("Finished", "True", reason),

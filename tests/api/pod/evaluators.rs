@@ -94,7 +94,6 @@ async fn a_replaced_pod_gives_each_evaluator_its_own_files_back() {
     for (key, bytes) in [
         ("evaluators/1/result.json", good.as_bytes()),
         ("evaluators/2/episodes/1.json", b"{}"),
-        ("evaluators/3/result.json", b"of another plan"),
         ("evaluators/../escaped", b"x"),
     ] {
         lost.archive.put(key, bytes.to_vec()).await.unwrap();
@@ -104,7 +103,7 @@ async fn a_replaced_pod_gives_each_evaluator_its_own_files_back() {
     let read = |path: &str| fs::read(next.path(path)).unwrap();
     assert_eq!(read("evaluators/1/result.json"), good.as_bytes());
     assert_eq!(read("evaluators/2/episodes/1.json"), b"{}");
-    assert!(!next.path("evaluators/3").exists() && !next.path("escaped").exists());
+    assert!(!next.path("escaped").exists());
 }
 
 #[tokio::test]

@@ -38,7 +38,8 @@ fn an_evaluator_and_its_agent_stand_behind_the_runner_with_their_own_words() {
         (evaluator.ready, evaluator.peer().to_string().as_str()),
         (seconds(60), "agent-2")
     );
-    assert_eq!(command, ["python3", "/evaluate.py", "--worker=2"]);
+    // The runner replaces it in each round.
+    assert_eq!(command, ["python3", "/evaluate.py", "--worker=$(WORKER)"]);
     assert_eq!(env["RESULTS"], "/results");
 
     let (words, mut env) = started(container(&job, "agent-2"), &[]);
@@ -51,7 +52,7 @@ fn an_evaluator_and_its_agent_stand_behind_the_runner_with_their_own_words() {
     };
     assert_eq!((agent.peer().to_string().as_str(), &agent.role), ("evaluator-2", &role));
     assert_eq!(agent.log_limit, 2_097_152);
-    assert_eq!(command, ["/agent", "127.0.0.1:9100"]);
+    assert_eq!(command, ["/agent", "$(EVALUATOR_ADDRESS)"]);
 }
 
 /// Containers of one Pod share its sandbox's memory, and agents could read there what an evaluator keeps from them.
