@@ -42,6 +42,7 @@ TOOLS = [
     "sha256sum",
     "sh",
     "shred",
+    "sleep",
     "touch",
     "tr",
 ]
