@@ -287,6 +287,8 @@ def manifests(repository: Path) -> list[Path]:
 def docker_faults(repository: Path, note: Note) -> Iterator[str]:
     """Targets that the file of a build lacks."""
     options = dict(zip(note.words, note.words[1:], strict=False))
-    file = repository / options.get("--file", "Dockerfile")
+    named = options.get("--file", "Dockerfile")
+    # The reader's own copy of an example.
+    file = repository / named.replace("my-challenge/", "examples/challenges/guessing-game/")
     if "--target" in options and f" AS {options['--target']}\n" not in file.read_text():
         yield f"{note}: {file.name} has no target {options['--target']}"
