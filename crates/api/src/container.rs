@@ -22,6 +22,22 @@ pub const PORT_STEP: i32 = 100;
 pub enum EvaluationMode {
     /// The evaluator and the agent run side by side in one Pod and talk over a port.
     Interactive,
+    /// One agent runs first and leaves files; the evaluators read them once it has ended.
+    Batch,
+    /// A submission is a file and no image: the evaluators read it.
+    Predictions,
+}
+
+impl EvaluationMode {
+    /// True if a submission is an image, whose agent runs.
+    pub const fn has_agent(self) -> bool {
+        !matches!(self, Self::Predictions)
+    }
+
+    /// True if the evaluators read files at `/input`.
+    pub const fn has_input(self) -> bool {
+        !matches!(self, Self::Interactive)
+    }
 }
 
 /// Treatment of the results of several workers.
@@ -39,7 +55,11 @@ pub enum MergeMethod {
 #[serde(rename_all = "camelCase")]
 #[x_kube(
     validation = Rule::new("quantity(string(self.shmSize)).compareTo(quantity('1Mi')) >= 0").message("evaluation.container.shmSize must be 1Mi or more"),
-    validation = Rule::new("quantity(string(self.shmSize)).compareTo(quantity('1Ti')) <= 0").message("evaluation.container.shmSize must be 1Ti or less")
+    validation = Rule::new("quantity(string(self.shmSize)).compareTo(quantity('1Ti')) <= 0").message("evaluation.container.shmSize must be 1Ti or less"),
+    validation = Rule::new("self.mode == oldSelf.mode").message("evaluation.container.mode is immutable: results of one mode cannot be compared with another's; make a new Leaderboard"),
+    validation = Rule::new("!has(self.port) || self.mode == 'Interactive'").message("evaluation.container.port is for Interactive: in other modes no agent talks to the evaluator; leave it out"),
+    validation = Rule::new("!has(self.input) || self.mode != 'Interactive'").message("evaluation.container.input is for Batch and Predictions: in Interactive the evaluator reads no files of the participant's; leave it out"),
+    validation = Rule::new("!has(self.datasetForAgent) || (has(self.dataset) && self.mode != 'Predictions')").message("evaluation.container.datasetForAgent needs a dataset and a mode with an agent; leave it out")
 )]
 pub struct ContainerEvaluation {
     /// Mode in which the evaluator and the participant's image meet.
@@ -75,16 +95,107 @@ pub struct ContainerEvaluation {
     /// Size of each evaluator's and each agent's `/dev/shm`, in memory: `1Mi` to `1Ti`. `agent.shmSize` takes its place for agents.
     #[serde(default = "defaults::shm_size")]
     pub shm_size: ByteQuantity,
-    /// Seconds from the regular end of an agent to the final result of its evaluator.
+    /// Seconds from the regular end of an agent to the final result of its evaluator; where no agent runs beside it, from its own start.
     #[serde(default = "defaults::answer_seconds")]
     #[schemars(range(min = 1, max = 31_536_000))]
     pub answer_seconds: i64,
     /// Treatment of the results of several workers.
     #[serde(default)]
     pub merge: MergeMethod,
+    /// Data of the challenge, read-only at `/dataset` in every evaluator, and in the agents as `datasetForAgent` says.
+    #[serde(default, skip_serializing_if = "Option::is_none")]
+    pub dataset: Option<DataSource>,
+    /// True if agents get the dataset, too. Absent: they do in Batch alone.
+    #[serde(default, skip_serializing_if = "Option::is_none")]
+    pub dataset_for_agent: Option<bool>,
+    /// Data that no agent ever gets, such as the right answers: read-only at `/labels` in every evaluator.
+    #[serde(default, skip_serializing_if = "Option::is_none")]
+    pub labels: Option<DataSource>,
+    /// Bounds of what a submission brings at `/input`, in Batch and Predictions.
+    #[serde(default, skip_serializing_if = "Option::is_none")]
+    pub input: Option<InputBounds>,
+}
+
+/// A source of read-only data: exactly one of its members.
+#[derive(Serialize, Deserialize, JsonSchema, Clone, Debug, PartialEq, Eq)]
+#[serde(rename_all = "camelCase")]
+pub enum DataSource {
+    /// A folder of an image, which each Pod copies before its work begins.
+    Image(DataImage),
+    /// A claim in the namespace of the Leaderboard.
+    PersistentVolumeClaim(DataClaim),
+}
+
+impl DataSource {
+    /// The image, if it is one.
+    pub fn image(&self) -> Option<&DataImage> {
+        match self {
+            Self::Image(image) => Some(image),
+            Self::PersistentVolumeClaim(_) => None,
+        }
+    }
+}
+
+/// A folder of an image. The image needs no shell and no program.
+#[derive(Serialize, Deserialize, JsonSchema, Clone, Debug, PartialEq, Eq)]
+pub struct DataImage {
+    /// The image.
+    #[schemars(length(min = 1, max = 512), regex(pattern = r"^[^\s]+$"))]
+    pub reference: String,
+    /// The folder in it.
+    #[serde(default = "defaults::data_path")]
+    #[schemars(length(min = 1, max = 512), regex(pattern = r"^/[^\s]*$"))]
+    pub path: String,
+}
+
+/// A claim whose volume is mounted read-only. Its access modes must let all Pods of submissions mount it: `ReadOnlyMany` or
+/// `ReadWriteMany`.
+#[derive(Serialize, Deserialize, JsonSchema, Clone, Debug, PartialEq, Eq)]
+#[serde(rename_all = "camelCase")]
+pub struct DataClaim {
+    /// Name of the claim.
+    #[schemars(length(min = 1, max = 253))]
+    pub claim_name: String,
+}
+
+/// Bounds of what a submission brings.
+#[derive(Serialize, Deserialize, KubeSchema, Clone, Debug, PartialEq, Eq)]
+#[serde(rename_all = "camelCase")]
+#[x_kube(
+    validation = Rule::new("quantity(string(self.maxBytes)).compareTo(quantity('1')) >= 0").message("evaluation.container.input.maxBytes must be 1 or more"),
+    validation = Rule::new("quantity(string(self.maxBytes)).compareTo(quantity('100Gi')) <= 0").message("evaluation.container.input.maxBytes must be 100Gi or less")
+)]
+pub struct InputBounds {
+    /// Most bytes of all files together.
+    #[serde(default = "defaults::max_bytes")]
+    pub max_bytes: ByteQuantity,
+    /// Most files. A submission to Predictions is one.
+    #[serde(default = "defaults::max_files")]
+    #[schemars(range(min = 1, max = 10_000))]
+    pub max_files: i32,
+}
+
+impl Default for InputBounds {
+    fn default() -> Self {
+        Self {
+            max_bytes: defaults::max_bytes(),
+            max_files: defaults::max_files(),
+        }
+    }
 }
 
 impl ContainerEvaluation {
+    /// True if an agent gets the dataset.
+    pub fn agent_has_dataset(&self) -> bool {
+        let usual = self.mode == EvaluationMode::Batch;
+        self.dataset.is_some() && self.mode.has_agent() && self.dataset_for_agent.unwrap_or(usual)
+    }
+
+    /// Bounds of what a submission brings.
+    pub fn input_bounds(&self) -> InputBounds {
+        self.input.clone().unwrap_or_default()
+    }
+
     /// The whole command of the evaluator.
     pub fn words(&self) -> Vec<String> {
         let arguments = self.args.iter().flatten();
@@ -108,7 +219,10 @@ pub struct TrackEvaluator {
 }
 
 /// The metric of a result that is its score.
-#[derive(Serialize, Deserialize, JsonSchema, Clone, Debug, PartialEq, Eq)]
+#[derive(Serialize, Deserialize, KubeSchema, Clone, Debug, PartialEq, Eq)]
+#[x_kube(
+    validation = Rule::new("!has(self.split) || size(self.split) + size(self.metric) < 64").message("container.score: split and metric have at most 63 characters together, because `<split>_<metric>` is the name of the score")
+)]
 pub struct ScoreMetric {
     /// Codename of the split that has the metric. Absent: the result has one split. Present: each metric's name is `<split>_<metric>`.
     #[serde(default, skip_serializing_if = "Option::is_none")]
@@ -152,6 +266,9 @@ pub struct ContainerPlan {
     /// Image of the evaluator, renewed by each attempt.
     #[schemars(length(max = 512))]
     pub image: SharedText,
+    /// Bounds of what a submission brings, in Batch and Predictions.
+    #[serde(default, skip_serializing_if = "Option::is_none")]
+    pub input: Option<InputBounds>,
 }
 
 /// The numbers of what a track effectively runs.
@@ -172,5 +289,14 @@ mod defaults {
     }
     pub(super) fn answer_seconds() -> i64 {
         600
+    }
+    pub(super) fn data_path() -> String {
+        "/dataset".to_owned()
+    }
+    pub(super) fn max_bytes() -> ByteQuantity {
+        ByteQuantity::mebibytes(1024)
+    }
+    pub(super) fn max_files() -> i32 {
+        1000
     }
 }

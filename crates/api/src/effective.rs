@@ -98,9 +98,9 @@ pub fn results_url(bucket: &S3Bucket, run_id: &RunId) -> String {
     )
 }
 
-/// The plan of a submission's first attempt. `image` is the participant's, `resume` means that stored results are taken up. `None` for a
+/// The plan of a submission's first attempt. `image` is the participant's, if it is an image; `resume` means that stored results are taken up. `None` for a
 /// track without the score that its kind of evaluation needs, which the API server refuses.
-pub fn plan(spec: &LeaderboardSpec, track: &Track, run_id: RunId, image: String, resume: bool) -> Option<RunPlan> {
+pub fn plan(spec: &LeaderboardSpec, track: &Track, run_id: RunId, image: Option<String>, resume: bool) -> Option<RunPlan> {
     let evaluation = match &spec.evaluation {
         Evaluation::Carla(carla) => PlannedEvaluation::Carla(carla_plan(carla, track)),
         Evaluation::Container(container) => {
@@ -140,6 +140,7 @@ fn container_plan(container: &ContainerEvaluation, track: &Track, own: &TrackEva
         merge: container.merge,
         score: own.score.clone(),
         image: container.image.as_str().into(),
+        input: container.mode.has_input().then(|| container.input_bounds()),
     }
 }
 

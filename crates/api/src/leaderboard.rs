@@ -54,7 +54,7 @@ use super::submission_use::{MAX_USING_TEAMS, TeamUse};
 #[x_kube(
     validation = Rule::new("has(self.evaluation.carla) == has(oldSelf.evaluation.carla)").message("the kind of evaluation is immutable: results of one cannot be compared with the other's; make a new Leaderboard"),
     validation = Rule::new("!has(self.evaluation.carla) || !has(oldSelf.evaluation.carla) || self.evaluation.carla.version == oldSelf.evaluation.carla.version").message("evaluation.carla.version is immutable: checkpoints of one format cannot be merged with the other's; make a new Leaderboard"),
-    validation = Rule::new("!has(self.evaluation.container) || has(self.agent) && has(self.agent.command)").message("agent.command is missing: evaluation.container knows no default command of the submitted image"),
+    validation = Rule::new("!has(self.evaluation.container) || self.evaluation.container.mode == 'Predictions' || has(self.agent) && has(self.agent.command)").message("agent.command is missing: evaluation.container knows no default command of the submitted image"),
     validation = Rule::new("self.tracks.all(t, has(t.container) == has(self.evaluation.container))").message("each track needs container.score if evaluation.container is set, and only then: it names the metric that is the score"),
     validation = Rule::new("!has(self.evaluation.container) || !self.tracks.exists(t, has(t.carla))").message("a track has carla, but evaluation.container is set: write its fields into the track's container"),
     validation = Rule::new("self.storage.s3.bucket == oldSelf.storage.s3.bucket").message("storage.s3.bucket is immutable: finished results would no longer be found; make a new Leaderboard"),

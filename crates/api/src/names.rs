@@ -74,8 +74,20 @@ pub const CONTAINER_CONTENTS: &str = "contents";
 pub const CONTAINER_WORKSPACE: &str = "workspace";
 /// Name of the sidecar that merges, uploads and reports.
 pub const CONTAINER_LOGCOPY: &str = "logcopy";
-/// The init containers of a Pod, in the order in which they start. `logcopy` goes on while the pairs run.
-pub const INIT_CONTAINERS: [&str; 3] = [CONTAINER_WORKSPACE, CONTAINER_CONTENTS, CONTAINER_LOGCOPY];
+/// Name of the init container that copies the dataset of `evaluation.container`.
+pub const CONTAINER_DATASET: &str = "dataset";
+/// Name of the init container that copies the labels of `evaluation.container`.
+pub const CONTAINER_LABELS: &str = "labels";
+/// Name of the init container that copies what an agent has left, for the evaluators. It runs after the agent.
+pub const CONTAINER_COLLECT: &str = "collect";
+/// The init containers of a Pod that start before its agents, in this order. `logcopy` goes on while the workers run.
+pub const INIT_CONTAINERS: [&str; 5] = [
+    CONTAINER_WORKSPACE,
+    CONTAINER_CONTENTS,
+    CONTAINER_DATASET,
+    CONTAINER_LABELS,
+    CONTAINER_LOGCOPY,
+];
 
 /// Key of the log that explains a failure, below the run's prefix. The controller writes no other text below that prefix.
 pub const FAILURE_LOG_KEY: &str = "evalai/environment_log.txt";

@@ -5,9 +5,29 @@
 use k8s_openapi::api::core::v1::{EnvVar, ResourceRequirements, SecurityContext};
 
 use super::leaderboard_parts::Evaluation;
-use super::{CarlaPlan, ContainerPlan, LeaderboardSpec, PlannedEvaluation, RouteSlice, RunPlan, Track, effective};
+use super::{CarlaPlan, ContainerPlan, DataSource, EvaluationMode, LeaderboardSpec, PlannedEvaluation, RouteSlice, RunPlan, Track, effective};
+
+/// How the agents of a run stand to the containers of the host.
+#[derive(Clone, Copy, Debug, PartialEq, Eq)]
+pub enum Agents {
+    /// Each worker has one, beside the container of the host.
+    Beside,
+    /// There is one. It ends before the containers of the host start.
+    First,
+    /// There is none.
+    Absent,
+}
 
 impl RunPlan {
+    /// How its agents stand to the containers of the host.
+    pub fn agents(&self) -> Agents {
+        match self.container().map(|container| container.mode) {
+            None | Some(EvaluationMode::Interactive) => Agents::Beside,
+            Some(EvaluationMode::Batch) => Agents::First,
+            Some(EvaluationMode::Predictions) => Agents::Absent,
+        }
+    }
+
     /// How many workers share the work.
     pub fn workers(&self) -> usize {
         match &self.evaluation {
@@ -67,6 +87,7 @@ impl RunPlan {
             }
             (PlannedEvaluation::Container(container), Evaluation::Container(now)) => {
                 container.image = now.image.as_str().into();
+                container.input = now.mode.has_input().then(|| now.input_bounds());
             }
             // The kind of a Leaderboard is immutable.
             (PlannedEvaluation::Carla(_), Evaluation::Container(_))
@@ -150,7 +171,11 @@ impl LeaderboardSpec {
     pub fn host_images(&self) -> Vec<&str> {
         match &self.evaluation {
             Evaluation::Carla(carla) => vec![&carla.contents.image, &carla.simulator.image],
-            Evaluation::Container(container) => vec![&container.image],
+            Evaluation::Container(container) => {
+                let data = [&container.dataset, &container.labels].into_iter().flatten();
+                let of_data = data.filter_map(DataSource::image).map(|image| image.reference.as_str());
+                of_data.chain([container.image.as_str()]).collect()
+            }
         }
     }
 }

@@ -1,4 +1,4 @@
-//! The kind `Submission`: one participant's image on one track, small enough to be written by hand.
+//! The kind `Submission`: one participant's image or file on one track, small enough to be written by hand.
 //!
 //! Owns the spec and its rules; the status is in `submission_status`. `ingest` creates and bumps it, people apply it.
 
@@ -10,7 +10,7 @@ use super::attempt::Attempt;
 use super::submission_status::SubmissionStatus;
 use super::team::{Team, TeamStatus};
 
-/// One participant's image on one track of a Leaderboard.
+/// One participant's image or file on one track of a Leaderboard.
 #[derive(CustomResource, KubeSchema, Serialize, Deserialize, Clone, Debug, Default, PartialEq)]
 #[kube(
     group = "leaderboard.carla.org",
@@ -21,7 +21,7 @@ use super::team::{Team, TeamStatus};
     category = "challenges",
     namespaced,
     status = "SubmissionStatus",
-    doc = "One participant's image on one track of a Leaderboard.",
+    doc = "One participant's image or file on one track of a Leaderboard.",
     derive = "PartialEq",
     derive = "Default",
     selectable = ".spec.leaderboardName",
@@ -56,7 +56,9 @@ use super::team::{Team, TeamStatus};
     validation = Rule::new("(has(self.check) && self.check) == (has(oldSelf.check) && oldSelf.check)").message("check is immutable; run another check"),
     validation = Rule::new("!has(self.check) || !self.check || !(has(self.evalai) || has(self.team))").message("a check has neither evalai nor team: it is published and recorded nowhere"),
     validation = Rule::new("has(self.evalai) != has(self.track)").message("a Submission has either evalai (its phase names the track) or a track, not both and not neither"),
-    validation = Rule::new("has(self.evalai) || has(self.image)").message("a Submission without evalai needs an image"),
+    validation = Rule::new("has(self.input) == has(oldSelf.input) && (!has(self.input) || self.input == oldSelf.input)").message("input is immutable; apply a new Submission"),
+    validation = Rule::new("has(self.evalai) || has(self.image) || has(self.input)").message("a Submission without evalai needs an image or an input"),
+    validation = Rule::new("!has(self.input) || !(has(self.image) || has(self.evalai))").message("a Submission has one of image, input and evalai's own file: leave input out beside image or evalai"),
     validation = Rule::new("self.attempt >= oldSelf.attempt").message("attempt may only grow"),
     validation = Rule::new("self.attempt == oldSelf.attempt || !self.cancel").message("to resume, set cancel to false together with the higher attempt"),
     validation = Rule::new("!oldSelf.cancel || self.cancel || self.attempt > oldSelf.attempt").message("a cancel is undone only by a higher attempt: set cancel to false and raise attempt in one patch")
@@ -65,10 +67,14 @@ pub struct SubmissionSpec {
     /// Name of the Leaderboard in the same namespace.
     #[schemars(length(min = 1, max = 52))]
     pub leaderboard_name: String,
-    /// The participant's image; asked from EvalAI when absent.
+    /// The participant's image; asked from EvalAI when absent. A Leaderboard of the mode Predictions takes files and no image.
     #[serde(default, skip_serializing_if = "Option::is_none")]
     #[schemars(length(min = 1, max = 512), regex(pattern = r"^[a-z0-9][!-~]*$"))]
     pub image: Option<String>,
+    /// The participant's file, for a Leaderboard of the mode Predictions. It lies in the bucket, below the run's prefix at `input/file`;
+    /// `kubectl leaderboard submit --file` puts it there.
+    #[serde(default, skip_serializing_if = "Option::is_none")]
+    pub input: Option<SubmittedFile>,
     /// Identity of the submission in EvalAI.
     #[serde(default, skip_serializing_if = "Option::is_none")]
     pub evalai: Option<EvalaiRef>,
@@ -112,6 +118,17 @@ impl Submission {
         let team = accepted.or(given.as_ref())?;
         team.name.clone().or_else(|| team.id.clone())
     }
+}
+
+/// A file in the bucket that is a submission.
+#[derive(Serialize, Deserialize, JsonSchema, Clone, Debug, PartialEq, Eq)]
+pub struct SubmittedFile {
+    /// SHA-256 of its content, in hexadecimal digits.
+    #[schemars(length(max = 64), regex(pattern = r"^[0-9a-f]{64}$"))]
+    pub sha256: String,
+    /// Bytes that it has.
+    #[schemars(range(min = 0))]
+    pub size: i64,
 }
 
 /// A submission's ids in EvalAI.

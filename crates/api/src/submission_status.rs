@@ -17,6 +17,7 @@ use super::progress::{MAX_METRICS, Metric, Progress, Score};
 use super::reasons::ReasonName;
 use super::run_id::RunId;
 use super::shared_text::SharedText;
+use super::submission::SubmittedFile;
 use super::submission_use::{Interruptions, Use};
 use super::team::TeamStatus;
 use super::waiting::Waiting;
@@ -109,6 +110,9 @@ pub struct SubmissionStatus {
     /// The participant's image as the first agent ran it. Every later Job runs the same, wherever its tag moves.
     #[serde(default, skip_serializing_if = "Option::is_none")]
     pub image: Option<PinnedImage>,
+    /// The submitted file in the bucket, below the run's prefix at `input/file`. Every Job reads the same.
+    #[serde(default, skip_serializing_if = "Option::is_none")]
+    pub input: Option<SubmittedFile>,
     /// Progress shows how much of the run is done.
     #[serde(default, skip_serializing_if = "Option::is_none")]
     pub progress: Option<Progress>,
@@ -230,9 +234,10 @@ pub struct RunPlan {
     pub phase: Option<i64>,
     /// Bucket and prefix that receive the results.
     pub storage: Storage,
-    /// The participant's image.
+    /// The participant's image; absent for a submission that is a file.
+    #[serde(default, skip_serializing_if = "Option::is_none")]
     #[schemars(length(max = 1024))]
-    pub image: String,
+    pub image: Option<String>,
     /// The plan of the kind of evaluation.
     #[serde(flatten)]
     pub evaluation: PlannedEvaluation,

@@ -33,6 +33,15 @@ pub const EVALUATORS: &str = "evaluators/";
 /// Name of the file in an evaluator's folder with its result.
 pub const RESULT_FILE: &str = leaderboard_protocol::files::RESULT;
 
+/// Where an agent of the mode Batch leaves its files, below the root of the `logs` volume. Nothing of it is stored.
+pub const SUBMISSION_FOLDER: &str = "submission";
+/// Before the keys of what the evaluators find at `/input`.
+pub const INPUT: &str = "input/";
+/// The submitted file of the mode Predictions.
+pub const INPUT_FILE: &str = "input/file";
+/// The list of what `collect` has copied.
+pub const COLLECTED: &str = "logcopy/collected.json";
+
 /// The folder of an agent, without a slash at its end.
 pub fn agent_folder(pair: Pair) -> String {
     format!("{AGENTS}agent{pair}")

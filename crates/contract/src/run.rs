@@ -4,7 +4,7 @@
 
 use serde::{Deserialize, Serialize};
 
-use leaderboard_api::{Attempt, Enforcement, LogGroup, Logs, RunPlan, Verify};
+use leaderboard_api::{Attempt, Enforcement, LogGroup, Logs, RunPlan, SubmittedFile, Verify};
 
 /// Environment variable with the JSON of [`Run`].
 pub const ENV_RUN: &str = "LEADERBOARD_RUN";
@@ -51,6 +51,9 @@ pub struct Run {
     pub attempt: Attempt,
     /// Share of each worker, images and storage.
     pub plan: RunPlan,
+    /// The submitted file, of a run of the mode Predictions.
+    #[serde(default, skip_serializing_if = "Option::is_none")]
+    pub input: Option<SubmittedFile>,
     /// The reaction to scores that do not follow from their infractions.
     pub verify: Verify,
     /// Seconds between two rounds.

@@ -1,4 +1,4 @@
-//! The verdict of `workspace`: why it could not prepare the Pod, or its measurement. `workspace` writes it, the controller reads it.
+//! The verdict of `workspace` or `collect`: why it could not prepare the Pod, or what it measured. The controller reads it.
 
 use serde::{Deserialize, Serialize};
 
@@ -22,6 +22,10 @@ pub enum WorkspaceReason {
     NotIsolated,
     /// The Pod's NetworkPolicy has to be enforced, and whether it is could not be measured.
     NotKnownIsolated,
+    /// The agent has left files that cannot be taken, or none. Of `collect` alone.
+    InputRefused,
+    /// The submitted file is not in the bucket, or another one.
+    InputMissing,
     /// No failure: the policy is enforced.
     Enforced,
     /// No failure: it is not.

@@ -20,6 +20,10 @@ reasons! {
             "The Submission names no image, and the file in EvalAI that names it could not be read yet. The operator retries.",
             "Check that EvalAI serves the submission's input file, or set `spec.image`. If it lasts, ask the participant to push \
              again, and cancel this submission.";
+        FetchingInput,
+            "The operator is copying the submitted file from EvalAI into the bucket, or waits for EvalAI's address of it. Nothing is \
+             charged meanwhile.",
+            "Nothing. If it lasts, the message has the last error: check that EvalAI serves the file, and the bucket.";
         PhaseDiffers,
             "EvalAI's row belongs to another phase than the Submission: one of the two was edited. It does not run. After an hour it \
              fails, which does not count as an attempt, so that EvalAI shows an end.",
@@ -145,6 +149,11 @@ reasons! {
              its simulator did not have. Or the host's evaluator refused the submission.",
             "Check what the agent writes into its checkpoint or sends to the evaluator, and submit again.",
             log: "the log of the agent whose results were refused";
+        InputInvalid,
+            "What the submission brings cannot be taken: no file, too many, too large, or something that is no regular file. Or the \
+             submission is an image where the Leaderboard takes files, or the other way round.",
+            "Keep to regular files within `evaluation.container.input`, and submit again.",
+            log: "the log of the agent, if there is one";
         NotEligible,
             "The run is complete, but its results do not count (`Rejected`, `Invalid`).",
             "Compare the agent's sensors with those the track allows, and submit again.",
@@ -187,6 +196,10 @@ reasons! {
             "Look at the evaluator's log and at `evaluators/<n>/result.json`; `kubectl leaderboard lint FILE` says what is wrong with \
              it. Correct the evaluator's image, then resume the submission.",
             log: "the log of evaluator `<n>`, `evaluators/<n>/console.log`";
+        InputMissing,
+            "The submitted file is not to be had: EvalAI does not serve it, or the bucket has none at `input/file` that is the one of \
+             the Submission.",
+            "Check EvalAI's MEDIA_URL, or put the file into the bucket again; then resume the submission.";
         NoGPU,
             "A simulator, or in `NodeIndex` an agent that had not begun, saw no GPU although `gpu` gives it one. Another Job follows; \
              after two such ends on one node the Jobs of the attempt avoid it.",
