@@ -294,7 +294,7 @@ mod defaults {
         "/dataset".to_owned()
     }
     pub(super) fn max_bytes() -> ByteQuantity {
-        ByteQuantity::mebibytes(1024)
+        ByteQuantity::gibibytes(1)
     }
     pub(super) fn max_files() -> i32 {
         1000

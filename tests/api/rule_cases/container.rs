@@ -38,7 +38,7 @@ fn case(message: &'static str, good: &Value, bad: &Value) -> Case {
 }
 
 pub(super) fn all() -> Vec<Case> {
-    [kinds(), gpus(), sizes()].into_iter().flatten().collect()
+    [kinds(), modes(), gpus(), sizes()].into_iter().flatten().collect()
 }
 
 fn kinds() -> Vec<Case> {
@@ -69,6 +69,52 @@ fn kinds() -> Vec<Case> {
     ]
 }
 
+fn modes() -> Vec<Case> {
+    let mode = |mode: &str, more: &Value| {
+        let mut all = json!({"mode": mode});
+        merge(&mut all, more);
+        container(&all)
+    };
+    let (dataset, none) = (json!({"dataset": {"image": {"reference": "data:1"}}}), json!({}));
+    let for_agent = |mut of: Value| {
+        merge(&mut of, &json!({"datasetForAgent": true}));
+        of
+    };
+    let score = |split: usize, metric: usize| {
+        tracks(&json!({"container": {"score": {"split": "s".repeat(split), "metric": "m".repeat(metric)}}}))
+    };
+    vec![
+        update(
+            Leaderboard,
+            "container.mode is immutable",
+            &by_container(&none),
+            &mode("Batch", &none),
+            &json!({"paused": true}),
+        ),
+        case(
+            "container.port is for Interactive",
+            &mode("Batch", &none),
+            &mode("Batch", &json!({"port": 7000})),
+        ),
+        case(
+            "container.input is for Batch",
+            &none,
+            &container(&json!({"input": {"maxFiles": 2}})),
+        ),
+        case(
+            "datasetForAgent needs a dataset",
+            &container(&for_agent(dataset.clone())),
+            &container(&for_agent(none.clone())),
+        ),
+        case(
+            "datasetForAgent needs a dataset",
+            &mode("Predictions", &dataset),
+            &mode("Predictions", &for_agent(dataset.clone())),
+        ),
+        case("split and metric have at most 63", &score(31, 32), &score(32, 32)),
+    ]
+}
+
 fn gpus() -> Vec<Case> {
     let given = json!({"gpu": {"resourceName": GPU}});
     let requests = |list: &str| json!({"resources": {list: {GPU: "1"}}});
@@ -88,7 +134,10 @@ fn gpus() -> Vec<Case> {
 
 fn sizes() -> Vec<Case> {
     let shm = |size: &str| container(&json!({"shmSize": size}));
+    let bytes = |size: &str| container(&json!({"mode": "Batch", "input": {"maxBytes": size}}));
     vec![
+        case("input.maxBytes must be 1 or", &bytes("1"), &bytes("0")),
+        case("input.maxBytes must be 100Gi", &bytes("100Gi"), &bytes("101Gi")),
         case("container.shmSize must be 1Mi", &shm("1Mi"), &shm("1M")),
         case("container.shmSize must be 1Ti", &shm("1024Gi"), &shm("1025Gi")),
     ]

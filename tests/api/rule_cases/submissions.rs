@@ -13,6 +13,8 @@ fn immutable() -> Vec<Case> {
     let ids = |submission: i64| json!({"challenge": 1, "phase": 7, "submission": submission});
     let theirs = json!({"track": null, "image": null, "evalai": ids(42)});
     let first = json!({"priority": 5});
+    let file = |digit: &str| json!({"sha256": digit.repeat(64), "size": 12});
+    let of_file = json!({"image": null, "input": file("a")});
     let keeps = |message, from: &Value, bad: &Value| update(Submission, message, from, bad, &first);
     vec![
         keeps(
@@ -35,6 +37,19 @@ fn immutable() -> Vec<Case> {
             "not both and not neither",
             &theirs,
             &json!({"track": "sensors"}),
+        ),
+        keeps("input is immutable", &of_file, &json!({"input": file("b")})),
+        create(
+            Submission,
+            "leave input out beside image or evalai",
+            &of_file,
+            &json!({"image": "agent:1"}),
+        ),
+        create(
+            Submission,
+            "leave input out beside image or evalai",
+            &theirs,
+            &json!({"input": file("a")}),
         ),
         create(
             Submission,
