@@ -30,8 +30,10 @@ CONTENTS, SIMULATOR, AGENT = "challenge/contents:1", "challenge/simulator:1", "c
 # Agents that the demo's last lines name.
 CRASHES, PRINTS = "challenge/agent:crash-once", "challenge/agent:print-routes"
 OPERATOR = "leaderboard-operator:dev"
+# The Leaderboard without CARLA, and what its agent needs for a game on average: local/games/README.md works it out.
+GAME, GUESSES = "guessing-game", "8.25"
 # The tests have more.
-IMAGES = (OPERATOR, CONTENTS, SIMULATOR, AGENT, CRASHES, PRINTS)
+IMAGES = (OPERATOR, CONTENTS, SIMULATOR, AGENT, CRASHES, PRINTS, f"{GAME}/evaluator:1", f"{GAME}/agent:1")
 CERTIFICATES = Path("/etc/ssl/certs/ca-certificates.crt")
 RUN_PATIENCE = 600
 # On two cores that do nothing else.
@@ -56,11 +58,13 @@ def run(settings: Settings) -> None:
     step(4, "EvalAI's stand-in", "1 s")
     evalai_server.ensure(settings, build.program(settings, "evalai-stand-in"))
     install(settings, kube, pinned)
-    apply_leaderboard(settings, kube, pinned)
+    apply_leaderboards(settings, kube, pinned)
+    game = submit_game(settings, kube, pinned)
     submission = submit_and_follow(settings, kube, pinned[AGENT])
     findings = collect(settings, kube, submission)
     show(kube, findings)
     check(settings, findings)
+    check_game(kube, game)
     say(f"the demo is done ({seconds(time.monotonic() - started)})")
     print(next_steps(settings, findings))
 
@@ -179,17 +183,23 @@ def words(text: str) -> str:
     return " | ".join(line.strip() for line in text.strip().splitlines()[-3:])[-400:] or "no word"
 
 
-def apply_leaderboard(settings: Settings, kube: Kube, pinned: dict[str, str]) -> None:
-    """Step 6: the Leaderboard; waits until the controller reports that it can serve."""
-    step(6, f"the Leaderboard {LEADERBOARD} in the namespace {NAMESPACE}", "3 s")
-    apply(settings, kube, "leaderboard.yaml", pinned)
-    wanted = ["wait", "--for=condition=Ready", f"leaderboard/{LEADERBOARD}", f"--namespace={NAMESPACE}"]
+def apply_leaderboards(settings: Settings, kube: Kube, pinned: dict[str, str]) -> None:
+    """Step 6: both Leaderboards; waits until the controller reports that it can serve them."""
+    step(6, f"the Leaderboards {LEADERBOARD} and {GAME} in the namespace {NAMESPACE}", "3 s")
+    for name in ("leaderboard.yaml", f"{GAME}.yaml"):
+        apply(settings, kube, name, pinned)
+    for board in (LEADERBOARD, GAME):
+        await_ready(kube, board)
+
+
+def await_ready(kube: Kube, name: str) -> None:
+    wanted = ["wait", "--for=condition=Ready", f"leaderboard/{name}", f"--namespace={NAMESPACE}"]
     done = kube.attempt("kubectl", *wanted, "--timeout=120s")
     if done.returncode != 0:
-        board = kube.json("kubectl", "get", "leaderboard", LEADERBOARD, f"--namespace={NAMESPACE}")
+        board = kube.json("kubectl", "get", "leaderboard", name, f"--namespace={NAMESPACE}")
         ready = [one for one in board.get("status", {}).get("conditions", []) if one["type"] == "Ready"]
         reason = f"{ready[0]['reason']}: {ready[0]['message']}" if ready else "the controller has not looked at it"
-        raise LabError(f"Leaderboard {LEADERBOARD} does not become Ready: {reason}; see the controller's log")
+        raise LabError(f"Leaderboard {name} does not become Ready: {reason}; see the controller's log")
 
 
 def apply(settings: Settings, kube: Kube, name: str, pinned: dict[str, str]) -> None:
@@ -218,9 +228,30 @@ class Submitted:
     name: str
 
 
+def submit_game(settings: Settings, kube: Kube, pinned: dict[str, str]) -> str:
+    """Begins step 7 with a submission to the challenge without CARLA, which runs beside; returns its name."""
+    step(7, f"a submission to {GAME} by kubectl, and one of team-a to EvalAI, phase SENSORS", "30 s until the score is published")
+    given = manifest(settings, "game.yaml", pinned)
+    made = kube.run("kubectl", "create", "--filename=-", "--output=name", given=given, action="kubectl create of a game")
+    return made.strip().partition("/")[2]
+
+
+def check_game(kube: Kube, name: str) -> None:
+    """Waits for the end of the game, prints it, and raises if its score is another one."""
+    heading(f"Next to it, a challenge without CARLA: {GAME}")
+    wanted = ["wait", "--for=condition=Finished", f"submission/{name}", f"--namespace={NAMESPACE}"]
+    kube.attempt("kubectl", *wanted, "--timeout=120s")
+    print(kube.run("kubectl", "get", "submission", name, f"--namespace={NAMESPACE}").rstrip())
+    found = kube.json("kubectl", "get", "submission", name, f"--namespace={NAMESPACE}").get("status", {})
+    score = found.get("score", {}).get("text")
+    if (found.get("state"), score) != ("Finished", GUESSES):
+        raise LabError(
+            f"the game {name} is {found.get('state')} with score {score} in place of Finished with {GUESSES}: {found.get('message')}"
+        )
+
+
 def submit_and_follow(settings: Settings, kube: Kube, agent: str) -> Submitted:
-    """Step 7: a participant pushes; EvalAI publishes into SQS; from there on nobody helps."""
-    step(7, "a participant of team-a submits to EvalAI, phase SENSORS", "30 s until the score is published")
+    """The rest of step 7: a participant pushes; EvalAI publishes into SQS; from there on nobody helps."""
     row = evalai_server.submit(settings, PARTICIPANT, CHALLENGE, PHASE, agent)
     since = time.monotonic()
     submitted = Submitted(row["id"], row["participant_team"], f"submission-{row['id']}")
@@ -323,6 +354,7 @@ What to try next:
   {stand_in} submit {settings.registry}/{CRASHES} --phase 2{at}
   {stand_in} submit {settings.registry}/{PRINTS}{at}
   kubectl get submissions --watch
+  kubectl leaderboard scores {GAME}
   {stand_in} show {key}{at}
   http://127.0.0.1:{settings.ports["evalai"]}/                                    # EvalAI's submissions and leaderboards
   make demo                                                 # once more: a new submission
