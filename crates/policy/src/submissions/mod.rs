@@ -103,7 +103,7 @@ fn in_line(draft: &mut PlanBuilder<'_>) {
     if !accept::decide(draft) {
         return draft.look_again(Wait::SLOT);
     }
-    match gates::closed(draft, &[Gate::NextTry, Gate::Slot]) {
+    match gates::closed(draft, &[Gate::NextTry, Gate::Slot, Gate::Input]) {
         None => start::start_job(draft),
         Some(Gate::NextTry) => {}
         Some(_) => draft.look_again(Wait::SLOT),

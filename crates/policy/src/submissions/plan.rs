@@ -2,7 +2,7 @@
 
 use std::time::Duration;
 
-use crate::questions::Row;
+use crate::questions::{Input, Row};
 use crate::slots::turns::InLine;
 use crate::view::{LogPlace, ReportDemand};
 use leaderboard_api::{JobNumber, ReasonName, SubmissionStatus, names};
@@ -100,6 +100,8 @@ pub enum Action {
 pub enum Question {
     /// Does another program's row of the table show a run?
     Row(Box<Row>),
+    /// Is the submitted file of EvalAI's in the bucket?
+    Input(Box<Input>),
     /// Does EvalAI want it to run?
     Evalai,
     /// Does it still, whatever was answered before?

@@ -23,6 +23,8 @@ impl Wait {
     pub(super) const EVALAI: Self = row(5, 30, NONE);
     /// The row of another program's run.
     pub(super) const ROW: Self = row(5, 1, NONE);
+    /// The copy of a submitted file. After `longest` without one a person has to look.
+    pub(super) const INPUT: Self = row(5, NONE, 5 * 60);
     /// The NetworkPolicy of a Leaderboard, which may come together with its first submission.
     pub(super) const POLICY: Self = row(5, NONE, NONE);
     /// The row's phase in EvalAI: time for a host who has made a mistake, and not too long for a participant, whose team has that
