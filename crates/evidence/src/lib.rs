@@ -4,6 +4,7 @@
 //! its folder; none of that may lead out of the volume, block a reader, or cost more than a bound.
 
 use std::collections::BTreeMap;
+use std::ffi::CString;
 use std::fs::File;
 use std::io::{self, Read};
 use std::os::fd::OwnedFd;
@@ -13,7 +14,7 @@ use std::path::{Path, PathBuf};
 use nix::dir::Dir;
 use nix::errno::Errno;
 use nix::fcntl::{AtFlags, OFlag, OpenHow, ResolveFlag, openat, openat2};
-use nix::sys::stat::{Mode, SFlag, fchmod, fstatat, mkdirat};
+use nix::sys::stat::{FileStat, Mode, SFlag, fchmod, fstatat, mkdirat};
 use nix::unistd::{UnlinkatFlags, unlinkat};
 use serde::{Deserialize, Serialize};
 
@@ -82,18 +83,51 @@ impl From<Errno> for TreeError {
     }
 }
 
+/// Why an entry of a folder is left out.
+#[derive(thiserror::Error, Clone, Copy, Debug, PartialEq, Eq)]
+pub enum LeftOut {
+    /// A link, pipe, socket or device.
+    #[error("it is neither a regular file nor a folder")]
+    NotRegular,
+    /// A name that is no text, or a path that can be no key.
+    #[error("its name has characters that are not taken, or its path is too long")]
+    Name,
+    /// Deeper than is looked.
+    #[error("it lies in more than {MAX_DEPTH} folders")]
+    Deep,
+    /// One more than is looked at.
+    #[error("there are too many files and folders")]
+    Many,
+    /// The system's own reason.
+    #[error("it can't be read ({})", .0.desc())]
+    Unreadable(Errno),
+}
+
+impl LeftOut {
+    /// True if the entry is the reason, which its writer can change; see [`TreeError::is_the_writers`].
+    pub fn is_the_writers(self) -> bool {
+        match self {
+            Self::Unreadable(errno) => TreeError::from(errno).is_the_writers(),
+            Self::NotRegular | Self::Name | Self::Deep | Self::Many => true,
+        }
+    }
+}
+
 /// The files found by [`Tree::walk`].
 #[derive(Clone, Debug, Default, PartialEq, Eq)]
 pub struct Walk {
     /// By path below the tree's root.
     pub files: BTreeMap<String, Stamp>,
-    /// Entries with impossible names, or beyond the limits.
+    /// Number of entries that are left out.
     pub left_out: usize,
+    /// The first of them, whose path is a stranger's text.
+    pub first: Option<(String, LeftOut)>,
 }
 
 impl Walk {
-    fn leave_out(&mut self) {
+    fn leave_out(&mut self, path: String, why: LeftOut) {
         self.left_out = self.left_out.saturating_add(1);
+        self.first.get_or_insert((path, why));
     }
 }
 
@@ -173,45 +207,60 @@ impl Tree {
         let mut looked_at: usize = 0;
         let mut folders = vec![(folder.to_owned(), 0_usize)];
         while let Some((folder, depth)) = folders.pop() {
-            let flags = OFlag::O_RDONLY | OFlag::O_DIRECTORY;
-            let Ok(mut dir) = self.at(&folder, flags).and_then(|fd| Ok(Dir::from_fd(fd)?)) else {
-                continue;
+            let most = limit.saturating_sub(looked_at).saturating_add(1);
+            let (dir, names) = match self.names(&folder, most) {
+                Ok(Some(listed)) => listed,
+                Ok(None) => continue,
+                Err(why) => {
+                    walk.leave_out(folder, why);
+                    continue;
+                }
             };
-            let names: Vec<_> = dir
-                .iter()
-                .map_while(Result::ok)
-                .map(|entry| entry.file_name().to_owned())
-                .filter(|name| !matches!(name.to_bytes(), b"." | b".."))
-                .take(limit.saturating_sub(looked_at).saturating_add(1))
-                .collect();
             for name in names {
                 looked_at = looked_at.saturating_add(1);
-                let path = name.to_str().map(|name| format!("{folder}/{name}")).ok();
-                let Some(path) = path.filter(|path| looked_at <= limit && is_plain(path)) else {
-                    walk.leave_out();
+                let path = format!("{folder}/{}", name.to_string_lossy());
+                if looked_at > limit {
+                    walk.leave_out(path, LeftOut::Many);
+                    return walk;
+                }
+                if name.to_str().is_err() || !is_plain(&path) {
+                    walk.leave_out(path, LeftOut::Name);
                     continue;
-                };
-                let Ok(stat) = fstatat(&dir, name.as_c_str(), AtFlags::AT_SYMLINK_NOFOLLOW) else {
-                    continue;
+                }
+                let stat = match fstatat(&dir, name.as_c_str(), AtFlags::AT_SYMLINK_NOFOLLOW) {
+                    Ok(stat) => stat,
+                    Err(Errno::ENOENT) => continue,
+                    Err(errno) => {
+                        walk.leave_out(path, LeftOut::Unreadable(errno));
+                        continue;
+                    }
                 };
                 match SFlag::from_bits_truncate(stat.st_mode & SFlag::S_IFMT.bits()) {
                     SFlag::S_IFDIR if depth < MAX_DEPTH => folders.push((path, depth.saturating_add(1))),
-                    SFlag::S_IFREG => {
-                        let stamp = Stamp {
-                            size: u64::try_from(stat.st_size).unwrap_or(0),
-                            mtime: (stat.st_mtime, stat.st_mtime_nsec),
-                            inode: stat.st_ino,
-                        };
-                        walk.files.insert(path, stamp);
-                    }
-                    _ => walk.leave_out(),
+                    SFlag::S_IFDIR => walk.leave_out(path, LeftOut::Deep),
+                    SFlag::S_IFREG => _ = walk.files.insert(path, Stamp::of_stat(&stat)),
+                    _ => walk.leave_out(path, LeftOut::NotRegular),
                 }
-            }
-            if looked_at > limit {
-                break;
             }
         }
         walk
+    }
+
+    /// An open folder, and at most so many names in it; `None` if there is no folder.
+    fn names(&self, folder: &str, most: usize) -> Result<Option<(Dir, Vec<CString>)>, LeftOut> {
+        let opened = self.at(folder, OFlag::O_RDONLY | OFlag::O_DIRECTORY);
+        let mut dir = match opened.and_then(|fd| Ok(Dir::from_fd(fd)?)) {
+            Ok(dir) => dir,
+            Err(TreeError::Io(error)) if error.kind() == io::ErrorKind::NotFound => return Ok(None),
+            Err(TreeError::Io(error)) => {
+                return Err(LeftOut::Unreadable(Errno::from_raw(error.raw_os_error().unwrap_or(0))));
+            }
+            Err(_) => return Err(LeftOut::NotRegular),
+        };
+        let names = dir.iter().map(|entry| entry.map(|entry| entry.file_name().to_owned()));
+        let names = names.filter(|name| !name.as_ref().is_ok_and(|name| matches!(name.to_bytes(), b"." | b"..")));
+        let names: Result<Vec<CString>, Errno> = names.take(most).collect();
+        Ok(Some((dir, names.map_err(LeftOut::Unreadable)?)))
     }
 
     /// Makes a folder and those above it, writable for every user: containers of any user work in them.
@@ -234,6 +283,18 @@ impl Tree {
             }
         }
         Ok(at)
+    }
+
+    /// Empties a folder, and makes it if there is none. No stranger may write where it lies.
+    pub fn clear(&self, relative: &str) -> Result<(), TreeError> {
+        if !is_plain(relative) {
+            return Err(TreeError::Path);
+        }
+        match std::fs::remove_dir_all(self.path.join(relative)) {
+            Err(error) if error.kind() != io::ErrorKind::NotFound => return Err(error.into()),
+            _ => {}
+        }
+        self.folder(relative).map(drop)
     }
 
     /// Makes a file that every user may read and write, in place of what is there.
@@ -297,8 +358,10 @@ impl Tree {
             return Err(TreeError::Path);
         }
         let flags = flags | OFlag::O_CLOEXEC | OFlag::O_NOFOLLOW | OFlag::O_NOCTTY;
-        let beneath =
-            ResolveFlag::RESOLVE_BENEATH | ResolveFlag::RESOLVE_NO_SYMLINKS | ResolveFlag::RESOLVE_NO_MAGICLINKS;
+        let beneath = ResolveFlag::RESOLVE_BENEATH
+            | ResolveFlag::RESOLVE_NO_SYMLINKS
+            | ResolveFlag::RESOLVE_NO_MAGICLINKS
+            | ResolveFlag::RESOLVE_NO_XDEV;
         match openat2(&self.root, relative, OpenHow::new().flags(flags).resolve(beneath)) {
             // Some sandboxed runtimes have no openat2.
             Err(Errno::ENOSYS) => self.step_by_step(relative, flags),
@@ -328,6 +391,14 @@ impl Stamp {
             inode: metadata.ino(),
         }
     }
+
+    fn of_stat(stat: &FileStat) -> Self {
+        Self {
+            size: u64::try_from(stat.st_size).unwrap_or(0),
+            mtime: (stat.st_mtime, stat.st_mtime_nsec),
+            inode: stat.st_ino,
+        }
+    }
 }
 
 /// True if a path is relative, stays below its root, and can be a key.
@@ -338,107 +409,4 @@ pub fn is_plain(path: &str) -> bool {
 }
 
 #[cfg(test)]
-mod tests {
-    use std::fs;
-    use std::os::unix::fs::{PermissionsExt, symlink};
-
-    use super::*;
-
-    fn tree() -> (tempfile::TempDir, Tree) {
-        let folder = tempfile::tempdir().unwrap();
-        fs::create_dir_all(folder.path().join("agent/agent1")).unwrap();
-        let tree = Tree::open(folder.path()).unwrap();
-        (folder, tree)
-    }
-
-    #[test]
-    fn paths_that_lead_elsewhere_are_not_plain() {
-        for bad in [
-            "",
-            "/etc/passwd",
-            "a/../b",
-            "..",
-            ".",
-            "a//b",
-            "a/",
-            "a\nb",
-            &"x".repeat(481),
-        ] {
-            assert!(!is_plain(bad), "{bad:?}");
-        }
-        for good in ["a", "agent/agent1/leaderboard.log", "simulator/ü b/…", ".hidden"] {
-            assert!(is_plain(good), "{good:?}");
-        }
-    }
-
-    #[test]
-    fn links_pipes_and_folders_are_no_files() {
-        let (folder, tree) = tree();
-        let at = |name: &str| folder.path().join("agent/agent1").join(name);
-        let outside = tempfile::tempdir().unwrap();
-        fs::write(outside.path().join("secret"), "s").unwrap();
-        symlink(outside.path().join("secret"), at("link")).unwrap();
-        symlink(outside.path(), at("way")).unwrap();
-        nix::unistd::mkfifo(&at("pipe"), Mode::from_bits_truncate(0o666)).unwrap();
-        fs::create_dir(at("folder")).unwrap();
-        fs::write(at("plain"), "p").unwrap();
-        for name in ["link", "way/secret", "pipe", "folder"] {
-            let error = tree.read(&format!("agent/agent1/{name}"), 10).unwrap_err();
-            assert!(matches!(error, TreeError::NotRegular), "{name}: {error}");
-            let flags = OFlag::O_RDONLY | OFlag::O_NONBLOCK | OFlag::O_NOFOLLOW;
-            let by_steps = tree.step_by_step(&format!("agent/agent1/{name}"), flags);
-            assert_eq!(by_steps.is_err(), name.starts_with(['l', 'w']), "{name}");
-        }
-        assert!(tree.read("agent/agent1/nothing", 10).unwrap().is_none());
-        assert_eq!(tree.read("agent/agent1/plain", 1).unwrap().unwrap().0, b"p");
-        let walk = tree.walk("agent/agent1", 100);
-        assert_eq!(walk.files.keys().collect::<Vec<_>>(), ["agent/agent1/plain"]);
-        assert_eq!(walk.left_out, 3);
-    }
-
-    #[test]
-    fn a_file_beyond_the_limit_is_not_read() {
-        let (folder, tree) = tree();
-        fs::write(folder.path().join("agent/x"), [0; 11]).unwrap();
-        let error = tree.read("agent/x", 10).unwrap_err();
-        assert!(matches!(error, TreeError::TooLarge { size: 11, limit: 10 }), "{error}");
-    }
-
-    #[test]
-    fn a_flood_of_files_costs_no_more_than_the_limit() {
-        let (folder, tree) = tree();
-        for i in 0..50 {
-            fs::write(folder.path().join(format!("agent/agent1/{i}")), "").unwrap();
-        }
-        let walk = tree.walk("agent", 10);
-        assert_eq!(walk.files.len(), 9);
-        assert!(walk.left_out > 0);
-        assert_eq!(tree.walk("agent", 51).left_out, 0);
-        assert_eq!(tree.walk("nothing", 10), Walk::default());
-    }
-
-    #[test]
-    fn what_is_made_here_is_for_every_user() {
-        let (folder, tree) = tree();
-        drop(tree.create("simulator/a/b.log").unwrap());
-        tree.write("evalai/results.json", b"[]").unwrap();
-        tree.write("evalai/results.json", b"[1]").unwrap();
-        let mode = |path: &str| fs::metadata(folder.path().join(path)).unwrap().permissions().mode() & 0o7777;
-        assert_eq!(
-            [mode("simulator/a/b.log"), mode("simulator/a"), mode("simulator")],
-            [0o666, 0o777, 0o777]
-        );
-        assert_eq!(fs::read(folder.path().join("evalai/results.json")).unwrap(), b"[1]");
-        assert_eq!(tree.walk("evalai", 10).files.len(), 1);
-    }
-
-    #[test]
-    fn restored_files_never_go_through_a_link() {
-        let (folder, tree) = tree();
-        let outside = tempfile::tempdir().unwrap();
-        symlink(outside.path(), folder.path().join("simulator")).unwrap();
-        assert!(tree.create("simulator/x").is_err());
-        assert!(tree.create("a/../../x").is_err());
-        assert_eq!(fs::read_dir(outside.path()).unwrap().count(), 0);
-    }
-}
+mod tests;
