@@ -196,6 +196,7 @@ def furnish(repository: Path, home: Path) -> None:
     for name in ("charts", "Dockerfile"):
         (home / name).symlink_to(repository / name)
     (home / "examples" / "aws" / "token.json").write_text('{"auth_token": "a-token"}')
+    (home / "predictions.csv").write_text("id,category\n")
     (home / "local").mkdir()
     (home / "local" / "quickstart").symlink_to(repository / "local" / "quickstart")
     for script in ("local/lab", "examples/contents/check.sh", "examples/participants/try.sh"):
@@ -287,7 +288,8 @@ def manifests(repository: Path) -> list[Path]:
 def docker_faults(repository: Path, note: Note) -> Iterator[str]:
     """Targets that the file of a build lacks."""
     options = dict(zip(note.words, note.words[1:], strict=False))
-    named = options.get("--file", "Dockerfile")
+    # That of the folder which is built, unless another one is named.
+    named = options.get("--file", f"{note.words[-1]}/Dockerfile")
     # The reader's own copy of an example.
     file = repository / named.replace("my-challenge/", "examples/challenges/guessing-game/")
     if "--target" in options and f" AS {options['--target']}\n" not in file.read_text():

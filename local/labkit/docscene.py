@@ -30,6 +30,16 @@ VALUES = ("networkPolicy:\n", "controller:\n")
 # What the rest of the example cannot stand next to, by page.
 INSTEAD: dict[str, dict[str, Any]] = {
     "docs/evalai.md": {"queue": None, "evalai": {"token": {"secretsManager": None}}},
+    "docs/evaluator.md": {
+        "evaluation": {
+            "carla": None,
+            "container": {"mode": "Batch", "image": "registry.example/evaluator:1", "command": ["python3"]},
+        },
+        "tracks": [{"name": "test", "container": {"score": {"metric": "accuracy"}}}],
+        "agent": {"command": ["python3"]},
+        "evalai": None,
+        "queue": None,
+    },
     "docs/gpu.md": {"gpu": None},
     "docs/migrate.md": {"queue": None, "table": None},
 }

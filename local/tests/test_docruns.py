@@ -153,6 +153,9 @@ class Words(unittest.TestCase):
             "lab chart-test --update",
             "cargo test -p leaderboard-results --test corpus",
             "docker build --file local/quickstart/Dockerfile --target agent .",
+            "docker build --file my-challenge/Dockerfile --target agent my-challenge",
+            "docker build --target labels --tag REGISTRY/classification/labels:1 examples/challenges/classification",
+            "docker build --tag REGISTRY/leaderboard-operator:1 .",
             "try.sh --memory 24g IMAGE",
         )
         self.assertEqual(self.faults(*right), [])
@@ -162,6 +165,7 @@ class Words(unittest.TestCase):
             ("cargo test -p leaderboard-result", "there is no"),
             ("cargo test -p leaderboard-results --test corpora", "corpora.rs"),
             ("docker build --file local/quickstart/Dockerfile --target agents .", "no target agents"),
+            ("docker build --target label examples/challenges/classification", "no target label"),
             ("try.sh --memories 24g IMAGE", "no option --memories"),
         ):
             self.assertIn(fault, "\n".join(self.faults(line)), line)
