@@ -14,7 +14,10 @@ pub const MAX_BYTES: usize = 340;
 /// Exit code of a runner whose node refused what it needs before its command ran (EX_OSERR). It counts without a verdict, since no process
 /// of the image has run and can have caused it.
 pub const CODE_NODE_REFUSED: i32 = 71;
-/// The same for want of a process (EX_TEMPFAIL), which the other containers of the Pod can use up.
+/// Exit code of a runner whose container was to have a GPU, or a driver to draw with, and has none (EX_UNAVAILABLE). It is the runner's own:
+/// no process of the image can bring it about.
+pub const CODE_NO_GRAPHICS: i32 = 69;
+/// The same as [`CODE_NODE_REFUSED`] for want of a process (EX_TEMPFAIL), which the other containers of the Pod can use up.
 pub const CODE_NO_PROCESS: i32 = 75;
 /// Version of the document.
 pub const SCHEMA: u32 = 1;
@@ -38,13 +41,14 @@ pub enum What {
     Stopped,
     /// The simulator's server did not answer in time, the evaluator did not listen in time, or the agent's host did not come.
     NotReady,
-    /// The evaluator's agent is done, or has forged that it is, and no complete result came in time.
+    /// The evaluator's agent is done, or has forged that it is, or it has none, and no complete result came in time.
     NoResult,
     /// The agent crashed, and at that moment the simulator's server did not answer any more.
     ServerSilent,
     /// Another process of the Pod has taken a port of the simulator's server or of the evaluator.
     PortTaken,
-    /// The host's container, or its agent, was to have a GPU and sees none. A host's word for both; of an agent it counts for nothing.
+    /// The host's container, or its agent, was to have a GPU and sees none. A host's word for both; of an agent it counts for nothing
+    /// without [`CODE_NO_GRAPHICS`].
     NoGpu,
     /// The simulator sees a GPU, and no driver for what its server draws with.
     GraphicsDriverMissing,

@@ -18,10 +18,11 @@ usage: leaderboard-runner simulator --pair N --status DIR --port P [options] -- 
        leaderboard-runner agent --pair N --status DIR --checkpoint FILE [options] -- CMD ARGS...
        leaderboard-runner agent --pair N --status DIR --host evaluator [options] -- CMD ARGS...
        leaderboard-runner keep --log FILE [--log-limit BYTES] -- CMD ARGS...
+       leaderboard-runner copy --from DIR --to DIR [--termination-log FILE]
        leaderboard-runner --version | --help
 
 Runs CMD as one container of a pair, which is a simulator or an evaluator and its agent, and speaks the status-file protocol in DIR; `keep`
-runs CMD and keeps its output.
+runs CMD and keeps its output; `copy` copies a folder's files, folders and links.
 
 all:        --ready-seconds 3600   how long a simulator or an evaluator may take until it listens on its port
             --grace-seconds 20     between SIGTERM and SIGKILL; 30 for an evaluator
@@ -38,10 +39,12 @@ evaluator:  --log FILE             where output is kept, too
             --unset A,B            variables that CMD does not get
 simulator:  --answer-seconds 10    how long a server may take to answer when its agent has crashed
 evaluator:  --port P               it is ready when it listens there; without one, as soon as it is started
-            --answer-seconds 600   how long it may take, after its agent's exit with code 0, until its result is complete
+            --answer-seconds 600   how long it may take, after its agent's exit with code 0, until its result is complete; alone, from its start
+            --alone                there is no agent beside it, and none is waited for or followed
 agent:      --work /tmp/agent      where leaderboard.log is written
             --idle-seconds 800     no output for so long ends the command
             --report-gpu false     true: looks for a GPU before anything else, and reports it to its host
+            --alone                with --host evaluator: there is none beside it, and none is waited for or followed
             --host simulator       evaluator: CMD is a plain program, without the options below
             --python-path A:B:C    put in front of the image's own PYTHONPATH
             --route-runs N         the pair's routes times repetitions: CMD is not started on a checkpoint that has all of them
@@ -52,6 +55,9 @@ const WORK: &str = "/tmp/agent";
 
 /// Where the kubelet reads a container's last message. A flag and no variable: the environment is the image's.
 const TERMINATION_LOG: &str = "/dev/termination-log";
+
+/// The one option that needs no value.
+const ALONE: &str = "--alone";
 
 /// Work of one container.
 #[derive(Debug, Clone, PartialEq)]
@@ -68,6 +74,8 @@ pub struct Job {
     pub inotify: bool,
     /// Where devices and drivers are looked for.
     pub root: PathBuf,
+    /// True if an evaluator, or its agent, has no peer beside it.
+    pub alone: bool,
     pub role: Role,
     /// The command and its arguments; never empty.
     pub command: Vec<OsString>,
@@ -191,11 +199,20 @@ pub struct Kept {
     pub command: Vec<OsString>,
 }
 
+/// A folder that is copied, and nothing else.
+#[derive(Debug, Clone, PartialEq)]
+pub struct Copied {
+    pub from: PathBuf,
+    pub to: PathBuf,
+    pub termination_log: PathBuf,
+}
+
 /// Request of the command line.
 #[derive(Debug, PartialEq)]
 pub enum Request {
     Run(Box<Job>),
     Keep(Kept),
+    Copy(Copied),
     Version,
     Help,
 }
@@ -205,7 +222,7 @@ pub enum Request {
 pub enum UsageError {
     #[error("no arguments")]
     Nothing,
-    #[error("unknown subcommand {0:?}: simulator, evaluator, agent or keep")]
+    #[error("unknown subcommand {0:?}: simulator, evaluator, agent, keep or copy")]
     Subcommand(OsString),
     #[error("{0} is missing")]
     Missing(&'static str),
@@ -236,25 +253,28 @@ pub fn parse(arguments: impl IntoIterator<Item = OsString>) -> Result<Request, U
         Some("evaluator") => Side::Host(Host::Evaluator),
         Some("agent") => Side::Agent,
         Some("keep") => return keep(arguments).map(Request::Keep),
+        Some("copy") => return copy(arguments).map(Request::Copy),
         _ => return Err(UsageError::Subcommand(first)),
     };
     let mut options = Options::collect(&mut arguments)?;
     let command: Vec<OsString> = arguments.collect();
-    let job = Job {
+    let mut job = Job {
         pair: options.required("--pair", "a number from 1 to 999")?,
         status: options.path("--status")?,
         ready: options.seconds("--ready-seconds", 3600)?,
         grace: options.seconds("--grace-seconds", grace_seconds(side))?,
         peer: options.seconds("--peer-seconds", 600)?,
         log_limit: options.log_limit()?,
-        termination_log: options
-            .take("--termination-log")?
-            .map_or_else(|| TERMINATION_LOG.into(), PathBuf::from),
+        termination_log: options.termination_log()?,
         inotify: options.optional("--inotify", "true or false")?.unwrap_or(true),
         root: options.take("--root")?.map_or_else(|| "/".into(), PathBuf::from),
+        alone: false,
         role: role(side, &mut options)?,
         command,
     };
+    if job.host() == Host::Evaluator {
+        job.alone = options.optional(ALONE, "true or false")?.unwrap_or(false);
+    }
     options.finish()?;
     if job.command.is_empty() {
         return Err(UsageError::NoCommand);
@@ -274,6 +294,20 @@ fn keep(mut arguments: impl Iterator<Item = OsString>) -> Result<Kept, UsageErro
         return Err(UsageError::NoCommand);
     }
     Ok(kept)
+}
+
+fn copy(mut arguments: impl Iterator<Item = OsString>) -> Result<Copied, UsageError> {
+    let mut options = Options::collect(&mut arguments)?;
+    let copied = Copied {
+        from: options.path("--from")?,
+        to: options.path("--to")?,
+        termination_log: options.termination_log()?,
+    };
+    options.finish()?;
+    match arguments.next() {
+        None => Ok(copied),
+        Some(word) => Err(UsageError::Unknown(word.to_string_lossy().into_owned())),
+    }
 }
 
 /// An evaluator has to write down what it knows so far.
@@ -342,7 +376,7 @@ fn program(options: &mut Options) -> Result<Program, UsageError> {
 struct Options(Vec<(String, OsString)>);
 
 impl Options {
-    /// Collects up to and including `--`.
+    /// Collects up to and including `--`, or all.
     fn collect(arguments: &mut impl Iterator<Item = OsString>) -> Result<Self, UsageError> {
         let mut options = Vec::new();
         while let Some(argument) = arguments.next() {
@@ -359,11 +393,17 @@ impl Options {
                 return Err(UsageError::Unknown(name));
             }
             let value = value
+                .or_else(|| (name == ALONE).then(|| "true".into()))
                 .or_else(|| arguments.next())
                 .ok_or_else(|| UsageError::NoValue(name.clone()))?;
             options.push((name, value));
         }
-        Err(UsageError::NoCommand)
+        Ok(Self(options))
+    }
+
+    fn termination_log(&mut self) -> Result<PathBuf, UsageError> {
+        let path = self.take("--termination-log")?;
+        Ok(path.map_or_else(|| TERMINATION_LOG.into(), PathBuf::from))
     }
 
     fn log_limit(&mut self) -> Result<u64, UsageError> {

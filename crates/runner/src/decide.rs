@@ -10,7 +10,7 @@
 //! its peer has crashed in steps over it (its own crash file, no exit); one that has started is brought down. So
 //! the two counts meet again however far apart the containers restart.
 
-use leaderboard_protocol::verdict::{CODE_NO_PROCESS, CODE_NODE_REFUSED};
+use leaderboard_protocol::verdict::{CODE_NO_GRAPHICS, CODE_NO_PROCESS, CODE_NODE_REFUSED};
 use leaderboard_runner::args::{Program, Role, Server};
 
 /// Part of a container in its pair.
@@ -105,6 +105,18 @@ pub(crate) struct Seen {
     pub(crate) overdue: bool,
 }
 
+impl Seen {
+    /// What a container sees that has no peer: as if an agent's host had started, an evaluator's agent were done, and neither had crashed.
+    pub(crate) const fn alone(self, part: Part) -> Self {
+        Self {
+            peer_started: true,
+            peer_crashed: false,
+            peer_done: part.has_last_word(),
+            ..self
+        }
+    }
+}
+
 /// Why a round is stepped over without an exit.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 pub(crate) enum Skip {
@@ -122,7 +134,7 @@ pub(crate) enum Cause {
     PeerDone,
     /// The evaluator's result is complete.
     HasResult,
-    /// The agent is done, and its evaluator's result was not complete in time.
+    /// The agent is done, or there is none, and the evaluator's result was not complete in time.
     NoResult,
     PeerCrashed,
     Cancelled,
@@ -300,8 +312,6 @@ pub(crate) const CODE_OVER: i32 = 0;
 pub(crate) const CODE_CRASHED: i32 = 1;
 /// A SIGTERM from outside, as a shell reports it.
 pub(crate) const CODE_TERMINATED: i32 = 143;
-/// There is nothing to draw with (EX_UNAVAILABLE).
-pub(crate) const CODE_NO_GRAPHICS: i32 = 69;
 /// The last whole checkpoint cannot be put back, so the command could not go on where it was (EX_CANTCREAT).
 pub(crate) const CODE_NOT_RESUMED: i32 = 73;
 /// The status folder cannot be written (EX_IOERR).

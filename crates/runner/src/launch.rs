@@ -51,7 +51,16 @@ pub(crate) fn launch(job: &Job, round: u32) -> Result<(Group, Option<Tee>), Cann
                 Some(log) => teed(command, log.clone(), job.log_limit),
             }
         }
-        Role::Agent { work, program, .. } => {
+        Role::Agent {
+            work,
+            program,
+            report_gpu,
+            ..
+        } => {
+            if job.alone && *report_gpu && graphics::devices(&job.root) == 0 {
+                // No host reads its report.
+                return Err(NoGraphics::NoGpu.into());
+            }
             let environment = of_agent(program, round);
             let words = expand_all(&job.command, &environment);
             let log = work.join("leaderboard.log");

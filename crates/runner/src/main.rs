@@ -1,8 +1,9 @@
-//! `leaderboard-runner`: PID 1 of every simulator, evaluator and agent container, and of the host's contents. Parses its arguments and lives one life (`run`).
+//! `leaderboard-runner`: PID 1 of every simulator, evaluator and agent container, and of the host's contents and data. Parses its arguments and lives one life (`run`).
 //!
 //! It runs inside any image: no shell, any uid, a read-only root. It has one thread and no heap growth with the output.
 
 mod checkpoint;
+mod copy;
 mod decide;
 mod group;
 mod keep;
@@ -40,6 +41,7 @@ fn main() -> ExitCode {
     match args::parse(std::env::args_os().skip(1)) {
         Ok(Request::Run(job)) => run(|signals| Runner::new(*job, signals).run()),
         Ok(Request::Keep(kept)) => run(|signals| keep_output::run(kept, signals)),
+        Ok(Request::Copy(copied)) => run(|signals| copy::run(&copied, signals)),
         Ok(Request::Version) => print(concat!("leaderboard-runner ", env!("CARGO_PKG_VERSION"), "\n")),
         Ok(Request::Help) => print(args::USAGE),
         Err(error) => {

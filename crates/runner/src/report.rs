@@ -17,6 +17,8 @@ use crate::group::Status;
 pub(crate) struct End<'a> {
     pub(crate) part: Part,
     pub(crate) round: u32,
+    /// True if the container has no peer.
+    pub(crate) alone: bool,
     pub(crate) cause: Cause,
     /// How the command ended, if it was started.
     pub(crate) status: Option<Status>,
@@ -33,6 +35,7 @@ impl<'a> End<'a> {
         Self {
             part,
             round,
+            alone: false,
             cause,
             status: None,
             out_of_memory: false,
@@ -94,6 +97,7 @@ fn reason(end: &End<'_>) -> String {
         Cause::Terminated => "the container was ended from outside".to_owned(),
         Cause::AlreadyDone => "the worker was done before this container began".to_owned(),
         Cause::HasResult => "the evaluation has come to its end".to_owned(),
+        Cause::NoResult if end.alone => "the evaluator had no complete result in time".to_owned(),
         Cause::NoResult => "the agent is done, and the evaluator had no complete result in time".to_owned(),
         Cause::PeerDone => format!("the {peer} is done, so the {own} was stopped"),
         Cause::PeerCrashed => format!("the {peer} crashed, so the {own} was stopped"),
@@ -157,8 +161,8 @@ pub(crate) fn of_checkpoint(results: &Result<Checkpoint, Unreadable>) -> String 
     }
 }
 
-/// Replaces the termination message by `verdict`. A container without that file goes without.
-pub(crate) fn write(path: &Path, verdict: &Verdict) {
+/// Replaces the termination message. A container without that file goes without.
+pub(crate) fn write(path: &Path, message: &str) {
     let flags = OFlag::O_NOFOLLOW | OFlag::O_NONBLOCK | OFlag::O_NOCTTY;
     // Written in place: the file is a mount of its own, so nothing can be renamed over it.
     let opened = OpenOptions::new()
@@ -166,7 +170,7 @@ pub(crate) fn write(path: &Path, verdict: &Verdict) {
         .truncate(true)
         .custom_flags(flags.bits())
         .open(path);
-    let written = opened.and_then(|mut file| file.write_all(verdict.to_json().as_bytes()));
+    let written = opened.and_then(|mut file| file.write_all(message.as_bytes()));
     if let Err(error) = written
         && error.kind() != ErrorKind::NotFound
     {
@@ -181,6 +185,7 @@ mod tests {
     const END: End<'_> = End {
         part: Part::Driver,
         round: 2,
+        alone: false,
         cause: Cause::ChildEnded,
         status: Some(Status::Exited(3)),
         out_of_memory: false,
@@ -274,6 +279,16 @@ mod tests {
                 },
                 What::NoResult,
                 "the agent is done, and the evaluator had no complete result in time; its result is not final",
+            ),
+            (
+                End {
+                    part: Part::Evaluator,
+                    alone: true,
+                    cause: Cause::NoResult,
+                    ..END
+                },
+                What::NoResult,
+                "the evaluator had no complete result in time",
             ),
         ]);
     }

@@ -56,7 +56,7 @@ pub(crate) struct Runner {
     keeper: Option<Keeper>,
     /// An evaluator's.
     result: Option<result::Watched>,
-    /// When an evaluator that runs has seen that its agent is done.
+    /// When an evaluator that runs has seen that its agent is done; one that is alone, when it began to run.
     agent_done: Option<Instant>,
     memory_kills: u64,
     /// A port of the host's command that another container has.
@@ -160,15 +160,12 @@ impl Runner {
         let has_result = self.has_result();
         let (me, peer, round) = (self.me, self.peer, self.round);
         let of = |member, mark| StatusFile::Of(member, mark).exists(&self.job.status);
-        let peer_done = of(peer, Mark::Done);
-        let since = peer_done.then(|| self.agent_done.unwrap_or_else(Instant::now));
-        self.agent_done = since.filter(|_| self.phase == Phase::Running);
-        Seen {
+        let seen = Seen {
             own_started: of(me, Mark::Start(round)),
             own_done: of(me, Mark::Done),
             peer_started: of(peer, Mark::Start(round)),
             peer_crashed: of(peer, Mark::Crash(round)),
-            peer_done,
+            peer_done: of(peer, Mark::Done),
             has_result,
             cancel: StatusFile::Cancel.exists(&self.job.status),
             stored: StatusFile::Stored.exists(&self.job.status),
@@ -176,7 +173,14 @@ impl Runner {
             agent_gpu: self.agent_gpu(),
             terminated: self.terminated,
             idle: self.idle_left() == Some(Duration::ZERO),
+            overdue: false,
+        };
+        let seen = if self.job.alone { seen.alone(self.part) } else { seen };
+        let since = seen.peer_done.then(|| self.agent_done.unwrap_or_else(Instant::now));
+        self.agent_done = since.filter(|_| self.phase == Phase::Running);
+        Seen {
             overdue: self.time_left() == Some(Duration::ZERO),
+            ..seen
         }
     }
 
@@ -413,10 +417,10 @@ impl Runner {
 
     fn hold_limit(&self, hold: Hold) -> Duration {
         match (hold, &self.job.role) {
-            (Hold::Peer, _) => self.job.peer,
+            (Hold::Peer, _) if !self.job.alone => self.job.peer,
             (Hold::Flush, Role::Host { flush, .. }) => *flush,
             (Hold::Cancel, Role::Host { cancel, .. }) => *cancel,
-            (Hold::Free | Hold::Flush | Hold::Cancel, _) => Duration::ZERO,
+            _ => Duration::ZERO,
         }
     }
 
@@ -473,7 +477,10 @@ impl Runner {
 
     /// An end of which nothing but its cause is known.
     fn end(&self, cause: Cause) -> report::End<'_> {
-        report::End::of(self.part, self.round, cause, self.detail.as_deref())
+        report::End {
+            alone: self.job.alone,
+            ..report::End::of(self.part, self.round, cause, self.detail.as_deref())
+        }
     }
 
     fn report(&self, end: &report::End<'_>) {
@@ -483,7 +490,7 @@ impl Runner {
     }
 
     fn write_verdict(&self, verdict: &Verdict) {
-        report::write(&self.job.termination_log, verdict);
+        report::write(&self.job.termination_log, &verdict.to_json());
     }
 
     fn say(&self, text: &str) {

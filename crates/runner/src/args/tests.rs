@@ -134,7 +134,7 @@ fn each_mistake_is_named() {
         ("", "no arguments"),
         (
             "monitor",
-            "unknown subcommand \"monitor\": simulator, evaluator, agent or keep",
+            "unknown subcommand \"monitor\": simulator, evaluator, agent, keep or copy",
         ),
         ("simulator --status /s --port 1 -- a", "--pair is missing"),
         (
@@ -187,6 +187,18 @@ fn each_mistake_is_named() {
             "--port: \"0\" is not a port from 1 to 65535",
         ),
         (
+            "simulator --pair 1 --status /s --port 1 --alone -- a",
+            "unknown option --alone",
+        ),
+        (
+            "agent --pair 1 --status /s --checkpoint /c --alone -- a",
+            "unknown option --alone",
+        ),
+        (
+            "evaluator --pair 1 --status /s --results /r --alone=2 -- a",
+            "--alone: \"2\" is not true or false",
+        ),
+        (
             "agent --pair 1 --status /s --host evaluators -- a",
             "--host: \"evaluators\" is not simulator or evaluator",
         ),
@@ -226,6 +238,47 @@ fn a_command_may_be_kept_alone() {
         parsed("keep --log=/l --pair=1 -- a"),
         Err(UsageError::Unknown("--pair".into()))
     );
+}
+
+#[test]
+fn an_evaluator_and_its_agent_may_be_alone() {
+    for line in [
+        "evaluator --pair 1 --status /s --results /r",
+        "agent --pair 1 --status /s --host evaluator",
+    ] {
+        for (option, alone) in [
+            ("", false),
+            ("--alone", true),
+            ("--alone=true", true),
+            ("--alone=false", false),
+        ] {
+            assert_eq!(job(&format!("{line} {option} -- a")).alone, alone, "{line} {option}");
+        }
+    }
+}
+
+#[test]
+fn a_folder_is_copied_without_a_command() {
+    let copied = |termination_log: &str| {
+        Ok(Request::Copy(Copied {
+            from: "/d".into(),
+            to: "/t".into(),
+            termination_log: termination_log.into(),
+        }))
+    };
+    assert_eq!(parse_line("copy --from=/d --to /t"), copied("/dev/termination-log"));
+    assert_eq!(
+        parse_line("copy --from=/d --to=/t --termination-log=/l --"),
+        copied("/l")
+    );
+    for (line, message) in [
+        ("copy --from=/d", "--to is missing"),
+        ("copy --to=/d --from=", "--from: \"\" is not a path"),
+        ("copy --from=/d --to=/t --pair=1", "unknown option --pair"),
+        ("copy --from=/d --to=/t -- a", "unknown option a"),
+    ] {
+        assert_eq!(parse_line(line).unwrap_err().to_string(), message, "{line}");
+    }
 }
 
 #[test]

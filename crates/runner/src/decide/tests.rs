@@ -215,6 +215,45 @@ fn next_follows_the_table() {
     }
 }
 
+/// Nobody's marks count but its own, `logcopy`'s and the cancel.
+const ALONE: &[(Part, Phase, &str, Action)] = &[
+    (Plain, Opening, "", Launch),
+    (Plain, Opening, "peer-crashed peer-done overdue", Launch),
+    (Plain, Opening, "own-started", SILENT_DEATH),
+    (Plain, Opening, "own-started own-done", End(Cause::AlreadyDone)),
+    (Plain, Opening, "cancel", End(Cause::Cancelled)),
+    (Plain, Opening, "stored", End(Cause::Cancelled)),
+    (Plain, Running, "peer-crashed peer-done", Wait),
+    (Plain, Running, "ended cancel", End(Cause::ChildEnded)),
+    (Plain, Running, "cancel idle", End(Cause::Cancelled)),
+    (Plain, Running, "idle peer-crashed", End(Cause::Idle)),
+    (Evaluator, Opening, "peer-crashed", Launch),
+    (Evaluator, Opening, "own-started peer-crashed", SILENT_DEATH),
+    (Evaluator, Opening, "has-result", End(Cause::HasResult)),
+    (Evaluator, Opening, "cancel", End(Cause::Cancelled)),
+    (Evaluator, Booting, "ready peer-crashed", Announce),
+    (Evaluator, Booting, "ended peer-crashed", End(Cause::ChildEnded)),
+    (Evaluator, Running, "peer-crashed", Wait),
+    (Evaluator, Running, "overdue", End(Cause::NoResult)),
+    (Evaluator, Running, "ended peer-crashed", End(Cause::ChildEnded)),
+    (Evaluator, Running, "has-result overdue", End(Cause::HasResult)),
+    (Evaluator, Running, "cancel overdue", End(Cause::Cancelled)),
+];
+
+#[test]
+fn a_container_that_is_alone_follows_nobody() {
+    for (part, phase, words, expected) in ALONE {
+        let seen = seen(words).alone(*part);
+        assert_eq!(next(*part, *phase, &seen), *expected, "{part:?} {phase:?}: {words}");
+    }
+    for (part, cause) in [(Plain, Cause::ChildEnded), (Evaluator, Cause::NoResult)] {
+        let seen = seen("peer-crashed peer-done").alone(part);
+        let crashed = conclude(part, cause, false, &seen);
+        assert_eq!((crashed.mark, crashed.code), (CRASH, 1), "{part:?}");
+        assert_eq!(leave(part, crashed, &seen, true), Leave::Exit(1), "{part:?}");
+    }
+}
+
 /// A cause, whether all is complete, what is seen, and what is concluded.
 type Concluded = (Cause, bool, &'static str, Option<EndMark>, Hold, i32);
 

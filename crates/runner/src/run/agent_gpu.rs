@@ -27,7 +27,7 @@ impl Runner {
 
     /// GPU of the agent, as its host has read it.
     pub(super) fn agent_gpu(&self) -> AgentGpu {
-        let is_asked = matches!(self.job.role, Role::Host { agent_gpu: true, .. });
+        let is_asked = !self.job.alone && matches!(self.job.role, Role::Host { agent_gpu: true, .. });
         if !is_asked || self.phase != Phase::Booting || self.has_announced() {
             return AgentGpu::NotAsked;
         }

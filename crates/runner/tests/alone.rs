@@ -1,0 +1,139 @@
+//! An evaluator, or its agent, that has no peer beside it, as a real process: it waits for nobody and follows nobody.
+
+#![allow(clippy::unwrap_used, clippy::panic, reason = "a test that cannot go on fails")]
+
+mod support;
+
+use std::fs;
+use std::time::{Duration, Instant};
+
+use leaderboard_protocol::files::{Mark, StatusFile};
+use leaderboard_protocol::verdict::{CODE_NO_GRAPHICS, What};
+use support::{AGENT, Container, EVALUATOR, Pod};
+
+const MOMENT: Duration = Duration::from_millis(300);
+const FINAL: &str = r#"echo '{"final":true,"splits":[]}' > $RESULT"#;
+/// Ends of the other side in the first round, which it may have forged.
+const ENDS: [Mark; 2] = [Mark::Crash(0), Mark::Done];
+
+fn agent(pod: &Pod, script: &str, options: &[&str]) -> Container {
+    pod.plain(script, &[&["--alone"], options].concat())
+}
+
+fn evaluator(pod: &Pod, script: &str, options: &[&str]) -> Container {
+    pod.evaluator(script, &[&["--alone"], options].concat())
+}
+
+fn is_stored(pod: &Pod, evaluator: &mut Container) {
+    pod.until(EVALUATOR, Mark::Done);
+    assert!(
+        evaluator.stays(MOMENT),
+        "it holds its exit until the results are stored"
+    );
+    pod.write(StatusFile::Stored);
+    assert_eq!((evaluator.code(), evaluator.verdict().what), (0, What::Finished));
+}
+
+#[test]
+fn an_agent_runs_once_to_its_end() {
+    let pod = Pod::new();
+    let script = format!("echo ran >> {}", pod.path("said").display());
+    let mut first = agent(&pod, &script, &[]);
+    assert_eq!((first.code(), first.verdict().what), (0, What::Exited));
+    let mut again = agent(&pod, &script, &[]);
+    assert_eq!((again.code(), again.verdict().what), (0, What::Finished));
+    assert_eq!(fs::read_to_string(pod.path("said")).unwrap(), "ran\n");
+    assert_eq!(pod.files(AGENT), ["agent-1.done", "agent-1.start0"]);
+}
+
+#[test]
+fn an_agent_that_crashes_leaves_at_once_and_is_run_again() {
+    let pod = Pod::new();
+    for mark in ENDS {
+        pod.write(StatusFile::Of(EVALUATOR, mark));
+    }
+    let mut first = agent(&pod, "exit 3", &[]);
+    assert_eq!(first.code(), 1);
+    let verdict = first.verdict();
+    assert_eq!((verdict.what, verdict.exit_code), (What::Exited, Some(3)));
+    let mut silent = agent(&pod, "exec sleep 1000", &["--idle-seconds=1"]);
+    assert_eq!((silent.code(), silent.verdict().what), (1, What::Idle));
+    let mut killed = agent(&pod, "exec sleep 1000", &[]);
+    pod.until(AGENT, Mark::Start(2));
+    killed.kill_without_a_word();
+    let mut last = agent(&pod, "exit 0", &[]);
+    assert_eq!(last.code(), 0);
+    for mark in [Mark::Crash(2), Mark::Start(3), Mark::Done] {
+        assert!(pod.has(AGENT, mark), "{mark:?}");
+    }
+}
+
+#[test]
+fn a_cancel_ends_an_agent_at_once_and_an_evaluator_when_all_is_stored() {
+    let pod = Pod::new();
+    let mut agent = agent(&pod, "exec sleep 1000", &[]);
+    let mut evaluator = evaluator(&pod, "exec sleep 1000", &[]);
+    pod.until(AGENT, Mark::Start(0));
+    pod.until(EVALUATOR, Mark::Start(0));
+    pod.write(StatusFile::Cancel);
+    assert_eq!((agent.code(), agent.verdict().what), (0, What::Cancelled));
+    assert!(evaluator.stays(MOMENT));
+    pod.write(StatusFile::Stored);
+    assert_eq!((evaluator.code(), evaluator.verdict().what), (0, What::Cancelled));
+    assert!(!pod.has(AGENT, Mark::Done) && !pod.has(EVALUATOR, Mark::Done));
+}
+
+#[test]
+fn an_agent_that_is_to_have_a_gpu_and_sees_none_is_not_begun() {
+    let pod = Pod::new();
+    let never = pod.path("never");
+    let root = format!("--root={}", pod.path("root").display());
+    let options = ["--report-gpu=true", &root];
+    let script = format!("touch {}", never.display());
+    let mut first = agent(&pod, &script, &options);
+    assert_eq!((first.code(), first.verdict().what), (CODE_NO_GRAPHICS, What::NoGpu));
+    pod.write(StatusFile::Of(AGENT, Mark::Done));
+    let mut done = agent(&pod, &script, &options);
+    assert_eq!(done.code(), 0, "{}", done.stderr());
+    assert!(!never.exists());
+}
+
+#[test]
+fn an_evaluator_follows_no_mark_of_an_agent() {
+    let pod = Pod::new();
+    for file in ENDS.map(|mark| StatusFile::Of(AGENT, mark)) {
+        pod.write(file);
+    }
+    pod.write(StatusFile::Gpu(AGENT, false));
+    let go = pod.path("go");
+    let script = format!("until [ -e {} ]; do sleep 0.02; done; {FINAL}", go.display());
+    let mut evaluator = evaluator(&pod, &script, &["--agent-gpu=true"]);
+    pod.until(EVALUATOR, Mark::Start(0));
+    assert!(evaluator.stays(MOMENT));
+    fs::write(go, "").unwrap();
+    is_stored(&pod, &mut evaluator);
+    assert_eq!(pod.files(EVALUATOR), ["evaluator-1.done", "evaluator-1.start0"]);
+}
+
+#[test]
+fn an_evaluator_has_its_time_from_its_own_start() {
+    let pod = Pod::new();
+    let began = Instant::now();
+    let mut evaluator = evaluator(&pod, "exec sleep 1000", &["--answer-seconds=1"]);
+    assert_eq!(evaluator.code(), 1);
+    assert!(began.elapsed() >= Duration::from_secs(1));
+    let verdict = evaluator.verdict();
+    let why = "the evaluator had no complete result in time; there is no result file";
+    assert_eq!((verdict.what, verdict.why.as_str()), (What::NoResult, why));
+    assert_eq!(pod.files(EVALUATOR), ["evaluator-1.crash0", "evaluator-1.start0"]);
+}
+
+#[test]
+fn an_evaluator_that_crashes_leaves_at_once_and_may_refuse_in_the_next_round() {
+    let pod = Pod::new();
+    let mut first = evaluator(&pod, "exit 4", &[]);
+    assert_eq!((first.code(), first.verdict().what), (1, What::Exited));
+    let mut refusing = evaluator(&pod, "exit 65", &[]);
+    is_stored(&pod, &mut refusing);
+    assert!(fs::read_to_string(pod.result()).unwrap().contains("refused"));
+}
