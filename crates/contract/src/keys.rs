@@ -21,6 +21,8 @@ pub const REFUSED: &str = "logcopy/refused/";
 pub const OWN_LOG: &str = "logcopy/logcopy.log";
 /// The log of `workspace`.
 pub const WORKSPACE_LOG: &str = "logcopy/workspace.log";
+/// The log of `collect`.
+pub const COLLECT_LOG: &str = "logcopy/collect.log";
 /// The output of the host's contents. The runner writes it.
 pub const CONTENTS_LOG: &str = "contents/contents.log";
 

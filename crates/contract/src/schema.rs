@@ -1,12 +1,13 @@
 //! Tests of the documents between the controller and its Pods, against the files of `golden/`: a run lasts days, and an upgrade of the
 //! operator does not wait for it.
 //!
-//! `report`, `run`, the verdict of `workspace` and the owner's mark carry a number each. A field that an older reader can do without
+//! `report`, `run`, the verdict of `workspace`, the list of `collect` and the owner's mark carry a number each. A field that an older reader can do without
 //! changes no number. Anything else does; the number before is then read too, and keeps its file.
 
 use serde::Serialize;
 use serde_json::Value;
 
+use crate::collected::{Collected, SCHEMA as COLLECTED_SCHEMA};
 use crate::report::{OWNER_SCHEMA, Owner, Report, ReportError, SCHEMA as REPORT_SCHEMA};
 use crate::run::{Run, SCHEMA as RUN_SCHEMA};
 use crate::verdict::{NotAVerdict, VERDICT_SCHEMA, WorkspaceReason, WorkspaceVerdict};
@@ -16,6 +17,8 @@ const REPORT_1: &str = include_str!("golden/report-1.json");
 const REPORT_1_CONTAINER: &str = include_str!("golden/report-1-container.json");
 const RUN_1: &str = include_str!("golden/run-1.json");
 const RUN_1_CONTAINER: &str = include_str!("golden/run-1-container.json");
+const RUN_1_PREDICTIONS: &str = include_str!("golden/run-1-predictions.json");
+const COLLECTED_1: &str = include_str!("golden/collected-1.json");
 const WORKSPACE_1: &str = include_str!("golden/workspace-1.json");
 const OWNER_1: &str = include_str!("golden/owner-1.json");
 
@@ -47,6 +50,22 @@ fn each_version_of_the_run_is_read() {
     let run: Run = serde_json::from_str(RUN_1_CONTAINER).unwrap();
     assert!(run.plan.container().is_some() && run.plan.workers() == 2);
     assert_round_trip(RUN_1_CONTAINER, &run);
+    let run: Run = serde_json::from_str(RUN_1_PREDICTIONS).unwrap();
+    assert!(run.plan.image.is_none() && run.input.as_ref().is_some_and(|input| input.size == 5));
+    assert_round_trip(RUN_1_PREDICTIONS, &run);
+}
+
+#[test]
+fn each_version_of_the_list_of_collect_is_read() {
+    assert_eq!(COLLECTED_SCHEMA, 1, "a new version needs a golden file of its own");
+    let list = Collected::parse(COLLECTED_1.as_bytes()).unwrap();
+    assert_eq!((list.files.len(), list.bytes()), (2, 5));
+    assert_round_trip(COLLECTED_1, &list);
+    assert_eq!(Collected::parse(&list.to_json()), Some(list));
+    let newer = COLLECTED_1.replacen("\"schema\": 1", "\"schema\": 2", 1);
+    for unknown in [newer.as_str(), "{\"schema\": 1", "{}"] {
+        assert_eq!(Collected::parse(unknown.as_bytes()), None, "{unknown}");
+    }
 }
 
 #[test]
