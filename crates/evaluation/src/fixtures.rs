@@ -6,8 +6,8 @@ use std::path::Path;
 use leaderboard_protocol::files::{Mark, Member, Pair, Side, StatusFile};
 
 use leaderboard_api::{
-    Attempt, ByteQuantity, CarlaPlan, ContainerPlan, EvaluationMode, LeaderboardVersion, MergeMethod, Order,
-    PlannedEvaluation, RouteSlice, RunPlan, S3Bucket, ScoreMetric, Storage, Verify,
+    Attempt, ByteQuantity, CarlaPlan, ContainerPlan, EvaluationMode, InputBounds, LeaderboardVersion, MergeMethod,
+    Order, PlannedEvaluation, RouteSlice, RunPlan, S3Bucket, ScoreMetric, Storage, Verify,
 };
 use leaderboard_contract::run::{Run, SCHEMA, STATUS_FOLDER};
 
@@ -34,7 +34,7 @@ pub fn run() -> Run {
                     storage_class: None,
                 },
             },
-            image: "image".to_owned(),
+            image: Some("image".to_owned()),
             evaluation: PlannedEvaluation::Carla(CarlaPlan {
                 version: LeaderboardVersion::V2,
                 codename: "SENSORS".into(),
@@ -48,6 +48,7 @@ pub fn run() -> Run {
             earlier_attempts: 0,
             submission_uid: None,
         },
+        input: None,
         verify: Verify::Disabled,
         period_seconds: 1,
         flush_seconds: 60,
@@ -68,11 +69,17 @@ pub fn run_of(slices: Vec<RouteSlice>) -> Run {
 
 /// Two workers of a host's evaluator, in phase 7.
 pub fn container_run() -> Run {
+    run_of_mode(EvaluationMode::Interactive)
+}
+
+/// The same in another mode.
+pub fn run_of_mode(mode: EvaluationMode) -> Run {
     let mut run = run();
     run.plan.track = "test".into();
     run.plan.phase = Some(7);
+    run.plan.image = run.plan.image.filter(|_| mode.has_agent());
     run.plan.evaluation = PlannedEvaluation::Container(ContainerPlan {
-        mode: EvaluationMode::Interactive,
+        mode,
         workers: 2,
         merge: MergeMethod::Mean,
         score: ScoreMetric {
@@ -81,6 +88,7 @@ pub fn container_run() -> Run {
             order: Order::Descending,
         },
         image: "evaluator".into(),
+        input: mode.has_input().then(InputBounds::default),
     });
     run
 }

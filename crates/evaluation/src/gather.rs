@@ -8,6 +8,7 @@ use std::fmt::Debug;
 use std::path::PathBuf;
 use std::sync::Arc;
 
+use leaderboard_api::Agents;
 use leaderboard_contract::keys::results_path;
 use leaderboard_contract::report::{RefusedResults, ReportWorker};
 use leaderboard_contract::run::{Run, STATUS_FOLDER};
@@ -101,6 +102,7 @@ pub(crate) struct Gatherer<K: Kind> {
     kind: K,
     tree: Arc<Tree>,
     status: PathBuf,
+    agents: Agents,
     workers: Vec<Worker<K::Found>>,
     merged: Option<Arc<Summary>>,
     texts: Arc<Texts>,
@@ -114,7 +116,7 @@ impl<K: Kind> Results for Gatherer<K> {
         let seen: Vec<WorkerSeen> = self
             .workers
             .iter()
-            .map(|worker| WorkerSeen::read(&self.status, worker.pair, K::HOST))
+            .map(|worker| WorkerSeen::read(&self.status, worker.pair, K::HOST, self.agents))
             .collect();
         let mut changed = false;
         for index in 0..self.workers.len() {
@@ -160,6 +162,7 @@ impl<K: Kind> Gatherer<K> {
         });
         let mut gatherer = Self {
             status: tree.path().join(STATUS_FOLDER),
+            agents: run.plan.agents(),
             workers: workers.collect(),
             kind,
             tree,

@@ -5,7 +5,7 @@ use std::path::Path;
 use std::sync::Arc;
 
 use bytes::Bytes;
-use leaderboard_api::{Metric, WorkerState};
+use leaderboard_api::{Agents, Metric, WorkerState};
 use leaderboard_contract::keys::EVALAI;
 use leaderboard_contract::report::{Outcome, RefusedResults, ReportWorker, StoredFile};
 use leaderboard_protocol::files::{Host, Pair, Progress};
@@ -24,8 +24,8 @@ pub struct Refused {
 /// One worker, as its status files show it.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 pub struct WorkerSeen {
-    /// From its agent's folder.
-    pub agent: Progress,
+    /// From its agent's folder; `None` for a worker without one. An agent that runs before all evaluators is the first worker's.
+    pub agent: Option<Progress>,
     /// From its host's folder.
     pub host: Progress,
     /// The side with the last word on the results is done.
@@ -33,29 +33,42 @@ pub struct WorkerSeen {
 }
 
 impl WorkerSeen {
-    pub(crate) fn read(status: &Path, pair: Pair, kind: Host) -> Self {
-        let agent = Progress::read(status, pair.agent());
+    pub(crate) fn read(status: &Path, pair: Pair, kind: Host, agents: Agents) -> Self {
+        let has_agent = match agents {
+            Agents::Beside => true,
+            Agents::First => pair.index() == 0,
+            Agents::Absent => false,
+        };
+        let agent = has_agent.then(|| Progress::read(status, pair.agent()));
         let host = Progress::read(status, pair.host(kind));
         let done = match kind {
-            Host::Simulator => agent.done,
+            Host::Simulator => agent.is_some_and(|agent| agent.done),
             Host::Evaluator => host.done,
         };
         Self { agent, host, done }
     }
 
+    /// True if one of its containers has begun, and may be running.
+    pub fn has_started(&self) -> bool {
+        self.host.started || self.agent.is_some_and(|agent| agent.started)
+    }
+
     /// `Waiting`, `Running`, `Done` or `Crashed`; the last means between a crash and the next start.
     pub fn state(&self) -> WorkerState {
+        // One that is done says nothing of an evaluator that starts after it.
+        let agent = self.agent.filter(|agent| !agent.done).unwrap_or_default();
         match self {
             Self { done: true, .. } => WorkerState::Done,
-            Self { agent, host, .. } if agent.started || host.started => WorkerState::Running,
-            _ if self.crashes() > 0 => WorkerState::Crashed,
+            Self { host, .. } if agent.started || host.started => WorkerState::Running,
+            Self { host, .. } if agent.crashes.max(host.crashes) > 0 => WorkerState::Crashed,
             _ => WorkerState::Waiting,
         }
     }
 
     /// Number of crashes of the side that had more, the agent's or the host's.
     pub fn crashes(&self) -> u32 {
-        self.agent.crashes.max(self.host.crashes)
+        let of_agent = self.agent.map_or(0, |agent| agent.crashes);
+        of_agent.max(self.host.crashes)
     }
 }
 

@@ -5,7 +5,7 @@
 
 use std::time::Duration;
 
-use crate::Gathered;
+use crate::{Gathered, WorkerSeen};
 use leaderboard_contract::report::RefusedResults;
 use leaderboard_contract::run::Stop;
 
@@ -136,10 +136,7 @@ impl Judge {
             whole,
             complete: self.complete.map(since),
             all_done: gathered.seen.iter().all(|worker| worker.done),
-            any_started: gathered
-                .seen
-                .iter()
-                .any(|worker| worker.agent.started || worker.host.started),
+            any_started: gathered.seen.iter().any(WorkerSeen::has_started),
             stop: outside.stop,
             spoiled: self.spoiled.clone().map(|(ending, then)| (ending, since(then))),
             cancelled: self.cancelled.map(since),

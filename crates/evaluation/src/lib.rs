@@ -23,14 +23,14 @@ pub mod workload;
 
 use std::sync::Arc;
 
-use leaderboard_api::{LeaderboardSpec, PlannedEvaluation, Ranking, RunPlan, Track};
+use leaderboard_api::{Agents, LeaderboardSpec, PlannedEvaluation, Ranking, RunPlan, Track};
 use leaderboard_contract::run::Run;
 use leaderboard_evidence::{Tree, TreeError};
 use leaderboard_protocol::files::{Host, Pair};
 
 pub use gathered::{Gathered, Object, Objects, Refused, Summary, Texts, WorkerSeen};
 pub use leaderboard_results::number_text;
-use workload::{Asked, Contents, Reserved, Workload};
+use workload::{Asked, Contents, Data, Reserved, Workload};
 
 /// One kind of evaluation.
 pub trait Evaluation {
@@ -38,6 +38,11 @@ pub trait Evaluation {
 
     /// Program in the containers with the host's image.
     fn host(&self) -> Host;
+
+    /// How its agents stand to these containers.
+    fn agents(&self) -> Agents {
+        Agents::Beside
+    }
 
     /// The numbers of a result, in EvalAI's order; empty where EvalAI's own labels are taken.
     fn columns(&self) -> Vec<Column>;
@@ -48,8 +53,13 @@ pub trait Evaluation {
     /// The number that ranks a track, and its order, where EvalAI names none.
     fn ranking(&self, track: &Track) -> Ranking;
 
-    /// Names that no host may use.
-    fn reserved(&self) -> Reserved;
+    /// Names that the host of this Leaderboard may not use.
+    fn reserved(&self, spec: &LeaderboardSpec) -> Reserved;
+
+    /// Data of the host's, each in a volume of its own.
+    fn data<'a>(&self, _spec: &'a LeaderboardSpec) -> Vec<Data<'a>> {
+        Vec::new()
+    }
 
     /// The container that fills the volumes with what the host keeps private, before the workers start; `None` if there is none.
     fn contents(&self, asked: &Asked<'_>) -> Option<Contents>;
@@ -82,7 +92,7 @@ pub struct Words {
     pub unit: &'static str,
     /// The container with the host's image.
     pub host: &'static str,
-    /// One worker: a container with the host's image and its agent.
+    /// One worker: a container with the host's image, and its agent if it has one.
     pub worker: &'static str,
     /// What a participant can try an agent on, in the plural.
     pub practice: &'static str,
@@ -100,7 +110,7 @@ const PLAIN: Words = Words {
     worker: "worker",
     practice: "data",
     after_refused: "Correct this, and submit again.",
-    after_rejected: "Compare the agent with the rules of the challenge, and submit again.",
+    after_rejected: "Compare the submission with the rules of the challenge, and submit again.",
 };
 
 /// One number of a result, under both of its names.
@@ -116,7 +126,7 @@ pub struct Column {
 pub fn of(spec: &LeaderboardSpec) -> &'static dyn Evaluation {
     match &spec.evaluation {
         leaderboard_api::Evaluation::Carla(carla) => carla::of(carla.version),
-        leaderboard_api::Evaluation::Container(_) => &container::Container,
+        leaderboard_api::Evaluation::Container(container) => container::of(container.mode),
     }
 }
 
@@ -124,7 +134,7 @@ pub fn of(spec: &LeaderboardSpec) -> &'static dyn Evaluation {
 pub fn of_plan(plan: &RunPlan) -> &'static dyn Evaluation {
     match &plan.evaluation {
         PlannedEvaluation::Carla(carla) => carla::of(carla.version),
-        PlannedEvaluation::Container(_) => &container::Container,
+        PlannedEvaluation::Container(container) => container::of(container.mode),
     }
 }
 

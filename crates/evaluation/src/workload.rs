@@ -1,6 +1,6 @@
 //! The containers of a Pod, as plain data. A kind of evaluation describes them, and `pod-spec` makes Kubernetes' objects of them.
 
-use leaderboard_api::{Attempt, Deadlines, LeaderboardSpec, RunPlan, Track};
+use leaderboard_api::{Attempt, DataSource, Deadlines, LeaderboardSpec, RunPlan, Track};
 use leaderboard_protocol::graphics::Needs;
 
 /// An agent's own folder, in its container.
@@ -9,14 +9,23 @@ pub(crate) const AGENT: &str = "/tmp/agent";
 pub(crate) const HOST_LOG_LIMIT: u64 = 64 << 20;
 
 /// Names that a kind of evaluation uses itself, so that no host gives them another meaning.
-#[derive(Clone, Copy, Debug, PartialEq, Eq)]
+#[derive(Clone, Debug, PartialEq, Eq)]
 pub struct Reserved {
     /// Variables of the workers' containers.
-    pub env: &'static [&'static str],
+    pub env: Vec<&'static str>,
     /// Volumes that `contents` fills.
     pub volumes: &'static [ContentsVolume],
-    /// Folders that the workers' containers write.
-    pub folders: &'static [&'static str],
+    /// Folders that the workers' containers have for themselves.
+    pub folders: Vec<&'static str>,
+}
+
+/// Data of the host's, in a volume that nobody but the operator mounts.
+#[derive(Clone, Copy, Debug)]
+pub struct Data<'a> {
+    pub volume: ContentsVolume,
+    /// Variable with the folder in which the workers read it.
+    pub variable: &'static str,
+    pub source: &'a DataSource,
 }
 
 /// The input of a workload: the spec, the plan, and the settings of the run.
@@ -75,19 +84,21 @@ pub struct Role {
 pub enum Mount {
     /// A folder of the `logs` volume that the container writes.
     Own { folder: String, path: &'static str },
-    /// A volume with the private contents, read-only.
+    /// A folder of the `logs` volume, read-only.
+    Read { folder: &'static str, path: &'static str },
+    /// A volume with the private contents, or with data of the host's, read-only.
     Contents(ContentsVolume),
     /// A folder of the node, read-only, which the node must have.
     OfNode { volume: &'static str, path: &'static str },
 }
 
-/// A volume that `contents` fills.
+/// A volume that an init container fills.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 pub struct ContentsVolume {
     pub name: &'static str,
-    /// Where `contents` writes it.
+    /// Where the init container writes it.
     pub written: &'static str,
-    /// Where the agents read it.
+    /// Where the workers read it.
     pub read: &'static str,
 }
 

@@ -9,7 +9,7 @@ mod workload;
 
 use std::sync::Arc;
 
-use leaderboard_api::{LeaderboardVersion, Order, Ranking, Track};
+use leaderboard_api::{LeaderboardSpec, LeaderboardVersion, Order, Ranking, Track};
 use leaderboard_contract::run::Run;
 use leaderboard_evidence::Tree;
 use leaderboard_protocol::files::{Host, Pair};
@@ -72,8 +72,8 @@ impl Evaluation for Carla {
         }
     }
 
-    fn reserved(&self) -> Reserved {
-        workload::RESERVED
+    fn reserved(&self, _spec: &LeaderboardSpec) -> Reserved {
+        workload::reserved()
     }
 
     fn contents(&self, asked: &Asked<'_>) -> Option<Contents> {

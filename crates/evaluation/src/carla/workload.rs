@@ -52,11 +52,13 @@ const FIXED_ENV: [&str; 12] = [
     "LEADERBOARD_ROOT",
 ];
 
-pub(super) const RESERVED: Reserved = Reserved {
-    env: &FIXED_ENV,
-    volumes: &CONTENTS_VOLUMES,
-    folders: &[AGENT, SAVED],
-};
+pub(super) fn reserved() -> Reserved {
+    Reserved {
+        env: FIXED_ENV.to_vec(),
+        volumes: &CONTENTS_VOLUMES,
+        folders: vec![AGENT, SAVED],
+    }
+}
 
 /// Settings of a workload, of this kind.
 struct Known<'a> {
@@ -94,7 +96,7 @@ pub(super) fn workload(asked: &Asked<'_>, pair: Pair) -> Option<Workload> {
     let known = Known::of(asked)?;
     Some(Workload {
         host: simulator(&known, pair),
-        agent: Some(agent(&known, pair)),
+        agent: Some(agent(&known, pair)?),
     })
 }
 
@@ -144,7 +146,8 @@ fn adapter(spec: &SimulatorContainer, has_gpus: bool) -> Adapter {
     }
 }
 
-fn agent(known: &Known<'_>, pair: Pair) -> Role {
+/// `None` for a submission without an image.
+fn agent(known: &Known<'_>, pair: Pair) -> Option<Role> {
     let (spec, deadlines) = (&known.asked.spec.agent, &known.asked.deadlines);
     let flags = vec![
         format!("--work={AGENT}"),
@@ -161,8 +164,8 @@ fn agent(known: &Known<'_>, pair: Pair) -> Role {
         folder: agent_folder(pair),
         path: AGENT,
     };
-    Role {
-        image: known.asked.plan.image.clone(),
+    Some(Role {
+        image: known.asked.plan.image.clone()?,
         flags,
         // The runner expands these words, so that RESUME is what it is in this round.
         command: words.iter().map(|word| literal(word)).collect(),
@@ -171,7 +174,7 @@ fn agent(known: &Known<'_>, pair: Pair) -> Role {
         shm: spec.shm_size.as_ref().map(ByteQuantity::bytes),
         removes: &[],
         draws: None,
-    }
+    })
 }
 
 /// How many route runs the pair's evaluator is to drive; 0 if there were no slice for it.

@@ -1,7 +1,7 @@
 //! A container's part of a round: the results of its evaluators read and merged.
 
 use leaderboard_api::evaluator_result::{MAX_BYTES, ResultFile, parse};
-use leaderboard_api::{ContainerPlan, WorkerState};
+use leaderboard_api::{ContainerPlan, MAX_NAME, WorkerState};
 use leaderboard_contract::keys::{RESULT_FILE, RESULTS, STDOUT};
 use leaderboard_contract::report::{RefusedResults, ReportWorker};
 use leaderboard_contract::run::Run;
@@ -14,6 +14,9 @@ use crate::judge::Ending;
 use crate::{Object, Refused};
 
 pub(crate) type Gatherer = gather::Gatherer<Evaluators>;
+
+/// Next step for a plan that no operator of this version makes.
+const OF_VERSIONS: &str = "Operator and Pod must be of the same version";
 
 /// The results of all evaluators.
 #[derive(Debug)]
@@ -28,14 +31,19 @@ impl Kind for Evaluators {
     const FAULT: fn(RefusedResults) -> Ending = Ending::Unusable;
 
     fn of(run: &Run) -> Result<Self, Refused> {
-        let refused = |problem: &str| Refused {
+        let refused = |problem: &str, next_step: &str| Refused {
             problem: format!("the plan of the run does not hold: {problem}"),
-            next_step: "Operator and Pod must be of the same version".to_owned(),
+            next_step: next_step.to_owned(),
         };
         let plan = run.plan.container();
-        let plan = plan.ok_or_else(|| refused("it is of another kind of evaluation"))?;
+        let plan = plan.ok_or_else(|| refused("it is of another kind of evaluation", OF_VERSIONS))?;
         if run.plan.workers() == 0 {
-            return Err(refused("it has no worker"));
+            return Err(refused("it has no worker", OF_VERSIONS));
+        }
+        // A status could not show it, and the run would end without a score.
+        if plan.score.name().chars().count() > MAX_NAME {
+            let problem = format!("the name of its score has more than {MAX_NAME} characters");
+            return Err(refused(&problem, "Set shorter names in tracks[].container.score"));
         }
         Ok(Self(plan.clone()))
     }

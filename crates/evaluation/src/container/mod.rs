@@ -1,4 +1,4 @@
-//! A container of the host's: each worker's evaluator runs beside an agent and writes `result.json`.
+//! A container of the host's: each worker's evaluator writes `result.json`, about an agent beside it, or about files.
 
 mod gather;
 mod merge;
@@ -6,18 +6,18 @@ mod workload;
 
 use std::sync::Arc;
 
-use leaderboard_api::{Order, Ranking, ScoreMetric, Track};
+use leaderboard_api::{Agents, EvaluationMode, LeaderboardSpec, Order, Ranking, ScoreMetric, Track};
 use leaderboard_contract::run::Run;
 use leaderboard_evidence::Tree;
 use leaderboard_protocol::files::{Host, Pair};
 
 use crate::gather::Kind;
-use crate::workload::{Asked, Contents, Reserved, Workload};
+use crate::workload::{Asked, Contents, Data, Reserved, Workload};
 use crate::{Column, Evaluation, Refused, Results, Words};
 use gather::{Evaluators, Gatherer};
 
 const HOST: Host = Host::Evaluator;
-const WORDS: Words = Words {
+const INTERACTIVE: Words = Words {
     units: "units",
     unit: "unit",
     host: HOST.name(),
@@ -26,18 +26,48 @@ const WORDS: Words = Words {
     after_refused: "Check what the agent sends to the evaluator, and submit again.",
     after_rejected: "Compare the agent with the rules of the challenge, and submit again.",
 };
+const BATCH: Words = Words {
+    after_refused: "Check the files that the agent writes, and submit again.",
+    ..INTERACTIVE
+};
+const PREDICTIONS: Words = Words {
+    after_refused: "Check the submitted file, and submit again.",
+    after_rejected: "Compare the submitted file with the rules of the challenge, and submit again.",
+    ..INTERACTIVE
+};
 
 /// An evaluation by a container of the host's.
 #[derive(Clone, Copy, Debug)]
-pub(crate) struct Container;
+struct Container(EvaluationMode);
+
+/// The member of a mode.
+pub(crate) fn of(mode: EvaluationMode) -> &'static dyn Evaluation {
+    match mode {
+        EvaluationMode::Interactive => &Container(EvaluationMode::Interactive),
+        EvaluationMode::Batch => &Container(EvaluationMode::Batch),
+        EvaluationMode::Predictions => &Container(EvaluationMode::Predictions),
+    }
+}
 
 impl Evaluation for Container {
     fn words(&self) -> &'static Words {
-        &WORDS
+        match self.0 {
+            EvaluationMode::Interactive => &INTERACTIVE,
+            EvaluationMode::Batch => &BATCH,
+            EvaluationMode::Predictions => &PREDICTIONS,
+        }
     }
 
     fn host(&self) -> Host {
         HOST
+    }
+
+    fn agents(&self) -> Agents {
+        match self.0 {
+            EvaluationMode::Interactive => Agents::Beside,
+            EvaluationMode::Batch => Agents::First,
+            EvaluationMode::Predictions => Agents::Absent,
+        }
     }
 
     fn columns(&self) -> Vec<Column> {
@@ -58,8 +88,12 @@ impl Evaluation for Container {
         }
     }
 
-    fn reserved(&self) -> Reserved {
-        workload::RESERVED
+    fn reserved(&self, spec: &LeaderboardSpec) -> Reserved {
+        workload::reserved(self.0, spec)
+    }
+
+    fn data<'a>(&self, spec: &'a LeaderboardSpec) -> Vec<Data<'a>> {
+        workload::data(spec)
     }
 
     fn contents(&self, _asked: &Asked<'_>) -> Option<Contents> {
@@ -77,5 +111,24 @@ impl Evaluation for Container {
 
     fn results(&self, run: &Run, tree: Arc<Tree>) -> Result<Box<dyn Results>, Refused> {
         Ok(Box::new(Gatherer::new(run, tree)?))
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn nobody_reads_of_an_agent_where_there_is_none() {
+        for (mode, agents) in [
+            (EvaluationMode::Interactive, Agents::Beside),
+            (EvaluationMode::Batch, Agents::First),
+            (EvaluationMode::Predictions, Agents::Absent),
+        ] {
+            let member = of(mode);
+            assert_eq!(member.agents(), agents);
+            let names_agent = format!("{:?}", member.words()).contains("agent");
+            assert_eq!(names_agent, agents != Agents::Absent, "{:?}", member.words());
+        }
     }
 }

@@ -5,7 +5,7 @@ use std::path::{Path, PathBuf};
 use std::sync::Arc;
 use std::time::Duration;
 
-use leaderboard_api::WorkerState;
+use leaderboard_api::{EvaluationMode, PlannedEvaluation, WorkerState};
 use leaderboard_contract::keys::result_path;
 use leaderboard_contract::report::Outcome;
 use leaderboard_evidence::Tree;
@@ -15,7 +15,7 @@ use nix::sys::stat::Mode;
 
 use super::super::merge::NOTHING_YET;
 use super::*;
-use crate::fixtures::{container_run, put_result, put_status, result, run};
+use crate::fixtures::{container_run, put_result, put_status, result, run, run_of_mode};
 use crate::judge::{Judge, Outside, Situation};
 use crate::{Gathered, Results};
 
@@ -29,10 +29,14 @@ struct Volume {
 
 impl Volume {
     fn new() -> Self {
+        Self::of_mode(EvaluationMode::Interactive)
+    }
+
+    fn of_mode(mode: EvaluationMode) -> Self {
         let folder = tempfile::tempdir().unwrap();
         let tree = Arc::new(Tree::open(folder.path()).unwrap());
         Self {
-            gatherer: Gatherer::new(&container_run(), Arc::clone(&tree)).unwrap(),
+            gatherer: Gatherer::new(&run_of_mode(mode), Arc::clone(&tree)).unwrap(),
             judge: Judge::default(),
             folder,
             tree,
@@ -135,6 +139,55 @@ fn a_worker_is_done_when_its_evaluator_is() {
     }
     let (_, seen) = volume.round();
     assert!(!seen.all_done && seen.spoiled.is_none());
+}
+
+/// Marks of two agents and of both evaluators, one after the other, each with what the two workers are then.
+#[test]
+fn an_agent_counts_only_where_one_is() {
+    use EvaluationMode::{Batch, Interactive, Predictions};
+    use WorkerState::{Crashed, Done, Running, Waiting};
+    let agent = |number, mark| (Side::Agent, number, mark);
+    let evaluator = |number, mark| (Side::Host(HOST), number, mark);
+    let steps = [
+        (agent(2, Mark::Start(0)), [Running, Waiting, Waiting]),
+        (agent(2, Mark::Crash(0)), [Crashed, Waiting, Waiting]),
+        (evaluator(2, Mark::Start(0)), [Running, Running, Running]),
+        (evaluator(2, Mark::Crash(0)), [Crashed, Crashed, Crashed]),
+        (evaluator(2, Mark::Done), [Done, Done, Done]),
+    ];
+    for (index, mode) in [Interactive, Batch, Predictions].into_iter().enumerate() {
+        let mut volume = Volume::of_mode(mode);
+        for ((side, number, mark), states) in steps {
+            put_status(volume.path(), side, number, mark);
+            let (gathered, seen) = volume.round();
+            assert_eq!(gathered.workers[1].state, states[index], "{mode:?} {side} {mark:?}");
+            assert_eq!(gathered.workers[0].state, Waiting, "{mode:?} {side} {mark:?}");
+            let agent_counts = mode == Interactive || side != Side::Agent;
+            if mark == Mark::Start(0) {
+                assert_eq!(seen.any_started, agent_counts, "{mode:?} {side}");
+            }
+        }
+    }
+}
+
+#[test]
+fn the_agent_that_runs_first_is_the_first_workers_until_it_is_done() {
+    let mut volume = Volume::of_mode(EvaluationMode::Batch);
+    for (side, mark, state, crashes) in [
+        (Side::Agent, Mark::Start(0), WorkerState::Running, 0),
+        (Side::Agent, Mark::Crash(0), WorkerState::Crashed, 1),
+        (Side::Agent, Mark::Start(1), WorkerState::Running, 1),
+        (Side::Agent, Mark::Done, WorkerState::Waiting, 1),
+        (Side::Host(HOST), Mark::Start(0), WorkerState::Running, 1),
+        (Side::Host(HOST), Mark::Crash(0), WorkerState::Crashed, 1),
+        (Side::Host(HOST), Mark::Done, WorkerState::Done, 1),
+    ] {
+        put_status(volume.path(), side, 1, mark);
+        let (gathered, seen) = volume.round();
+        let worker = &gathered.workers[0];
+        assert_eq!((worker.state, worker.crashes), (state, crashes), "{side} {mark:?}");
+        assert!(!seen.all_done, "{side} {mark:?}: the second worker has done nothing");
+    }
 }
 
 #[test]
@@ -382,10 +435,23 @@ fn a_plan_that_does_not_hold_is_refused() {
         refused.problem.ends_with("it is of another kind of evaluation"),
         "{refused}"
     );
-    let mut none = container_run();
-    let leaderboard_api::PlannedEvaluation::Container(container) = &mut none.plan.evaluation else {
-        panic!("not of a container")
-    };
-    container.workers = 0;
-    assert!(Evaluators::of(&none).unwrap_err().problem.ends_with("it has no worker"));
+    let long = "m".repeat(MAX_NAME + 1);
+    for (workers, metric, problem) in [
+        (0, "accuracy", "it has no worker"),
+        (2, long.as_str(), "the name of its score has more than 64 characters"),
+        (2, &long[1..], ""),
+    ] {
+        let mut run = container_run();
+        let PlannedEvaluation::Container(container) = &mut run.plan.evaluation else {
+            panic!("not of a container")
+        };
+        container.workers = workers;
+        metric.clone_into(&mut container.score.metric);
+        let refused = Evaluators::of(&run).err();
+        assert_eq!(refused.is_some(), !problem.is_empty(), "{metric}");
+        assert!(
+            refused.is_none_or(|refused| refused.problem.ends_with(problem)),
+            "{problem}"
+        );
+    }
 }
