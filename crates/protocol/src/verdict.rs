@@ -11,13 +11,13 @@ use thiserror::Error;
 
 /// No verdict is longer, in bytes. The containers of a Pod share 12 KiB of termination messages: 16 pairs leave 351 bytes each.
 pub const MAX_BYTES: usize = 340;
-/// Exit code of a runner whose node refused what it needs before its command ran (EX_OSERR). It counts without a verdict, since no process
-/// of the image has run and can have caused it.
-pub const CODE_NODE_REFUSED: i32 = 71;
 /// Exit code of a runner whose container was to have a GPU, or a driver to draw with, and has none (EX_UNAVAILABLE). It is the runner's own:
 /// no process of the image can bring it about.
 pub const CODE_NO_GRAPHICS: i32 = 69;
-/// The same as [`CODE_NODE_REFUSED`] for want of a process (EX_TEMPFAIL), which the other containers of the Pod can use up.
+/// Exit code of a runner whose node refused what it needs before its command ran (EX_OSERR). It counts without a verdict, since no process
+/// of the image has run and can have caused it.
+pub const CODE_NODE_REFUSED: i32 = 71;
+/// The same for want of a process (EX_TEMPFAIL), which the other containers of the Pod can use up.
 pub const CODE_NO_PROCESS: i32 = 75;
 /// Version of the document.
 pub const SCHEMA: u32 = 1;

@@ -10,13 +10,11 @@ use std::path::{Component, Path, PathBuf};
 
 use thiserror::Error;
 
-use crate::decide::CODE_OVER;
+use crate::decide::{CODE_CRASHED, CODE_OVER};
 use crate::wake::Signals;
 use crate::{report, say};
 use leaderboard_runner::args::Copied;
 
-/// The folder is not copied.
-const CODE_FAILED: i32 = 1;
 /// Bytes between two looks at signals.
 const CHUNK: u64 = 8 << 20;
 
@@ -53,7 +51,7 @@ pub(crate) fn run(copied: &Copied, mut signals: Signals) -> i32 {
     };
     say(format_args!("{error}"));
     report::write(&copied.termination_log, &error);
-    CODE_FAILED
+    CODE_CRASHED
 }
 
 /// Copies all that is in the folder over what is there already. The modes of the copies are those that the umask leaves.

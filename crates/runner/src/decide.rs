@@ -308,7 +308,7 @@ pub(crate) struct Conclusion {
 
 /// Complete, cancelled, or the results are stored already: the container is not started again.
 pub(crate) const CODE_OVER: i32 = 0;
-/// The round ended without complete results.
+/// The round ended without complete results, or a folder could not be copied.
 pub(crate) const CODE_CRASHED: i32 = 1;
 /// A SIGTERM from outside, as a shell reports it.
 pub(crate) const CODE_TERMINATED: i32 = 143;
