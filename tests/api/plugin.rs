@@ -5,6 +5,7 @@
 mod checks;
 mod daily;
 mod dashboard;
+mod files;
 mod logs;
 mod resume;
 mod rights;

@@ -103,7 +103,7 @@ fn how_it_stops(submission: &Submission, leaderboard: Observed<'_>) -> String {
     let grace = seconds.map_or_else(|| "deadlines.cancelSeconds".to_owned(), span);
     if status.is_none_or(|s| s.times.started.is_none()) {
         return format!(
-            "No agent has started, so the Job is deleted at once; a Pod that is already running is first asked to stop and \
+            "Its run has not begun, so the Job is deleted at once; a Pod that is already running is first asked to stop and \
              has {grace}."
         );
     }
@@ -214,7 +214,7 @@ fn not_resumable(submission: &Submission) -> Option<String> {
     match found.filter(|_| has_ended(submission)) {
         Some(State::Failed | State::Cancelled) => None,
         Some(State::Finished) => Some(format!(
-            "{name} has finished and cannot be resumed. Submit the image again to run it once more"
+            "{name} has finished and cannot be resumed. Submit again to run it once more"
         )),
         _ => {
             let shown = shown(submission);

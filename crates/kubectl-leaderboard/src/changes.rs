@@ -11,7 +11,7 @@ use crate::cluster::{Cluster, Fetched, Scope};
 use crate::commands::{frame, note_interruption, nothing};
 use crate::error::{self, Error};
 use crate::output::{self, note, print};
-use crate::{Cancel, facts, resume, submit};
+use crate::{Cancel, facts, resume, submit, upload};
 use leaderboard_api::{Attempt, Leaderboard, State, Submission, SubmissionStatus};
 
 /// How often a change is tried again after a conflict with somebody else's.
@@ -119,8 +119,13 @@ pub async fn submit(cluster: &Cluster, wanted: &submit::Submit) -> Result<ExitCo
             .unknown::<Leaderboard>("Leaderboard", &wanted.leaderboard)
             .await?);
     }
-    submit::fits(&wanted.leaderboard, &wanted.track, leaderboard.observed()).map_err(Error::Unfit)?;
-    let created = cluster.create(&submit::object(wanted)).await?;
+    let (name, is_file) = (&wanted.leaderboard, wanted.file.is_some());
+    submit::fits(name, &wanted.track, is_file, leaderboard.observed()).map_err(Error::Unfit)?;
+    let mut object = submit::object(wanted);
+    if let Some(file) = &wanted.file {
+        upload::upload(cluster, wanted, file, leaderboard.observed(), &mut object).await?;
+    }
+    let created = cluster.create(&object, false).await?;
     let name = created.name_any();
     print(&submit::lines(&created, leaderboard.observed(), frame()));
     if !wanted.wait {

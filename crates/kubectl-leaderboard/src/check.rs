@@ -52,7 +52,7 @@ pub async fn check(cluster: &Cluster, wanted: &Check) -> Result<ExitCode, Error>
         Fetched::Forbidden => return Err(Error::Forbidden("Leaderboards cannot be read".to_owned())),
     };
     let object = object(&leaderboard, wanted).map_err(Error::Unfit)?;
-    let created = cluster.create(&object).await?;
+    let created = cluster.create(&object, false).await?;
     let name = created.name_any();
     let followed = tokio::select! {
         biased;
@@ -85,7 +85,7 @@ pub(super) fn object(leaderboard: &Leaderboard, wanted: &Check) -> Result<Value,
     let spec = &leaderboard.spec;
     let first = spec.tracks.first().map(|track| track.name.clone());
     let track = wanted.track.clone().or(first).unwrap_or_default();
-    submit::fits(&wanted.name, &track, Observed::Found(leaderboard))?;
+    submit::fits(&wanted.name, &track, false, Observed::Found(leaderboard))?;
     let named = spec.check.as_ref().map(|check| check.image.clone());
     let image = wanted.image.clone().or(named).ok_or_else(|| {
         let of_carla = match spec.evaluation {

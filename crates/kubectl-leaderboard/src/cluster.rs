@@ -291,12 +291,12 @@ impl Cluster {
         self.in_time(api.patch(name, &params, &Patch::Merge(patch))).await
     }
 
-    /// Creates a submission.
-    pub async fn create(&self, submission: &Value) -> Result<Submission, Error> {
+    /// Creates a submission. A trial creates none: the API server checks it, and answers as if it had.
+    pub async fn create(&self, submission: &Value, is_trial: bool) -> Result<Submission, Error> {
         let object = serde_json::from_value(submission.clone()).map_err(|error| Error::Malformed(error.to_string()))?;
         let params = PostParams {
+            dry_run: is_trial,
             field_manager: Some(MANAGER.to_owned()),
-            ..PostParams::default()
         };
         Ok(self
             .in_time(self.api::<Submission>().create(&params, &object))

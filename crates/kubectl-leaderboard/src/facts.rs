@@ -6,8 +6,10 @@ use jiff::Timestamp;
 use k8s_openapi::apimachinery::pkg::apis::meta::v1::Time;
 use kube::ResourceExt;
 
-use super::text::{Frame, join, span, when};
-use leaderboard_api::{Attempt, FailureClass, State, Submission, SubmissionStatus, Waiting, conditions};
+use super::text::{Frame, join, size, span, when};
+use leaderboard_api::{
+    Agents, Attempt, FailureClass, RunPlan, State, Submission, SubmissionStatus, Waiting, conditions,
+};
 
 /// The state as people read it.
 pub(super) fn shown(submission: &Submission) -> &'static str {
@@ -95,7 +97,7 @@ pub(super) fn transition(submission: &Submission, attempt: Attempt, frame: Frame
     Some((state, page.into_lines()))
 }
 
-/// Track, Leaderboard, team and submission in EvalAI.
+/// Track, Leaderboard, team, the submitted file and the submission in EvalAI.
 pub(super) fn track(submission: &Submission) -> String {
     let spec = &submission.spec;
     let found = submission.status.as_ref().and_then(|status| status.track.as_deref());
@@ -106,6 +108,9 @@ pub(super) fn track(submission: &Submission) -> String {
     if let Some(team) = submission.team_name() {
         text = format!("{text}, by {team}");
     }
+    if let Some(file) = file(submission) {
+        text = format!("{text}; {file}");
+    }
     if let Some(evalai) = spec.evalai {
         text = format!(
             "{text}; EvalAI submission {}, phase {}",
@@ -113,6 +118,26 @@ pub(super) fn track(submission: &Submission) -> String {
         );
     }
     text
+}
+
+/// The submitted file as `file (12 KiB)`, if the submission is one.
+fn file(submission: &Submission) -> Option<String> {
+    let known = submission.status.as_ref().and_then(|status| status.input.as_ref());
+    let file = known.or(submission.spec.input.as_ref())?;
+    let quantity = size(u64::try_from(file.size).unwrap_or_default());
+    let number = quantity.trim_end_matches(|c: char| c.is_ascii_alphabetic());
+    let unit = quantity.strip_prefix(number).unwrap_or_default();
+    Some(format!("file ({number} {unit}B)"))
+}
+
+/// The plan of a run, if there is one yet.
+pub(super) fn plan(submission: &Submission) -> Option<&RunPlan> {
+    submission.status.as_ref()?.plan.as_ref()
+}
+
+/// True if an agent runs, as far as the plan is known.
+pub(super) fn has_agent(plan: Option<&RunPlan>) -> bool {
+    plan.is_none_or(|plan| plan.agents() != Agents::Absent)
 }
 
 /// True if the attempt has ended and no higher one is requested.

@@ -1,4 +1,4 @@
-//! `logs`: what the agents of a submission print, from its Pod, or from the bucket once the Pod is gone.
+//! `logs`: what the containers of a submission print, from its Pod, or from the bucket once the Pod is gone.
 
 mod follow;
 
@@ -8,7 +8,7 @@ use clap::{Args, ValueEnum};
 use futures::StreamExt;
 use k8s_openapi::api::core::v1::Pod;
 use kube::ResourceExt;
-use leaderboard_api::{Attempt, RunPlan, State, Submission, SubmissionStatus, names};
+use leaderboard_api::{Agents, Attempt, RunPlan, State, Submission, SubmissionStatus, names};
 
 use crate::aws::{Unread, read};
 use crate::cluster::Cluster;
@@ -23,28 +23,37 @@ use crate::{bucket, facts, foreign};
 pub struct Logs {
     /// Name of the submission.
     name: String,
-    /// Follow the log until the submission has ended: into Pods that come later, and through crashes of agents.
+    /// Follow the log until the submission has ended: into Pods that come later, and through crashes.
     #[arg(short, long)]
     follow: bool,
     /// Only this worker, from 1.
     #[arg(long, value_name = "NUMBER")]
     worker: Option<usize>,
-    /// Containers: the agents, the simulators or evaluators beside them, workspace and contents (start), or logcopy, which stores results.
-    #[arg(long, value_enum, default_value_t, value_name = "CONTAINERS")]
-    of: Whose,
+    /// Containers: the agents, the simulators or evaluators, those that prepare the run (start), or logcopy, which stores results
+    /// [default: agent; evaluator where a file was submitted].
+    #[arg(long, value_enum, value_name = "CONTAINERS")]
+    of: Option<Whose>,
     /// Endpoint of the bucket, if it is not AWS's, that may get your AWS credentials once the Pod is gone.
     #[arg(long, value_name = "URL")]
     endpoint: Option<String>,
 }
 
+impl Logs {
+    /// The containers that are asked for.
+    fn whose(&self, submission: &Submission) -> Whose {
+        let has_agent = facts::has_agent(facts::plan(submission));
+        self.of
+            .unwrap_or(if has_agent { Whose::Agent } else { Whose::Evaluator })
+    }
+}
+
 /// The containers whose log is shown.
-#[derive(ValueEnum, Clone, Copy, Debug, Default, PartialEq, Eq)]
+#[derive(ValueEnum, Clone, Copy, Debug, PartialEq, Eq)]
 pub(super) enum Whose {
-    #[default]
     Agent,
     Simulator,
     Evaluator,
-    // The containers that prepare the Pod.
+    // The containers that prepare the Pod, and the one that prepares what evaluators read.
     Start,
     Logcopy,
 }
@@ -63,16 +72,18 @@ impl Whose {
             Self::Start => {
                 let all = names::INIT_CONTAINERS.into_iter();
                 let that_end = all.filter(|name| *name != names::CONTAINER_LOGCOPY);
-                that_end.map(|name| (name.to_owned(), name.to_owned())).collect()
+                let all = that_end.chain([names::CONTAINER_COLLECT]);
+                all.map(|name| (name.to_owned(), name.to_owned())).collect()
             }
             Self::Logcopy => vec![("logcopy".to_owned(), names::CONTAINER_LOGCOPY.to_owned())],
         }
     }
 
-    /// The choice in place of this one, if the workers of the run have no such containers.
+    /// The choice in place of this one, if the run has no such containers.
     fn in_place(self, plan: Option<&RunPlan>) -> Option<&'static str> {
         let has_evaluators = plan?.container().is_some();
         match self {
+            Self::Agent if !facts::has_agent(plan) => Some("evaluator"),
             Self::Simulator if has_evaluators => Some("evaluator"),
             Self::Evaluator if !has_evaluators => Some("simulator"),
             _ => None,
@@ -109,22 +120,21 @@ struct Source {
 /// Prints the logs.
 pub async fn logs(cluster: &Cluster, wanted: &Logs) -> Result<ExitCode, Error> {
     let submission = cluster.submission(&wanted.name).await?;
-    let workers = workers(&submission);
+    let of = wanted.whose(&submission);
+    let workers = workers(&submission, of);
     if let Some(worker) = wanted.worker.filter(|worker| *worker == 0 || *worker > workers.max(1)) {
         return Err(Error::Unfit(no_worker(&wanted.name, worker, workers)));
     }
-    if let Some(other) = wanted.of.in_place(plan(&submission)) {
-        return Err(Error::Unfit(format!(
-            "beside each agent of {} is its {other}. Use --of {other}",
-            wanted.name
-        )));
+    if let Some(other) = of.in_place(facts::plan(&submission)) {
+        let name = &wanted.name;
+        return Err(Error::Unfit(format!("{name} has no such container. Use --of {other}")));
     }
     if wanted.follow && !facts::has_ended(&submission) {
         return follow::follow(cluster, wanted, submission).await;
     }
     let code = match cluster.pod(&wanted.name).await? {
-        Some(pod) => stream(cluster, &pod, &sources(wanted, workers)).await?,
-        None => from_bucket(&submission, wanted, workers).await?,
+        Some(pod) => stream(cluster, &pod, &sources(of, workers, wanted.worker)).await?,
+        None => from_bucket(&submission, wanted, of, workers).await?,
     };
     if wanted.follow {
         note(&end(&submission));
@@ -134,7 +144,7 @@ pub async fn logs(cluster: &Cluster, wanted: &Logs) -> Result<ExitCode, Error> {
 
 fn no_worker(name: &str, worker: usize, workers: usize) -> String {
     match workers {
-        0 | 1 => format!("{name} has no worker {worker}. It has one: leave out --worker"),
+        0 | 1 => format!("{name} has no such log of worker {worker}. There is one for all: leave out --worker"),
         workers => format!("{name} has no worker {worker}. It has {workers}, counted from 1"),
     }
 }
@@ -171,8 +181,8 @@ pub(super) fn end(submission: &Submission) -> String {
     )
 }
 
-fn sources(wanted: &Logs, workers: usize) -> Vec<Source> {
-    let containers = wanted.of.containers(workers, wanted.worker).into_iter().enumerate();
+fn sources(of: Whose, workers: usize, only: Option<usize>) -> Vec<Source> {
+    let containers = of.containers(workers, only).into_iter().enumerate();
     let source = |(stream, (label, container)): (usize, (String, String))| Source {
         // A worker has its colour also where it is shown alone.
         stream: label.parse().unwrap_or(stream),
@@ -182,12 +192,12 @@ fn sources(wanted: &Logs, workers: usize) -> Vec<Source> {
     containers.map(source).collect()
 }
 
-fn plan(submission: &Submission) -> Option<&RunPlan> {
-    submission.status.as_ref()?.plan.as_ref()
-}
-
-fn workers(submission: &Submission) -> usize {
-    plan(submission).map_or(0, RunPlan::workers)
+/// How many workers have such a container: of an agent that runs first, there is one.
+fn workers(submission: &Submission, of: Whose) -> usize {
+    facts::plan(submission).map_or(0, |plan| match (of, plan.agents()) {
+        (Whose::Agent, Agents::First) => 1,
+        _ => plan.workers(),
+    })
 }
 
 /// Whether a Pod has this container: not each kind of evaluation has all.
@@ -227,9 +237,9 @@ async fn stream(cluster: &Cluster, pod: &Pod, sources: &[Source]) -> Result<Exit
 }
 
 /// Prints the logs that are stored, or the commands that do so where there is no program for it.
-async fn from_bucket(submission: &Submission, wanted: &Logs, workers: usize) -> Result<ExitCode, Error> {
-    let keys = wanted.of.keys(workers, wanted.worker);
-    let commands = in_bucket(submission, wanted.of, &keys, frame()).map_err(Error::Unfit)?;
+async fn from_bucket(submission: &Submission, wanted: &Logs, of: Whose, workers: usize) -> Result<ExitCode, Error> {
+    let keys = of.keys(workers, wanted.worker);
+    let commands = in_bucket(submission, of, &keys, frame()).map_err(Error::Unfit)?;
     let status = submission.status.as_ref();
     let results = status
         .and_then(|status| status.results_url.as_deref())
@@ -356,7 +366,8 @@ mod tests {
             two("evaluators/1/console.log", "evaluators/2/console.log"),
         );
         assert_eq!(names(Whose::Evaluator, None), evaluators);
-        assert_eq!(names(Whose::Start, None), (two("workspace", "contents"), vec![]));
+        let start = ["workspace", "contents", "dataset", "labels", "collect"].map(str::to_owned);
+        assert_eq!(names(Whose::Start, None), (start.to_vec(), vec![]));
         assert_eq!(names(Whose::Logcopy, Some(2)).0, ["logcopy"]);
     }
 
@@ -367,22 +378,50 @@ mod tests {
                 json!({"runId": "mine", kind: of, "track": "t", "storage": {"s3": {"bucket": "b"}}, "image": "a"});
             serde_json::from_value(plan).unwrap()
         };
-        let evaluated =
-            json!({"mode": "Interactive", "workers": 2, "merge": "Mean", "score": {"metric": "m"}, "image": "e"});
+        let by_evaluator = |mode: &str| {
+            let of = json!({"mode": mode, "workers": 2, "merge": "Mean", "score": {"metric": "m"}, "image": "e"});
+            plan("container", of)
+        };
         let driven = json!({"version": "V2", "codename": "S", "slices": [], "routes": 1, "repetitions": 1, "contentsImage": "c",
             "simulatorImage": "s"});
-        let (evaluated, driven) = (plan("container", evaluated), plan("carla", driven));
+        let [evaluated, batch, of_file] = ["Interactive", "Batch", "Predictions"].map(by_evaluator);
+        let driven = plan("carla", driven);
         for (plan, of, other) in [
             (Some(&evaluated), Whose::Simulator, Some("evaluator")),
             (Some(&driven), Whose::Evaluator, Some("simulator")),
             (Some(&evaluated), Whose::Evaluator, None),
             (Some(&driven), Whose::Simulator, None),
             (Some(&evaluated), Whose::Agent, None),
+            (Some(&batch), Whose::Agent, None),
+            (Some(&of_file), Whose::Agent, Some("evaluator")),
+            (Some(&of_file), Whose::Evaluator, None),
             // Which kind it is, is not known yet.
             (None, Whose::Simulator, None),
         ] {
             assert_eq!(of.in_place(plan), other, "{of:?}");
         }
+        let wanted = |of: Option<Whose>, plan: &RunPlan| {
+            let one = submission(&json!({"plan": plan}));
+            let wanted = Logs {
+                name: "mine".to_owned(),
+                follow: false,
+                worker: None,
+                of,
+                endpoint: None,
+            };
+            let of = wanted.whose(&one);
+            (of, workers(&one, of))
+        };
+        // An agent that runs first is one, however many evaluators share the work.
+        for (plan, expected) in [
+            (&driven, (Whose::Agent, 0)),
+            (&evaluated, (Whose::Agent, 2)),
+            (&batch, (Whose::Agent, 1)),
+            (&of_file, (Whose::Evaluator, 2)),
+        ] {
+            assert_eq!(wanted(None, plan), expected);
+        }
+        assert_eq!(wanted(Some(Whose::Evaluator), &batch), (Whose::Evaluator, 2));
         let containers = json!({"containers": [{"name": "evaluator-1"}], "initContainers": [{"name": "workspace"}]});
         let pod: Pod = serde_json::from_value(json!({"metadata": {}, "spec": containers})).unwrap();
         let has: Vec<bool> = ["workspace", "contents", "evaluator-1"]
@@ -407,7 +446,7 @@ mod tests {
                 "routes": 1, "repetitions": 1, "contentsImage": "c", "simulatorImage": "s"},
             "track": "sensors", "storage": {"s3": storage}, "image": "a"});
         let stored = submission(&json!({"resultsURL": "s3://b/mine", "plan": plan, "conditions": ended()}));
-        assert_eq!(workers(&stored), 1);
+        assert_eq!(workers(&stored, Whose::Agent), 1);
         let in_bucket = |submission, of: Whose| in_bucket(submission, of, &of.keys(1, None), frame());
         let lines = in_bucket(&stored, Whose::Agent).unwrap();
         assert_eq!(
@@ -446,7 +485,7 @@ mod tests {
         ] {
             let why = no_worker("mine", 7, workers);
             assert!(
-                why.starts_with("mine has no worker 7. ") && why.ends_with(next),
+                why.starts_with("mine has no ") && why.contains("worker 7. ") && why.ends_with(next),
                 "{why}"
             );
         }

@@ -37,6 +37,7 @@ mod submit;
 mod table;
 mod text;
 mod top;
+mod upload;
 mod version;
 mod why;
 
@@ -92,15 +93,15 @@ enum Command {
     Scores(scores::Scores),
     /// List what a submission has stored, or copy it into a folder.
     Get(get::Get),
-    /// Submit an image to a track, without EvalAI.
+    /// Submit an image or a file to a track, without EvalAI.
     #[command(
-        override_usage = "kubectl leaderboard submit [OPTIONS] --leaderboard <LEADERBOARD>\n       --track <TRACK> --image <IMAGE>",
+        override_usage = "kubectl leaderboard submit [OPTIONS] --leaderboard <LEADERBOARD>\n       --track <TRACK> <--image <IMAGE>|--file <FILE>>",
         after_help = "Exit code 0: it is submitted; with --wait, it is Finished. 1: it did not finish, or an error."
     )]
     Submit(submit::Submit),
     /// Open the operator's page for a browser on this machine, until Ctrl-C.
     Dashboard(dashboard::Dashboard),
-    /// Print what the agents of a submission print.
+    /// Print the logs of a submission, by default those of its agents.
     Logs(logs::Logs),
     /// Run an agent of your own once, and show whether the Leaderboard works.
     #[command(
@@ -264,7 +265,7 @@ async fn carry_out_there(command: Command, cluster: &Cluster) -> Result<ExitCode
         Command::Unpause(wanted) => pause::pause(cluster, &wanted, false).await,
         Command::Top { scope, output } => commands::top(cluster, &scope, output.format).await,
         Command::Scores(wanted) => scores::scores(cluster, &wanted).await,
-        Command::Submit(wanted) => changes::submit(cluster, &wanted).await,
+        Command::Submit(wanted) => Box::pin(changes::submit(cluster, &wanted)).await,
         Command::Dashboard(wanted) => Box::pin(dashboard::dashboard(cluster, &wanted))
             .await
             .map(|()| ExitCode::SUCCESS),

@@ -1,8 +1,10 @@
-//! `submit`: an image on a track of a Leaderboard, without EvalAI. Pure.
+//! `submit`: an image or a file on a track of a Leaderboard, without EvalAI. Pure: `upload` puts the file into the bucket.
+
+use std::path::PathBuf;
 
 use clap::Args;
 use kube::ResourceExt;
-use leaderboard_api::{Submission, names};
+use leaderboard_api::{Evaluation, Submission, names};
 use serde_json::{Value, json};
 
 use crate::board::{self, Observed};
@@ -19,8 +21,14 @@ pub struct Submit {
     #[arg(long)]
     pub track: String,
     /// Image of the agent.
+    #[arg(long, required_unless_present = "file", conflicts_with = "file")]
+    pub image: Option<String>,
+    /// File in place of an image, for a Leaderboard of the mode Predictions. Your own program aws puts it into the bucket.
     #[arg(long)]
-    pub image: String,
+    pub file: Option<PathBuf>,
+    /// Endpoint of the bucket, if it is not AWS's, that may get your AWS credentials.
+    #[arg(long, value_name = "URL", requires = "file")]
+    pub endpoint: Option<String>,
     /// Name of the submission [default: the Leaderboard's, and five letters].
     #[arg(long)]
     pub name: Option<String>,
@@ -38,11 +46,26 @@ pub struct Submit {
     pub wait: bool,
 }
 
-/// Refuses a track that the Leaderboard lacks, with the next step. An unreadable Leaderboard passes: the operator checks it.
-pub fn fits(name: &str, track: &str, leaderboard: Observed<'_>) -> Result<(), String> {
+/// Refuses a file or an image where the Leaderboard takes the other, and a track that it lacks, with the next step. An unreadable
+/// Leaderboard passes: the operator checks it.
+pub fn fits(name: &str, track: &str, is_file: bool, leaderboard: Observed<'_>) -> Result<(), String> {
     let Some(found) = leaderboard.leaderboard() else {
         return Ok(());
     };
+    let takes_file = matches!(&found.spec.evaluation, Evaluation::Container(by) if !by.mode.has_agent());
+    if takes_file != is_file {
+        let (takes, flag) = if takes_file {
+            ("files and no images, as its mode is Predictions", "--file FILE")
+        } else {
+            (
+                "images and no files, which are for the mode Predictions",
+                "--image IMAGE",
+            )
+        };
+        return Err(format!(
+            "Leaderboard {name} takes {takes}. Use `kubectl leaderboard submit {flag}`"
+        ));
+    }
     let tracks: Vec<&str> = found.spec.tracks.iter().map(|track| track.name.as_str()).collect();
     if tracks.contains(&track) {
         return Ok(());

@@ -163,6 +163,52 @@ fn each_keyword_finds_its_fault() {
     }
 }
 
+/// What a manifest of an evaluator says of its mode, its data and its files is held to the schema and to the rules in CEL.
+#[test]
+fn a_leaderboard_of_each_mode_is_judged_by_schema_and_rules() {
+    let of = |mode: &str, more: &str, agent: &str| {
+        format!(
+            "apiVersion: leaderboard.carla.org/v1alpha1\nkind: Leaderboard\nmetadata: {{name: digits}}\nspec:\n  \
+             tracks: [{{name: test, container: {{score: {{metric: accuracy}}}}}}]\n  storage: {{s3: {{bucket: results}}}}\n  \
+             {agent}evaluation:\n    container: {{mode: {mode}, image: 'e:1', command: [evaluate]{more}}}\n"
+        )
+    };
+    let kinds = Kinds::new().unwrap();
+    let (agent, data) = (
+        "agent: {command: [play]}\n  ",
+        ", labels: {image: {reference: 'labels:1'}}",
+    );
+    for (text, expected) in [
+        (of("Batch", data, agent), None),
+        (of("Predictions", ", input: {maxBytes: 1Mi, maxFiles: 1}", ""), None),
+        (of("Batch", "", ""), Some("agent.command is missing")),
+        (
+            of("Predictions", ", port: 7000", ""),
+            Some("container.port is for Interactive"),
+        ),
+        (
+            of("Interactive", ", input: {}", agent),
+            Some("container.input is for Batch"),
+        ),
+        (
+            of("Predictions", ", input: {maxBytes: 200Gi}", ""),
+            Some("must be 100Gi or less"),
+        ),
+        (
+            of("Batch", ", dataset: {}", agent),
+            Some("container.dataset has none of"),
+        ),
+        (of("Files", "", agent), Some("mode is \"Files\"")),
+    ] {
+        let (findings, _) = kinds.findings(&text);
+        let found: Vec<&str> = findings.iter().map(|finding| finding.text.as_str()).collect();
+        match expected {
+            None => assert_eq!(found, Vec::<&str>::new(), "{text}"),
+            Some(expected) => assert!(found.iter().any(|found| found.contains(expected)), "{found:?}\n{text}"),
+        }
+    }
+}
+
 #[test]
 fn a_value_has_its_line_through_documents_lists_and_aliases() {
     let text = "a: 1\n---\n# none\n---\nspec:\n  tracks:\n    - name: x\n    - &one\n      name: \"y\"\n  flow: {b: [1,\n    2]}\n";

@@ -98,10 +98,8 @@ impl Following<'_> {
     /// Begins the logs of containers that have one and were not begun.
     fn begin(&mut self, pod: &Pod) {
         let mut new = Vec::new();
-        for source in sources(
-            self.wanted,
-            workers(&self.submission).max(self.wanted.worker.unwrap_or(0)),
-        ) {
+        let (of, only) = (self.wanted.whose(&self.submission), self.wanted.worker);
+        for source in sources(of, workers(&self.submission, of).max(only.unwrap_or(0)), only) {
             let Some(restarts) = life(pod, &source.container) else {
                 continue;
             };
@@ -116,7 +114,7 @@ impl Following<'_> {
             let lines = self.cluster.followed_log(&pod.name_any(), &source.container);
             new.push(lines.map(move |line| (source.clone(), line)).boxed());
         }
-        if self.wanted.of.is_in_turn() {
+        if of.is_in_turn() {
             self.lines.push(futures::stream::iter(new).flatten().boxed());
         } else {
             self.lines.extend(new);

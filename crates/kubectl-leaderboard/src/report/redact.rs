@@ -16,9 +16,10 @@ const DROPPED: [&str; 6] = [
     "nextStep",
     "podOverrides",
 ];
-/// Reasons whose messages quote results, and with CARLA's routes.
-const OF_RESULTS: [Reason; 4] = [
+/// Reasons whose messages quote results, with CARLA's routes, or names of files.
+const OF_RESULTS: [Reason; 5] = [
     Reason::InvalidResults,
+    Reason::InputInvalid,
     Reason::NotEligible,
     Reason::UnexplainedScores,
     Reason::EvaluatorFailed,

@@ -190,3 +190,19 @@ fn a_submission_is_made_of_the_flags() {
     assert_eq!(full["spec"]["team"], json!({"id": "7", "name": "Team Seven"}));
     assert_eq!(full["spec"]["priority"], -5);
 }
+
+#[test]
+fn a_submission_is_an_image_or_a_file() {
+    for (flags, is_right) in [
+        ("--image a:1", true),
+        ("--file f.csv", true),
+        ("--file f.csv --endpoint https://s3.example", true),
+        ("", false),
+        ("--image a:1 --file f.csv", false),
+        ("--image a:1 --endpoint https://s3.example", false),
+    ] {
+        let usual = "submit --leaderboard digits --track test";
+        let words = usual.split(' ').chain(flags.split_whitespace());
+        assert_eq!(Line::try_parse_from(words).is_ok(), is_right, "{flags}");
+    }
+}

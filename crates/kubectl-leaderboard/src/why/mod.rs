@@ -16,6 +16,7 @@ use super::facts::{self, class, command, has_ended, headline, is_attempt_request
 use super::text::{Frame, Page, join, span, when};
 use leaderboard_api::conditions::{self, Condition};
 use leaderboard_api::names::FAILURE_LOG_KEY;
+use leaderboard_api::reasons::Class;
 use leaderboard_api::text::sentence;
 use leaderboard_api::{
     Attempt, EndReason, FailureClass, LastEnd, Reason, ReasonName, Submission, SubmissionStatus, WorkerStatus, reasons,
@@ -244,7 +245,10 @@ impl Explanation<'_> {
         let Some(failure) = self.status.failure.as_ref().filter(|_| has_ended(self.submission)) else {
             return;
         };
-        let log = failure.reason.known().and_then(Reason::log);
+        // Without an agent, no log is the participant's.
+        let has_agent = facts::has_agent(self.status.plan.as_ref());
+        let is_shown = |reason: &Reason| has_agent || reason.class() != Class::Participant;
+        let log = failure.reason.known().filter(is_shown).and_then(Reason::log);
         let Some((log, results)) = log.zip(self.status.results_url.as_ref()) else {
             return;
         };

@@ -68,7 +68,12 @@ fn leaderboard() -> Value {
 
 fn pod() -> Value {
     let labels = json!({"leaderboard.carla.org/submission": "submission-43"});
-    json!({"apiVersion": "v1", "kind": "Pod", "status": {"phase": "Running"},
+    let named = |names: &[&str]| names.iter().map(|name| json!({"name": name})).collect::<Vec<_>>();
+    let spec = json!({
+        "initContainers": named(&["workspace", "contents", "logcopy"]),
+        "containers": named(&["agent-1", "agent-2", "simulator-1", "simulator-2"]),
+    });
+    json!({"apiVersion": "v1", "kind": "Pod", "status": {"phase": "Running"}, "spec": spec,
            "metadata": {"name": "runs-1-abcde", "namespace": "carla", "creationTimestamp": TIME, "labels": labels}})
 }
 
