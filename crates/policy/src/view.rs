@@ -7,12 +7,13 @@ use jiff::Timestamp;
 
 use super::report_digest::ReportDigest;
 use crate::ask::Lookup;
-use crate::questions::Row;
+use crate::questions::{Input, Row};
 pub use crate::slots::turns::Turn;
 use leaderboard_api::evalai_status::Status;
 use leaderboard_api::{Attempt, JobNumber, Leaderboard, SharedText, Submission, names};
 use leaderboard_contract::run::Stop;
 use leaderboard_contract::verdict::WorkspaceReason;
+use leaderboard_protocol::files::{Member, Side};
 use leaderboard_protocol::verdict::Verdict;
 
 /// Everything a decision may depend on. By default nothing has been seen yet.
@@ -27,6 +28,8 @@ pub struct View {
     pub is_policy_in_place: bool,
     /// The row that another program may have written of it.
     pub row: Lookup<Row>,
+    /// The copy of its submitted file.
+    pub input: Lookup<Input>,
     /// Its permission to start; only meaningful while it has no Job and all else is settled.
     pub turn: Turn,
     pub job: ObservedJob,
@@ -153,7 +156,7 @@ pub struct PodView {
     pub delete_by: Option<Timestamp>,
     /// When its deletion was asked for.
     pub deleted: Option<Timestamp>,
-    /// When its first agent started.
+    /// When its first agent started; where it has none, its first evaluator.
     pub agent_started: Option<Timestamp>,
     pub logcopy_running: bool,
     /// When the last container of its workers ended, once all of them have ended well.
@@ -232,6 +235,21 @@ impl ContainerView {
         names::INIT_CONTAINERS.contains(&self.name.as_str())
     }
 
+    /// True if it is one of the Pod's own containers, for which those after it wait.
+    pub fn prepares(&self) -> bool {
+        self.is_before_agents() || self.name == names::CONTAINER_COLLECT
+    }
+
+    /// True if it is an agent's.
+    pub fn is_agents(&self) -> bool {
+        Member::parse(&self.name).is_some_and(|member| member.side == Side::Agent)
+    }
+
+    /// True if its last life ended with exit code 0.
+    pub fn has_ended_well(&self) -> bool {
+        self.last.as_ref().is_some_and(|end| end.exit_code == 0)
+    }
+
     /// True if the restarts count a life after the last end.
     pub fn has_next_life(&self) -> bool {
         self.running || self.begins_anew
@@ -249,7 +267,7 @@ pub struct EndView {
     pub at: Option<Timestamp>,
     /// The runner's verdict. An agent can forge its own.
     pub verdict: Option<Verdict>,
-    /// The reason that `workspace` reported.
+    /// The reason that `workspace` or `collect` reported.
     pub own_reason: Option<WorkspaceReason>,
     /// The sentence of a container of the host's, or Kubernetes' own.
     pub why: Option<String>,

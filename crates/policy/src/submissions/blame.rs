@@ -3,7 +3,9 @@
 //! No participant's program runs in the host's container, so its verdict, and what the kubelet reports of it,
 //! decide. An agent's processes can replace or suppress the agent's verdict; it therefore only names the agent's fault more closely.
 //! Both ends are matched by their round. Where the host's end of a round is missing, it is waited for, and then the agent is the
-//! cause.
+//! cause. Where the two never live at one time, `alone` judges.
+
+pub(super) mod alone;
 
 use std::collections::BTreeSet;
 
@@ -15,7 +17,7 @@ use super::waits::Wait;
 use super::{cause, failure};
 use crate::report_digest::clamp;
 use crate::view::{ContainerView, EndView, PodView};
-use leaderboard_api::{EndReason, Failure, LastEnd, SubmissionStatus, WorkerState, WorkerStatus};
+use leaderboard_api::{Agents, EndReason, Failure, LastEnd, RunPlan, SubmissionStatus, WorkerState, WorkerStatus};
 use leaderboard_evaluation::of_plan;
 use leaderboard_protocol::files::{Host, Member, Pair, Side};
 use leaderboard_protocol::verdict::{CODE_NO_PROCESS, CODE_NODE_REFUSED, What};
@@ -324,12 +326,12 @@ fn of_start_error(end: &EndView) -> EndReason {
 
 /// Counts the crashes of each worker and remembers the last one: its Pod may be gone when the cause is looked for.
 pub(super) fn note_crashes(status: &mut SubmissionStatus, pod: &PodView, now: Timestamp) {
-    let kind = host_of(status);
+    let (kind, agents) = (host_of(status), agents_of(status));
     let ids: BTreeSet<i32> = pod.containers.iter().filter_map(|c| pair_of(&c.name)).collect();
     for id in ids {
         let its = pod.containers.iter().filter(|c| pair_of(&c.name) == Some(id));
-        let counted = its.map(count_crashes).max().unwrap_or(0);
-        let crash = last_crash_of(pod, kind, id, now);
+        let counted = its.map(|its| count_crashes(its, agents)).max().unwrap_or(0);
+        let crash = last_crash_of(pod, (kind, agents), id, now);
         if counted > 0 || crash.is_some() {
             let host = pair_with(id).and_then(|pair| container(pod, pair.host(kind)));
             let worker = worker_entry(status, id);
@@ -359,12 +361,12 @@ fn take_crash(worker: &mut WorkerStatus, counted: i32, crash: Option<Crash>) {
 
 /// Ends of a container that were crashes. One that has ended counts at once, not only when it is started again. The kubelet also counts
 /// how often it could not start a host's container, whose runner knows its rounds.
-fn count_crashes(container: &ContainerView) -> i32 {
+fn count_crashes(container: &ContainerView, agents: Agents) -> i32 {
     let Some(last) = container.last.as_ref() else {
         return container.restarts;
     };
     let is_host = Member::parse(&container.name).is_some_and(|member| member.side != Side::Agent);
-    if is_host && lacked_processes(container, last) {
+    if is_host && agents == Agents::Beside && lacked_processes(container, last) {
         return 0;
     }
     let is_crash = is_crash(last);
@@ -378,9 +380,13 @@ fn count_crashes(container: &ContainerView) -> i32 {
     }
 }
 
-fn last_crash_of(pod: &PodView, kind: Host, id: i32, now: Timestamp) -> Option<Crash> {
+fn last_crash_of(pod: &PodView, (kind, agents): (Host, Agents), id: i32, now: Timestamp) -> Option<Crash> {
     let pair = pair_with(id)?;
-    last_crash(kind, container(pod, pair.host(kind)), container(pod, pair.agent()), now)
+    let (host, agent) = (container(pod, pair.host(kind)), container(pod, pair.agent()));
+    match agents {
+        Agents::Beside => last_crash(kind, host, agent, now),
+        Agents::First | Agents::Absent => alone::last_crash(host, agent),
+    }
 }
 
 /// The program in the hosts' containers of the workers.
@@ -388,6 +394,11 @@ pub(super) fn host_of(status: &SubmissionStatus) -> Host {
     let plan = status.plan.as_ref();
     // Without a plan nothing is decided before it is pinned anew.
     plan.map_or(Host::Simulator, |plan| of_plan(plan).host())
+}
+
+/// How the agents of a submission stand to its hosts' containers.
+pub(super) fn agents_of(status: &SubmissionStatus) -> Agents {
+    status.plan.as_ref().map_or(Agents::Beside, RunPlan::agents)
 }
 
 pub(super) fn pair_with(id: i32) -> Option<Pair> {
@@ -423,7 +434,8 @@ fn worker_entry(status: &mut SubmissionStatus, id: i32) -> &mut WorkerStatus {
 
 /// The failure of a pair that has crashed as often as it may, or cannot start at all. It waits until the cause is settled.
 pub(super) fn too_many(draft: &mut PlanBuilder<'_>) -> Option<Failure> {
-    let (limit, kind) = (draft.retries().per_worker.saturating_add(1), host_of(&draft.status));
+    let limit = draft.retries().per_worker.saturating_add(1);
+    let sides = (host_of(&draft.status), agents_of(&draft.status));
     let is_too_many = |worker: &&WorkerStatus| {
         worker.crashes >= limit || (worker.crashes > 0 && failure::cause_of(worker).is_some_and(is_hopeless))
     };
@@ -433,7 +445,7 @@ pub(super) fn too_many(draft: &mut PlanBuilder<'_>) -> Option<Failure> {
             continue;
         };
         let pod = draft.view.pod.as_ref();
-        let crash = pod.and_then(|pod| last_crash_of(pod, kind, worker.id, draft.now()));
+        let crash = pod.and_then(|pod| last_crash_of(pod, sides, worker.id, draft.now()));
         // Further failures while the other side's end is awaited put the end of the run off no further.
         match crash.filter(|crash| !crash.is_settled && worker.crashes <= limit) {
             None => return Some(failure::of_worker(worker, cause, &draft.status)),

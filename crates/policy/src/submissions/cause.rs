@@ -22,6 +22,9 @@ use leaderboard_protocol::files::{Member, Side};
 const NOT_ISOLATED: &str = "The Pod was not shown to be isolated from the network, and network.enforcement is Require. Look at the log of its \
      container workspace.";
 
+const NO_INPUT: &str = "The submitted file is not in the bucket.";
+const BAD_INPUT: &str = "The files that the agent has left cannot be taken.";
+
 /// A container that does not start.
 pub(super) struct Trouble {
     pub(super) reason: Reason,
@@ -44,14 +47,14 @@ pub(super) fn trouble_of(pod: &PodView) -> Option<Trouble> {
     let mut all = hosts.into_iter().chain(agents);
     let has_started = pod.agent_started.is_some();
     all.find_map(|container| {
-        let is_init = container.is_before_agents();
-        if is_init && has_started {
+        if container.is_before_agents() && has_started {
             return None;
         }
         let never_ran = container.last.is_none() && container.restarts == 0;
-        let found = of_container(container, is_init)?;
+        let found = of_container(container, container.prepares())?;
         Some(Trouble {
-            is_start: !has_started || never_ran,
+            // Until `collect` is through, no evaluator starts.
+            is_start: !has_started || never_ran || container.prepares(),
             ..found
         })
     })
@@ -122,21 +125,31 @@ fn of_end(container: &ContainerView, is_init: bool) -> Option<Trouble> {
     if !is_init {
         return None;
     }
-    // Another try of the same Pod would find the same; the next Pod may get another node.
-    if matches!(
-        end.own_reason,
-        Some(WorkspaceReason::NotIsolated | WorkspaceReason::NotKnownIsolated)
-    ) {
-        let why = end.why.as_deref().unwrap_or(NOT_ISOLATED);
+    // Another try of the same Pod would find the same.
+    if let Some((reason, unsaid, cause)) = end.own_reason.and_then(of_verdict) {
+        let why = end.why.as_deref().unwrap_or(unsaid);
         return Some(Trouble {
             is_hopeless: true,
-            ..trouble(container, Reason::NotIsolated, why, Cause::Host)
+            ..trouble(container, reason, why, cause)
         });
     }
     let code = || format!("it ended with code {} ({})", end.exit_code, end.reason);
     let why = end.why.clone().unwrap_or_else(code);
     let message = format!("{name} fails: {why}");
     Some(trouble(container, Reason::Preparing, &message, Cause::Host))
+}
+
+/// What `workspace` or `collect` has found that no further try changes: with the message should it not report it itself.
+fn of_verdict(verdict: WorkspaceReason) -> Option<(Reason, &'static str, Cause)> {
+    match verdict {
+        // The next Pod may get another node.
+        WorkspaceReason::NotIsolated | WorkspaceReason::NotKnownIsolated => {
+            Some((Reason::NotIsolated, NOT_ISOLATED, Cause::Host))
+        }
+        WorkspaceReason::InputMissing => Some((Reason::InputMissing, NO_INPUT, Cause::Host)),
+        WorkspaceReason::InputRefused => Some((Reason::InputInvalid, BAD_INPUT, Cause::Input)),
+        _ => None,
+    }
 }
 
 fn trouble(container: &ContainerView, reason: Reason, message: &str, cause: Cause) -> Trouble {
@@ -213,8 +226,9 @@ pub(super) fn failure_of(found: &Trouble, pod: &PodView, seconds: i64) -> Failur
             "The submitted image is of a kind that cannot be run.",
             "Build the image with a present version of its tool, and submit again.",
         ),
+        Cause::Input => participant(found.reason, message, &for_both("Correct this, and submit again.")),
         Cause::Registry | Cause::Node | Cause::Host => match found.reason {
-            Reason::NotIsolated => infrastructure(found.reason, message),
+            Reason::NotIsolated | Reason::InputMissing => infrastructure(found.reason, message),
             Reason::Preparing => infrastructure(Reason::StartDeadline, &tried),
             reason => infrastructure(reason, &tried),
         },
@@ -255,6 +269,8 @@ pub(super) enum Cause {
     ImageKind,
     /// The text that was submitted is the name of no image.
     ImageName,
+    /// The files that the agent has left.
+    Input,
     /// The registry, or the way to it.
     Registry,
     /// The node: its kubelet, container engine, GPU toolkit, disk or memory.
@@ -273,7 +289,7 @@ impl Cause {
             | Self::ImagePlatform
             | Self::ImageKind
             | Self::ImageName => true,
-            Self::Registry | Self::Node | Self::Host => false,
+            Self::Input | Self::Registry | Self::Node | Self::Host => false,
         }
     }
 }

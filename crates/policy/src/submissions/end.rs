@@ -164,7 +164,7 @@ fn of_job(draft: &PlanBuilder<'_>, end: &JobEnd) -> Failure {
         JobEnd::Failed { reason, .. } if reason == "DeadlineExceeded" && draft.deadlines().run_seconds.is_some() => {
             let units = draft.words().units;
             let what = format!("The Pod reached its time limit; finished {units} are kept.");
-            failure::charged(Reason::TimeLimit, &what)
+            failure::time_limit(&what, &draft.status)
         }
         JobEnd::Failed { reason, message, .. } => failure::worst(&draft.status).unwrap_or_else(|| {
             let what = format!("The Job failed with {reason}: {}", sentence(message));
@@ -175,8 +175,9 @@ fn of_job(draft: &PlanBuilder<'_>, end: &JobEnd) -> Failure {
 
 /// Failures that a second try may fix.
 fn may_retry(draft: &PlanBuilder<'_>, found: &Failure) -> bool {
-    const FINAL: [Reason; 4] = [
+    const FINAL: [Reason; 5] = [
         Reason::GraphicsDriverMissing,
+        Reason::InputMissing,
         Reason::JobDeleted,
         Reason::JobExpired,
         Reason::ScheduleDeadline,

@@ -3,9 +3,9 @@
 //! Pure.
 
 use super::plan::Event;
-use super::publish;
+use super::{blame, publish};
 use leaderboard_api::conditions;
-use leaderboard_api::{Reason, ReasonName, State, SubmissionStatus};
+use leaderboard_api::{Agents, Reason, ReasonName, State, SubmissionStatus};
 
 /// Reasons that Kubernetes' own events, the event `Started` and the status show anyway.
 const WITHOUT_EVENT: [Reason; 4] = [
@@ -20,18 +20,19 @@ pub(super) fn of_change(old: Option<&SubmissionStatus>, new: &SubmissionStatus) 
     [start(old, new), transition(old, new)].into_iter().flatten()
 }
 
-/// The start of the agents, of each Pod once.
+/// The start of the agents, of each Pod once; of the evaluators where there are none.
 fn start(old: Option<&SubmissionStatus>, new: &SubmissionStatus) -> Option<Event> {
     let is_running = |status: &SubmissionStatus| status.is_true(conditions::RUNNING);
     if old.is_some_and(is_running) || !is_running(new) {
         return None;
     }
     let node = new.node_name.as_ref().map(|node| format!(" on node {node}"));
-    let message = format!(
-        "The agents of attempt {} run{}.",
-        new.attempt?,
-        node.unwrap_or_default()
-    );
+    let (attempt, node) = (new.attempt?, node.unwrap_or_default());
+    let message = match blame::agents_of(new) {
+        Agents::Beside => format!("The agents of attempt {attempt} run{node}."),
+        Agents::First => format!("The agent of attempt {attempt} runs{node}."),
+        Agents::Absent => format!("The evaluators of attempt {attempt} run{node}."),
+    };
     Some(event(false, Reason::Started, message))
 }
 

@@ -1,14 +1,13 @@
-//! Failures: a class, a reason, one sentence and the next step for hosts and for participants; and which log explains one.
+//! Failures: a class, a reason, one sentence and the next step for hosts and for participants.
 //!
 //! No text for a participant names a file, an object or a machine of the hosts.
 
+use super::blame::{agents_of, pair_with};
 use crate::report_digest::{ReportDigest, clamp};
-use crate::view::{ContainerView, LogAt, LogPlace, ObservedNode, PodView};
+use crate::view::ObservedNode;
 use leaderboard_api::text::sentence;
-use leaderboard_api::{
-    EndReason, Failure, FailureClass, Reason, ReasonName, SubmissionStatus, WorkerStatus, names, reasons,
-};
-use leaderboard_contract::keys::{agent_log, host_log};
+use leaderboard_api::{Agents, EndReason, Failure, FailureClass, Reason, SubmissionStatus, WorkerStatus, reasons};
+use leaderboard_contract::keys::{REFUSED, result_path};
 use leaderboard_contract::report::{Outcome, RefusedResults};
 use leaderboard_contract::run::Stop;
 use leaderboard_evaluation::{Words, words};
@@ -49,7 +48,7 @@ pub(super) fn at_the_end(found: Failure) -> Failure {
     match found.class {
         FailureClass::Participant => found,
         FailureClass::Infrastructure => {
-            let step = of_infrastructure(&found.reason);
+            let step = of_infrastructure(&found);
             Failure {
                 message: format!("{} {step}", found.message).trim_end().to_owned(),
                 next_step: Some(step.clone()).filter(|step| !step.is_empty()),
@@ -86,12 +85,19 @@ pub(super) fn node_lost(node: Option<&str>, node_state: ObservedNode, words: &Wo
     infrastructure(Reason::NodeLost, &what)
 }
 
-pub(super) fn time_limit(seconds: i64, words: &Words) -> Failure {
-    let what = format!(
-        "The run took longer than {seconds} s and was stopped; finished {} are kept.",
-        words.units
-    );
-    charged(Reason::TimeLimit, &what)
+/// A run that took too long: `what` happened.
+pub(super) fn time_limit(what: &str, status: &SubmissionStatus) -> Failure {
+    match agents_of(status) {
+        Agents::Beside | Agents::First => charged(Reason::TimeLimit, what),
+        Agents::Absent => participant(
+            Reason::TimeLimit,
+            what,
+            &Steps {
+                hosts: "Look at the evaluator's log, and give the run more time.".to_owned(),
+                participant: "Ask the challenge's hosts for more time.".to_owned(),
+            },
+        ),
+    }
 }
 
 pub(super) fn results_not_stored() -> Failure {
@@ -111,9 +117,15 @@ pub(super) fn invalid_results(refused: &RefusedResults, words: &Words) -> Failur
 
 /// Results that the host's own evaluator has spoiled.
 pub(super) fn unusable_results(found: &RefusedResults) -> Failure {
+    let worker = found.worker.map(clamp);
+    let kept = worker.and_then(pair_with).map(|pair| {
+        let path = result_path(pair);
+        format!(" A file that cannot be used is kept at {REFUSED}{path}.")
+    });
+    let what = sentence(&capitalized(&found.why)) + &kept.unwrap_or_default();
     Failure {
-        worker: found.worker.map(clamp),
-        ..infrastructure(Reason::EvaluatorFailed, &sentence(&capitalized(&found.why)))
+        worker,
+        ..infrastructure(Reason::EvaluatorFailed, &what)
     }
 }
 
@@ -192,13 +204,14 @@ pub(super) fn cause_of(worker: &WorkerStatus) -> Option<EndReason> {
 
 pub(super) fn of_worker(worker: &WorkerStatus, cause: EndReason, status: &SubmissionStatus) -> Failure {
     let (id, node, words) = (worker.id, status.node_name.as_deref(), words(status.plan.as_ref()));
+    let agents = agents_of(status);
     let times = match worker.crashes {
         1 => "once".to_owned(),
         crashes => format!("{crashes} times"),
     };
-    let failure = if let Some((reason, what)) = of_node(id, &times, (cause, node), words) {
+    let failure = if let Some((reason, what)) = of_node(id, &times, (cause, node), (agents, words)) {
         infrastructure(reason, &what)
-    } else if let Some((reason, what)) = of_host(cause) {
+    } else if let Some((reason, what)) = of_host(cause, agents) {
         let what = format!("The {} of {} {id} failed {times}: {what}.", words.host, words.worker);
         infrastructure(reason, &what)
     } else {
@@ -212,16 +225,25 @@ pub(super) fn of_worker(worker: &WorkerStatus, cause: EndReason, status: &Submis
 }
 
 /// The node's fault: it cannot draw, or start an agent.
-fn of_node(id: i32, times: &str, (cause, node): (EndReason, Option<&str>), words: &Words) -> Option<(Reason, String)> {
+fn of_node(
+    id: i32,
+    times: &str,
+    (cause, node): (EndReason, Option<&str>),
+    (agents, words): (Agents, &Words),
+) -> Option<(Reason, String)> {
     let Words { host, worker, .. } = words;
     let node = node.map_or_else(|| "the node".to_owned(), |node| format!("node {node}"));
     match cause {
         EndReason::NoGPU => Some((
             Reason::NoGPU,
             format!(
-                "{} {id} lacks a GPU on {node}, although the Leaderboard gives it one: its {host} or its agent saw none. The \
-                 {host}'s log says which.",
-                capitalized(worker)
+                "{} {id} lacks a GPU on {node}, although the Leaderboard gives it one: {}",
+                capitalized(worker),
+                match agents {
+                    Agents::Beside => format!("its {host} or its agent saw none. The {host}'s log says which."),
+                    Agents::First => format!("its agent or its {host} saw none."),
+                    Agents::Absent => format!("its {host} saw none."),
+                }
             ),
         )),
         EndReason::GraphicsDriverMissing => Some((
@@ -246,17 +268,18 @@ fn of_node(id: i32, times: &str, (cause, node): (EndReason, Option<&str>), words
 }
 
 /// The end of the host's container, if that was the cause.
-fn of_host(cause: EndReason) -> Option<(Reason, &'static str)> {
+fn of_host(cause: EndReason, agents: Agents) -> Option<(Reason, &'static str)> {
     let (reason, what) = match cause {
         EndReason::SimulatorCrashed => (Reason::SimulationCrashed, "it crashed"),
         EndReason::SimulatorNotReady => (Reason::SimulationCrashed, "it was not ready in time"),
         EndReason::SimulatorSilent => (Reason::SimulationCrashed, "its server did not answer any more"),
         EndReason::SimulatorNotStarted => (Reason::SimulationCrashed, NOT_STARTED),
         EndReason::EvaluatorCrashed => (Reason::EvaluatorFailed, "it ended without a final result"),
-        EndReason::EvaluatorNotReady => (
+        EndReason::EvaluatorNotReady if agents == Agents::Beside => (
             Reason::EvaluatorFailed,
             "it did not listen on its port in time, or had no final result in time",
         ),
+        EndReason::EvaluatorNotReady => (Reason::EvaluatorFailed, "it had no final result in time"),
         EndReason::EvaluatorNotStarted => (Reason::EvaluatorFailed, NOT_STARTED),
         _ => return None,
     };
@@ -360,14 +383,18 @@ fn of_participant(reason: Reason) -> String {
 }
 
 /// The host's next step after a failure of the infrastructure that no retry has ended.
-fn of_infrastructure(reason: &ReasonName) -> String {
-    let step = match reason.known() {
+fn of_infrastructure(found: &Failure) -> String {
+    let step = match found.reason.known() {
         // The text of `workspace` has the step before this one.
         Some(Reason::NotIsolated) => "Then resume the submission.",
         Some(reason) => reason.after_failure(),
         None => "Fix this, then resume the submission.",
     };
-    reasons::plain(step)
+    let step = reasons::plain(step);
+    match found.worker {
+        Some(worker) => step.replace("<n>", &worker.to_string()),
+        None => step,
+    }
 }
 
 /// All that a participant reads of a failure of the infrastructure.
@@ -388,59 +415,12 @@ fn infrastructure_for_participants(reason: Reason) -> String {
         Reason::JobDeleted | Reason::JobExpired | Reason::JobFailed => "The cluster ended the run.",
         Reason::PhaseDiffers => "The submission's phase in EvalAI is not the one it was submitted to.",
         Reason::NotIsolated => "The run could not be isolated from the network.",
+        Reason::InputMissing => "The submitted file could not be read.",
         _ => "The run could not be set up.",
     };
-    format!("{what} Your agent is not the cause. Ask the challenge's hosts to resume the submission, or submit again.")
-}
-
-pub(super) fn is_on_node(place: &LogPlace) -> bool {
-    matches!(place.at, LogAt::Node { .. })
-}
-
-/// The places of the log that explains the failure of a status.
-pub(super) fn log_places(status: &SubmissionStatus, pod: Option<&PodView>) -> Vec<LogPlace> {
-    let Some(failure) = &status.failure else {
-        return Vec::new();
-    };
-    let id = failure.worker.unwrap_or_else(|| unfinished(status));
-    let Some(pair) = super::blame::pair_with(id) else {
-        return Vec::new();
-    };
-    let kind = super::blame::host_of(status);
-    let (agent, host) = (pair.agent().to_string(), pair.host(kind).to_string());
-    let on_node = |container: &str| pod.and_then(|pod| on_node(pod, container));
-    let found = match failure.reason.known() {
-        Some(Reason::SimulationCrashed | Reason::EvaluatorFailed) => {
-            vec![on_node(&host), Some(stored(&host, host_log(kind, pair)))]
-        }
-        Some(Reason::StartDeadline) => vec![pod.and_then(failing_before_agents).and_then(on_node)],
-        Some(Reason::ResultsNotStored | Reason::JobFailed) => vec![
-            on_node(names::CONTAINER_LOGCOPY),
-            Some(stored(
-                names::CONTAINER_LOGCOPY,
-                leaderboard_contract::keys::OWN_LOG.into(),
-            )),
-        ],
-        // It never ran.
-        Some(
-            Reason::ImageInvalid
-            | Reason::ImageNotFound
-            | Reason::ImagePlatform
-            | Reason::ImagePull
-            | Reason::ImageChanged
-            | Reason::ContainerConfig,
-        ) => Vec::new(),
-        Some(Reason::DiskFull) => vec![Some(stored(&agent, agent_log(pair))), on_node(&agent)],
-        _ if failure.class == FailureClass::Participant => vec![Some(stored(&agent, agent_log(pair))), on_node(&agent)],
-        _ => Vec::new(),
-    };
-    found.into_iter().flatten().collect()
-}
-
-/// The container before the agents that fails.
-fn failing_before_agents(pod: &PodView) -> Option<&str> {
-    let is_failing = |c: &&ContainerView| c.is_before_agents() && c.last.as_ref().is_some_and(|l| l.exit_code != 0);
-    pod.containers.iter().find(is_failing).map(|c| c.name.as_str())
+    format!(
+        "{what} Your submission is not the cause. Ask the challenge's hosts to resume the submission, or submit again."
+    )
 }
 
 /// Words at the beginning of a sentence.
@@ -457,35 +437,4 @@ fn article(word: &str) -> &'static str {
     } else {
         "a"
     }
-}
-
-/// The first worker that has not done all its work: a failure of the whole run is most likely explained by its log.
-fn unfinished(status: &SubmissionStatus) -> i32 {
-    let mut workers = status.workers.iter();
-    workers
-        .find(|worker| worker.done < worker.total)
-        .map_or(1, |worker| worker.id)
-}
-
-fn stored(container: &str, key: String) -> LogPlace {
-    LogPlace {
-        container: container.into(),
-        at: LogAt::Bucket { key },
-    }
-}
-
-/// None for a container that never ran: it has no log.
-fn on_node(pod: &PodView, container: &str) -> Option<LogPlace> {
-    let found = pod.container(container)?;
-    if !found.running && found.last.is_none() {
-        return None;
-    }
-    let at = LogAt::Node {
-        pod: pod.name.clone(),
-        previous: found.running && found.last.is_some(),
-    };
-    Some(LogPlace {
-        container: container.into(),
-        at,
-    })
 }

@@ -6,8 +6,9 @@
 //!                               └─▶ stop ─▶┘
 //! ```
 //!
-//! `cause` and `blame` decide whose fault a start or a crash was, `failure` makes it a sentence with its next step. `waits` has how long anything
-//! is waited for. All write into one `status`; `write` decides whether a changed one is worth a write, `events` has its events, and `plan` is the result.
+//! `cause` and `blame` decide whose fault a start or a crash was. `failure` makes it a sentence with its next step, and `logs` finds the log for
+//! it. `waits` has how long anything is waited for, and `limits` how long a start may take. All write into one `status`; `write` decides whether
+//! a changed one is worth a write, `events` has its events, and `plan` is the result.
 
 mod accept;
 mod blame;
@@ -17,6 +18,8 @@ mod events;
 mod failure;
 mod gates;
 mod leave;
+mod limits;
+mod logs;
 mod plan;
 mod publish;
 mod run;

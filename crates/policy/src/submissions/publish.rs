@@ -12,7 +12,7 @@ use super::plan::{Action, EvalaiUpdate, TableUpdate};
 use super::run::{self, Reading};
 use super::status::PlanBuilder;
 use super::waits::{Wait, after};
-use super::{failure, gates, leave, stop};
+use super::{gates, leave, logs, stop};
 use crate::view::{EvalaiEnd, EvalaiView, ObservedLog};
 use leaderboard_api::conditions::{self, Truth};
 use leaderboard_api::evalai_status::Status;
@@ -324,7 +324,7 @@ fn keep_at_end(draft: &mut PlanBuilder<'_>) -> Option<Duration> {
     let is_answered = draft.view.evalai.as_ref().is_some_and(|e| e.end.is_some());
     let is_awaited = draft.spec().evalai.is_some() && !is_published && !is_answered;
     if is_awaited || (has_just_ended && !is_answered) {
-        let places = failure::log_places(&draft.status, draft.view.pod.as_ref());
+        let places = logs::log_places(&draft.status, draft.view.pod.as_ref());
         if !places.is_empty() {
             draft.act(Action::KeepLog { places });
             // The known log is from before the end.

@@ -19,7 +19,7 @@ use crate::view::{ContainerView, ObservedJob, ObservedReport, PodView, ReportDem
 use leaderboard_api::conditions::{self, Condition, Truth};
 use leaderboard_api::text::sentence;
 use leaderboard_api::{
-    Failure, ImageReference, PinnedImage, Reason, Repository, State, SubmissionStatus, WorkerStatus, names,
+    Failure, ImageReference, PinnedImage, Reason, Repository, State, SubmissionStatus, WorkerStatus,
 };
 use leaderboard_contract::report::Logs;
 use leaderboard_contract::report::Patience;
@@ -54,7 +54,9 @@ pub(super) fn watch(draft: &mut PlanBuilder<'_>) {
         return;
     };
     if ran >= limit {
-        draft.fail(failure::time_limit(limit, draft.words()));
+        let units = draft.words().units;
+        let what = format!("The run took longer than {limit} s and was stopped; finished {units} are kept.");
+        draft.fail(failure::time_limit(&what, &draft.status));
     } else if goes_on(draft) {
         draft.requeue_at(after(draft.now(), limit - ran));
     }
@@ -125,8 +127,8 @@ fn image_changed(draft: &PlanBuilder<'_>) -> Option<Failure> {
 /// The digests of the submitted image that a Pod's agents run. A node may show an image under the name of another repository that has
 /// the same content; such a digest proves nothing of this repository.
 fn digests<'a>(status: &SubmissionStatus, pod: &'a PodView) -> Vec<&'a str> {
-    let submitted = status.plan.as_ref().map(|plan| ImageReference::parse(&plan.image));
-    let Some(Ok(submitted)) = submitted else {
+    let image = status.plan.as_ref().and_then(|plan| plan.image.as_deref());
+    let Some(Ok(submitted)) = image.map(ImageReference::parse) else {
         return Vec::new();
     };
     let repository = Repository::of(&submitted);
@@ -137,10 +139,7 @@ fn digests<'a>(status: &SubmissionStatus, pod: &'a PodView) -> Vec<&'a str> {
             .digest
             .filter(|digest| is_submitted && digest.starts_with("sha256:"))
     };
-    let agents = pod
-        .containers
-        .iter()
-        .filter(|container| names::is_agent_container(&container.name));
+    let agents = pod.containers.iter().filter(|container| container.is_agents());
     agents.filter_map(digest).collect()
 }
 

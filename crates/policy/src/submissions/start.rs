@@ -1,26 +1,27 @@
 //! From the Job's creation to its running agents: what its Pod waits for, and when that has taken too long.
 //!
 //! Also of a Pod that replaces a lost one: the submission then keeps its state, with the reason `Replacing`. Pulls of images have a deadline
-//! apart from all the rest. The kubelet's events are not watched, and no condition covers images, so a pull is known by its containers: the
-//! kubelet starts them in order, and one that was never started, has no error and is next is waiting for its image.
+//! apart from all the rest (`limits`).
 
 use jiff::Timestamp;
 
 use super::cause::{self, Cause, Trouble};
-use super::failure::{self, infrastructure};
+use super::failure::infrastructure;
 use super::plan::Action;
 use super::status::PlanBuilder;
 use super::waits::{Wait, after};
-use super::{run, suspend};
-use crate::view::{ContainerView, JobView, ObservedJob, ObservedNode, PodView, ScaleUp};
+use super::{blame, limits, run, suspend};
+use crate::view::{JobView, ObservedJob, ObservedNode, PodView, ScaleUp};
+use leaderboard_api::Reason;
 use leaderboard_api::conditions::{self, Truth};
 use leaderboard_api::text::sentence;
-use leaderboard_api::{Deadlines, Failure, Reason, names};
 use leaderboard_pod_spec::job as job_spec;
-use leaderboard_protocol::files::Member;
 
 /// The message for a Pod that starts as it should.
 const PREPARED: &str = "The Pod is being prepared.";
+
+/// The message between the agent's end and the evaluators' start.
+const AGENT_IS_DONE: &str = "The agent has ended; the evaluators start.";
 
 /// The kubelet's reason where a device plugin does not give the devices on which the scheduler counted.
 const NOT_ADMITTED: &str = "UnexpectedAdmissionError";
@@ -108,10 +109,12 @@ fn on_its_node(draft: &mut PlanBuilder<'_>, pod: &PodView, since: Timestamp) {
         .as_ref()
         .map(|found| draft.blocked_since(found.reason).unwrap_or(draft.now()));
     // Until the scheduler has spoken there is no node that could be late.
-    let limit = limit(pod, &draft.deadlines(), stalled);
+    let agents = blame::agents_of(&draft.status);
+    let limit = limits::limit(pod, agents, &draft.deadlines(), stalled);
     let over = limit.filter(|limit| draft.now() >= limit.at);
     let lasted = found.as_ref().and_then(|found| lasts(draft, found));
     let has_started = pod.agent_started.is_some();
+    let awaits_evaluators = limits::awaits_evaluators(pod, agents);
     match (found, over) {
         (Some(found), _) if found.is_hopeless => draft.fail(cause::failure_of(&found, pod, 0)),
         (Some(found), Some(over)) if found.is_start => draft.fail(cause::failure_of(&found, pod, over.seconds)),
@@ -124,10 +127,14 @@ fn on_its_node(draft: &mut PlanBuilder<'_>, pod: &PodView, since: Timestamp) {
                 draft.requeue_at(limit.at);
             }
         }
-        (None, _) if has_started => show_running(draft),
-        (None, Some(over)) => draft.fail(start_deadline(pod, over)),
+        (None, _) if has_started && !awaits_evaluators => show_running(draft, ""),
+        (None, Some(over)) => draft.fail(limits::start_deadline(pod, agents, over)),
         (None, None) => {
-            show_preparing(draft, pod, since);
+            if has_started {
+                show_running(draft, AGENT_IS_DONE);
+            } else {
+                show_preparing(draft, pod, since);
+            }
             if let Some(limit) = limit {
                 draft.requeue_at(limit.at);
             }
@@ -177,16 +184,18 @@ fn left_by_node(draft: &PlanBuilder<'_>, pod: &PodView) -> Option<String> {
     }
 }
 
-fn show_running(draft: &mut PlanBuilder<'_>) {
+/// Shows that it runs, with its progress, or these words where there is none.
+fn show_running(draft: &mut PlanBuilder<'_>, words: &str) {
     let reason = if draft.status.is_resumed() {
         Reason::Resumed
     } else {
         Reason::Running
     };
     let progress = draft.status.progress.as_ref();
-    let message = progress
-        .map(|p| format!("{} {} done.", p.text, p.unit))
-        .unwrap_or_default();
+    let message = match progress {
+        Some(progress) if words.is_empty() => format!("{} {} done.", progress.text, progress.unit),
+        _ => words.to_owned(),
+    };
     draft.moves();
     draft.condition(conditions::RUNNING, Truth::True, reason, "");
     draft.show(reason, message);
@@ -235,29 +244,13 @@ fn show_preparing(draft: &mut PlanBuilder<'_>, pod: &PodView, since: Timestamp) 
         let told = REPORTED_MINUTES.iter().rev().find(|m| silent >= **m * 60);
         let long = told.map_or_else(String::new, |m| format!(", for over {m} min"));
         let node = pod.node.as_deref().map(|n| format!(" on {n}")).unwrap_or_default();
-        format!("The Pod is being prepared{node}: {}{long}.", stage(pod))
+        format!("The Pod is being prepared{node}: {}{long}.", limits::stage(pod))
     };
     if draft.is_running() {
         let what = what_went(draft);
         draft.replacing(&format!("{what}. {message}"));
     } else {
         draft.show(Reason::Preparing, message);
-    }
-}
-
-fn stage(pod: &PodView) -> &'static str {
-    let end = |name: &str| pod.container(name)?.last.as_ref();
-    let ended = |name: &str| end(name).is_some_and(|last| last.exit_code == 0);
-    if pod.logcopy_running {
-        "images are pulled, its containers start"
-    } else if ended(names::CONTAINER_CONTENTS)
-        || (ended(names::CONTAINER_WORKSPACE) && pod.container(names::CONTAINER_CONTENTS).is_none())
-    {
-        "logcopy starts"
-    } else if ended(names::CONTAINER_WORKSPACE) {
-        "contents are pulled and copied"
-    } else {
-        "the operator's image is pulled and the workspace is filled"
     }
 }
 
@@ -363,103 +356,4 @@ fn is_late(draft: &mut PlanBuilder<'_>, job: &JobView, reason: Reason, message: 
     }
     draft.requeue_at(deadline);
     false
-}
-
-fn start_deadline(pod: &PodView, over: Limit) -> Failure {
-    let node = pod.node.as_deref().unwrap_or("the node");
-    let seconds = over.seconds;
-    let what = if over.is_of_pulls {
-        let names = waiting(pod).join(", ");
-        format!("The images of the Pod were not pulled within {seconds} s on {node}; these containers wait: {names}.")
-    } else {
-        format!(
-            "The Pod did not start within {seconds} s, and {node} reports no reason: {}.",
-            stage(pod)
-        )
-    };
-    failure::infrastructure(Reason::StartDeadline, &what)
-}
-
-/// How a container waits that the kubelet has not come to yet.
-const NOT_BEGUN: [&str; 3] = ["", "ContainerCreating", "PodInitializing"];
-
-/// When a start has taken too long.
-#[derive(Clone, Copy, Debug, PartialEq, Eq)]
-pub(super) struct Limit {
-    pub(super) at: Timestamp,
-    /// The deadline that is over then.
-    pub(super) seconds: i64,
-    pub(super) is_of_pulls: bool,
-}
-
-/// The limit of a start; none before the Pod has a node. `stalled` is since when a container of it does not start, and that is known.
-pub(super) fn limit(pod: &PodView, deadlines: &Deadlines, stalled: Option<Timestamp>) -> Option<Limit> {
-    let scheduled = pod.scheduled?;
-    let pulled_by = after(after(scheduled, run_seconds(pod)), deadlines.pull_seconds);
-    if stalled.is_none() && !waiting(pod).is_empty() {
-        return Some(Limit {
-            at: pulled_by,
-            seconds: deadlines.pull_seconds,
-            is_of_pulls: true,
-        });
-    }
-    let since = stalled.or_else(|| last_begun(pod)).unwrap_or(scheduled);
-    // Causes that take turns put the end off no further.
-    let latest = after(pulled_by, deadlines.start_seconds);
-    Some(Limit {
-        at: after(since.max(scheduled), deadlines.start_seconds).min(latest),
-        seconds: deadlines.start_seconds,
-        is_of_pulls: false,
-    })
-}
-
-/// The containers that wait for an image, if the Pod is at a pull.
-pub(super) fn waiting(pod: &PodView) -> Vec<&str> {
-    // Ours before the agents go one by one. Containers of an overlay hold them up, wherever they stand.
-    let mut before = pod.containers.iter().filter(|container| container.is_before_agents());
-    match before.find(|container| !is_through(container)) {
-        Some(next) if is_before_its_pull(next) => vec![&next.name],
-        Some(_) => Vec::new(),
-        None => {
-            let of_workers = pod
-                .containers
-                .iter()
-                .filter(|container| Member::parse(&container.name).is_some());
-            let waiting = of_workers.filter(|container| is_before_its_pull(container));
-            waiting.map(|container| container.name.as_str()).collect()
-        }
-    }
-}
-
-/// Seconds in which containers before the agents have run: no pull was under way then.
-fn run_seconds(pod: &PodView) -> i64 {
-    let before = pod.containers.iter().filter(|container| container.is_before_agents());
-    before
-        .filter_map(|container| {
-            let end = container.last.as_ref().filter(|end| end.exit_code == 0)?;
-            Some(end.at?.duration_since(end.began?).as_secs().max(0))
-        })
-        .fold(0, i64::saturating_add)
-}
-
-/// When the kubelet came to a container last. A restart is none of its pulls.
-fn last_begun(pod: &PodView) -> Option<Timestamp> {
-    let first_lives = pod.containers.iter().filter(|container| container.restarts == 0);
-    let begun = first_lives.filter_map(|container| container.began.or_else(|| container.last.as_ref()?.began));
-    begun.max()
-}
-
-/// True if the kubelet goes on to the next one.
-fn is_through(container: &ContainerView) -> bool {
-    let has_ended_well = container.last.as_ref().is_some_and(|end| end.exit_code == 0);
-    let stays = container.running && container.name == names::CONTAINER_LOGCOPY;
-    stays || (has_ended_well && !container.running)
-}
-
-fn is_before_its_pull(container: &ContainerView) -> bool {
-    let waits = container
-        .waiting
-        .as_ref()
-        .is_some_and(|(reason, _)| NOT_BEGUN.contains(&reason.as_str()));
-    waits && container.restarts == 0 && container.last.is_none()
 }

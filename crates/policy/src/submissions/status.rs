@@ -240,6 +240,7 @@ impl<'a> PlanBuilder<'a> {
             track: old.track,
             plan: old.plan.map(next),
             image: old.image,
+            input: old.input,
             progress: old.progress,
             score: old.score.map(Score::so_far),
             metrics: old.metrics,
@@ -428,9 +429,8 @@ impl<'a> PlanBuilder<'a> {
     /// Since when it is blocked for this reason.
     pub(super) fn blocked_since(&self, reason: Reason) -> Option<Timestamp> {
         let blocked = self.status.blocked_since.as_ref();
-        blocked
-            .filter(|blocked| blocked.reason == reason)
-            .map(|blocked| blocked.time.0)
+        let blocked = blocked.filter(|blocked| blocked.reason == reason);
+        blocked.map(|blocked| blocked.time.0)
     }
 
     /// Shows nothing new: the status stays as it was observed, and nothing is published.

@@ -9,6 +9,7 @@ use jiff::Timestamp;
 use k8s_openapi::apimachinery::pkg::apis::meta::v1::Time;
 
 use super::failure::{self, infrastructure};
+use super::logs;
 use super::plan::Action;
 use super::status::PlanBuilder;
 use super::waits::{Wait, after};
@@ -229,12 +230,12 @@ fn keep_while_there(draft: &mut PlanBuilder<'_>) -> Option<Duration> {
     if draft.is_cancelled() {
         return None;
     }
-    let mut places = failure::log_places(&draft.status, draft.view.pod.as_ref());
+    let mut places = logs::log_places(&draft.status, draft.view.pod.as_ref());
     // The log in S3 is complete only when the Pod has ended; it is read then, and the best place first.
-    if !places.first().is_some_and(failure::is_on_node) {
+    if !places.first().is_some_and(logs::is_on_node) {
         return None;
     }
-    places.retain(failure::is_on_node);
+    places.retain(logs::is_on_node);
     draft.act(Action::KeepLog { places });
     log_left(draft.view.log, Wait::LOG.left(Duration::ZERO))
 }

@@ -1,0 +1,39 @@
+//! The fault for the last crash of a worker whose two sides never live at one time: its own end alone. Pure.
+//!
+//! In Batch the agent ends before the evaluators begin, and in Predictions there is none. So no end follows from that of another container, and
+//! none is waited for.
+
+use super::{Crash, crash, is_crash, is_false_claim, of_agent, of_evaluator, of_host};
+use crate::view::{ContainerView, EndView};
+use leaderboard_api::EndReason;
+use leaderboard_protocol::verdict::CODE_NO_GRAPHICS;
+
+/// The last crash of the agent, and once that has ended well, of the evaluator.
+pub(in crate::submissions) fn last_crash(host: Option<&ContainerView>, agent: Option<&ContainerView>) -> Option<Crash> {
+    if let Some(agent) = agent.filter(|agent| !agent.has_ended_well()) {
+        let end = agent.last.as_ref()?;
+        let is_its = is_crash(end) || is_false_claim(None, agent, end);
+        return is_its.then(|| crash(of_lone_agent(agent, end), end));
+    }
+    let (host, end) = (host?, host?.last.as_ref()?);
+    is_crash(end).then(|| crash(of_lone_evaluator(host, end), end))
+}
+
+/// The processes of its earlier lives are gone: it is not the agent that leaves none.
+fn of_lone_agent(agent: &ContainerView, end: &EndView) -> EndReason {
+    if end.exit_code == CODE_NO_GRAPHICS {
+        return EndReason::NoGPU;
+    }
+    match of_evaluator(of_agent(agent, end)) {
+        EndReason::NoProcess => EndReason::NodeCannotStart,
+        cause => cause,
+    }
+}
+
+/// No agent is there to use up the Pod's processes, or to take a port.
+fn of_lone_evaluator(host: &ContainerView, end: &EndView) -> EndReason {
+    match of_evaluator(of_host(Some(host), end)) {
+        EndReason::NoProcess | EndReason::PortTaken => EndReason::EvaluatorCrashed,
+        cause => cause,
+    }
+}
