@@ -81,6 +81,7 @@ fn target(api_server: &str, token: &str) -> Target {
         metrics: Metrics::Fixed(seed.challenges[0].phases[0].splits[0].schema.labels.clone().into()),
         inbox: None,
         is_observed: false,
+        takes_files: false,
         since: Timestamp::now() - SignedDuration::from_hours(1),
     }
 }

@@ -109,6 +109,10 @@ impl Client {
                 let path = format!("challenges/challenge/create/challenge_phase_split/{id}/");
                 Reply::PhaseSplit(self.get(token, &path).await)
             }
+            Request::Challenge(id) => {
+                let path = format!("challenges/challenge/{id}/");
+                Reply::Challenge(self.get(token, &path).await)
+            }
             Request::Receive(queue) => {
                 let path = format!("jobs/challenge/queues/{queue}/");
                 Reply::Message(self.get(token, &path).await.of_hosts())

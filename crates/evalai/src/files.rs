@@ -3,24 +3,57 @@
 //! refuses the rest, at each redirect anew.
 
 use std::sync::Arc;
+use std::time::Duration;
 
 use bytes::Bytes;
-use http::header::LOCATION;
+use futures::stream::{self, BoxStream, StreamExt, TryStreamExt};
+use http::header::{CONTENT_LENGTH, LOCATION};
 use http::{Request, Response, StatusCode};
-use tokio::time::Instant;
+use tokio::time::{Instant, timeout};
 use url::Url;
 
-use super::answer::{About, Answer, Refusal};
-use super::row::image;
-use super::transport::{Body, Failure, Need, Timeouts, Transport, read, send, unsendable};
-use super::types::ImageAnswer;
+use super::answer::{About, Answer, Refusal, Silence};
+use super::row::{FileUrl, image};
+use super::transport::{Body, Failure, Need, Timeouts, Transport, late, read, send, unsendable};
+use super::types::{ImageAnswer, Key};
 
-/// Largest file that is read, in bytes.
+/// Largest file that is read for the image that it names, in bytes.
 const LARGEST_UPLOAD: usize = 64 << 10;
 /// How often a file may be somewhere else.
 const REDIRECTS: usize = 5;
 
+/// Where the uploaded file of a submission is. Its `Debug` does not show the address.
+#[derive(Clone, Debug)]
+pub struct InputAddress {
+    pub(super) key: Key,
+    pub(super) url: FileUrl,
+}
+
+/// The content of an uploaded file, in chunks as they come. It is whole if the stream ends without an error.
+pub type InputStream = BoxStream<'static, Result<Bytes, InputError>>;
+
+/// Why an uploaded file was not read, in words that do not show its address.
+#[derive(thiserror::Error, Clone, Debug, PartialEq, Eq)]
+pub enum InputError {
+    /// Its address gives it out no more, with this status: it was deleted, or a presigned address has expired.
+    #[error("the address of the uploaded file answers {0}; check that EvalAI still serves the file")]
+    Gone(u16),
+    /// Its address leads to where no file is read from, or to no file.
+    #[error("{0}")]
+    Refused(String),
+    /// There was no answer, or not a whole one: a later try may get it.
+    #[error("{0}")]
+    Silent(String),
+}
+
+/// Why no answer came that has a file.
+enum Unfound {
+    Refused(String),
+    Silent(Silence),
+}
+
 /// Reads uploaded files.
+#[derive(Clone)]
 pub(super) struct Files {
     transport: Arc<dyn Transport>,
     timeouts: Timeouts,
@@ -32,17 +65,35 @@ impl Files {
     }
 
     /// The image that an uploaded file names.
-    pub(super) async fn image(&self, url: &str) -> Answer<ImageAnswer> {
+    pub(super) async fn image(&self, url: &FileUrl) -> Answer<ImageAnswer> {
         let end = Instant::now() + self.timeouts.read;
         match self.found(url, end).await {
             Ok(response) => content(response, end).await,
-            Err(answer) => answer,
+            Err(Unfound::Refused(why)) => refused(why),
+            Err(Unfound::Silent(silence)) => Answer::Unanswered(silence),
+        }
+    }
+
+    /// The content of an uploaded file, whatever that is. Each chunk is waited for as long as the answer before; the caller limits the
+    /// whole.
+    pub(super) async fn open(&self, url: &FileUrl) -> Result<InputStream, InputError> {
+        let end = Instant::now() + self.timeouts.read;
+        let response = self.found(url, end).await.map_err(|unfound| match unfound {
+            Unfound::Refused(why) => InputError::Refused(why),
+            Unfound::Silent(silence) => InputError::Silent(silence.why),
+        })?;
+        let answers = |code: u16| format!("the address of the uploaded file answers {code}");
+        match response.status().as_u16() {
+            200 => Ok(chunks(response, self.timeouts.read)),
+            code @ (400 | 401 | 403 | 404 | 410) => Err(InputError::Gone(code)),
+            code @ (408 | 429 | 500..) => Err(InputError::Silent(answers(code))),
+            code => Err(InputError::Refused(check_media_url(&answers(code)))),
         }
     }
 
     /// The first answer that is no redirect.
-    async fn found(&self, url: &str, end: Instant) -> Result<Response<Body>, Answer<ImageAnswer>> {
-        let mut url = Url::parse(url).map_err(|_| refused("the address of the uploaded file is no URL"))?;
+    async fn found(&self, url: &FileUrl, end: Instant) -> Result<Response<Body>, Unfound> {
+        let mut url = Url::parse(url.as_str()).map_err(|_| unfound("the address of the uploaded file is no URL"))?;
         for _ in 0..=REDIRECTS {
             let response = send(&*self.transport, get(&url)?, end).await.map_err(failed)?;
             match next(&url, &response) {
@@ -50,22 +101,22 @@ impl Files {
                 None => return Ok(response),
             }
         }
-        Err(refused(&format!(
+        Err(unfound(&format!(
             "the uploaded file is more than {REDIRECTS} redirects away"
         )))
     }
 }
 
-fn get(url: &Url) -> Result<Request<Bytes>, Answer<ImageAnswer>> {
+fn get(url: &Url) -> Result<Request<Bytes>, Unfound> {
     if !["http", "https"].contains(&url.scheme()) {
-        return Err(refused("the address of the uploaded file is neither http nor https"));
+        return Err(unfound("the address of the uploaded file is neither http nor https"));
     }
     let request = Request::get(url.as_str()).body(Bytes::new());
-    request.map_err(|error| Answer::Unanswered(unsendable(&error)))
+    request.map_err(|error| Unfound::Silent(unsendable(&error)))
 }
 
 /// Where a redirect leads; None: this is the answer.
-fn next(url: &Url, response: &Response<Body>) -> Option<Result<Url, Answer<ImageAnswer>>> {
+fn next(url: &Url, response: &Response<Body>) -> Option<Result<Url, Unfound>> {
     let redirects = [
         StatusCode::MOVED_PERMANENTLY,
         StatusCode::FOUND,
@@ -78,7 +129,31 @@ fn next(url: &Url, response: &Response<Body>) -> Option<Result<Url, Answer<Image
     }
     let location = response.headers().get(LOCATION)?.to_str().ok();
     let next = location.and_then(|location| url.join(location).ok());
-    Some(next.ok_or_else(|| refused("the uploaded file is redirected to no URL")))
+    Some(next.ok_or_else(|| unfound("the uploaded file is redirected to no URL")))
+}
+
+/// The chunks of a body, which has to be as long as its header says.
+fn chunks(response: Response<Body>, longest: Duration) -> InputStream {
+    let length = response.headers().get(CONTENT_LENGTH);
+    let length: Option<u64> = length.and_then(|length| length.to_str().ok()?.parse().ok());
+    let begun = (response.into_body(), 0_u64);
+    let chunks = stream::try_unfold(begun, move |(mut body, read)| async move {
+        let next = timeout(longest, body.try_next()).await;
+        let next = next.unwrap_or_else(|_| Err(late("reading the uploaded file")));
+        match next.map_err(|silence| InputError::Silent(silence.why))? {
+            Some(chunk) => {
+                let read = read.saturating_add(chunk.len() as u64);
+                Ok(Some((chunk, (body, read))))
+            }
+            None => match length.filter(|length| *length != read) {
+                Some(length) => Err(InputError::Silent(format!(
+                    "the uploaded file ended after {read} of {length} bytes"
+                ))),
+                None => Ok(None),
+            },
+        }
+    });
+    chunks.boxed()
 }
 
 async fn content(response: Response<Body>, end: Instant) -> Answer<ImageAnswer> {
@@ -91,7 +166,8 @@ async fn content(response: Response<Body>, end: Instant) -> Answer<ImageAnswer> 
         other => other.and_then(|(_, body)| {
             // No JSON begins so: a login page, or the start page of a web application, stands in the file's place.
             if body.trim_ascii_start().starts_with(b"<") {
-                return refused("the address of the uploaded file answers with a page and not with the file");
+                let why = "the address of the uploaded file answers with a page and not with the file";
+                return refused(check_media_url(why));
             }
             let named = image(&body).map(ImageAnswer::Named);
             Answer::Done(named.unwrap_or_else(ImageAnswer::NotAnImage))
@@ -99,22 +175,33 @@ async fn content(response: Response<Body>, end: Instant) -> Answer<ImageAnswer> 
     }
 }
 
-fn failed(failure: Failure) -> Answer<ImageAnswer> {
+fn failed(failure: Failure) -> Unfound {
     match failure {
-        Failure::Silent(silence) => Answer::Unanswered(silence),
-        Failure::NotPublic(error) => refused(&format!(
+        Failure::Silent(silence) => Unfound::Silent(silence),
+        Failure::NotPublic(error) => unfound(&format!(
             "the uploaded file is not read: {error}, and no part of evalai.apiServer"
         )),
     }
 }
 
-fn refused(why: &str) -> Answer<ImageAnswer> {
+fn unfound(why: &str) -> Unfound {
+    Unfound::Refused(check_media_url(why))
+}
+
+fn check_media_url(why: &str) -> String {
+    format!("{why}; check EvalAI's MEDIA_URL")
+}
+
+fn refused(message: String) -> Answer<ImageAnswer> {
     Answer::Refused(Refusal {
         about: About::Request,
         status: 0,
-        message: format!("{why}; check EvalAI's MEDIA_URL"),
+        message,
     })
 }
 
 #[cfg(test)]
 mod tests;
+
+#[cfg(test)]
+mod input_tests;

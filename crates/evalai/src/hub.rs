@@ -13,6 +13,7 @@ use tokio::task::JoinHandle;
 use tokio::time::Instant;
 
 use super::client::Client;
+use super::files::{Files, InputAddress, InputError, InputStream};
 use super::labels::Labels;
 use super::queue::{Now, Purse, Queue, Timing};
 use super::request::{Reply, Request};
@@ -270,6 +271,25 @@ impl Hub {
         self.place(key)?.queue().view(key)
     }
 
+    /// Where the uploaded file of a submission is, as its row was last read; none while that is not known.
+    pub fn input_address(&self, key: &Key) -> Option<InputAddress> {
+        let row = self.view(key)?.row?;
+        let (key, url) = (key.clone(), row.input_file.clone()?);
+        Some(InputAddress { key, url })
+    }
+
+    /// Opens an uploaded file, without any token. The row is read again if the address gives none out: it may have expired.
+    pub async fn open_input(&self, address: &InputAddress) -> Result<InputStream, InputError> {
+        let not_served = || InputError::Silent("EvalAI is not asked about the submission now".to_owned());
+        let shared = self.place(&address.key).ok_or_else(not_served)?;
+        let opened = shared.files.open(&address.url).await;
+        if matches!(opened, Err(InputError::Gone(_))) {
+            shared.queue().outdate(&address.key);
+            shared.notify.notify_one();
+        }
+        opened
+    }
+
     /// How a Leaderboard fits its challenge, checked at its start and hourly, and why there is no newer check.
     pub fn labels(&self, leaderboard: &Key) -> (Option<Labels>, Option<String>) {
         self.place(leaderboard)
@@ -435,7 +455,8 @@ impl Hub {
         let share = state.purse_of(target, now).share(target.requests_per_minute, now.at);
         let queue = Queue::new(timing, share, not_before, now);
         let (token, clock) = (target.token.clone(), options.clock.clone());
-        let shared = Arc::new(Shared::new(queue, token, inner.start, clock));
+        let files = Files::new(transport.clone(), options.timeouts);
+        let shared = Arc::new(Shared::new(queue, token, files, inner.start, clock));
         let (weak, account) = (Arc::downgrade(inner), account.clone());
         let work = run(Task {
             shared: shared.clone(),

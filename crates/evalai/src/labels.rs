@@ -23,6 +23,8 @@ pub struct Catalog {
     pub codenames: BTreeMap<i64, Option<String>>,
     /// Whether the highest value leads, by the ids of leaderboards whose schemas leave it open; none where EvalAI does not show it.
     pub descending: BTreeMap<i64, Option<bool>>,
+    /// False if EvalAI's own worker evaluates its submissions. Read for a Leaderboard that takes files.
+    pub is_remote: bool,
 }
 
 /// How a Leaderboard fits its challenge.
@@ -63,23 +65,31 @@ pub enum Misfit {
     /// The leaderboard has metrics that are never sent: EvalAI shows them as `#`.
     #[error("the leaderboard of phase {phase} also has {}, which the operator never sends and which stay empty; remove them from its schema, or check evaluation.carla.version", .labels.join(", "))]
     Unsent { phase: i64, labels: Vec<String> },
+    /// EvalAI's own worker takes the submissions, too.
+    #[error(
+        "challenge {challenge} has remote_evaluation: false in EvalAI, so that EvalAI's own worker would evaluate its submissions; set it to true there"
+    )]
+    NotRemote { challenge: i64 },
 }
 
 impl Misfit {
     /// True if it keeps results from being published.
     fn prevents(&self) -> bool {
-        !matches!(self, Self::Unsent { .. })
+        !matches!(self, Self::Unsent { .. } | Self::NotRemote { .. })
     }
 }
 
 /// Compares a Leaderboard with its challenge.
 pub fn compare(target: &Target, catalog: &Catalog) -> Labels {
+    let challenge = target.challenge;
+    let not_remote = (target.takes_files && !catalog.is_remote).then_some(Misfit::NotRemote { challenge });
     Labels {
         at: catalog.at,
         problems: target
             .phases
             .iter()
             .flat_map(|phase| compare_phase(target, catalog, *phase))
+            .chain(not_remote)
             .collect(),
         rankings: target
             .phases
@@ -190,6 +200,7 @@ mod tests {
             metrics: Metrics::Fixed(labels.iter().map(|label| (*label).to_owned()).collect()),
             inbox: None,
             is_observed: false,
+            takes_files: false,
             since: Timestamp::UNIX_EPOCH,
         }
     }
@@ -213,6 +224,7 @@ mod tests {
             splits: vec![split(1, 10, &["A", "B"]), split(2, 11, &["A", "B", "C"])],
             codenames: [(10, codename.map(str::to_owned)), (11, None)].into(),
             descending: BTreeMap::new(),
+            is_remote: true,
         }
     }
 
@@ -315,6 +327,29 @@ mod tests {
             let found = compare(&takes_what_is_listed(split), &catalog).rankings.remove(&1);
             let metric = "A".to_owned();
             assert_eq!(found, expected.map(|order| Ranking { metric, order }), "{split:?}");
+        }
+    }
+
+    #[test]
+    fn a_leaderboard_that_takes_files_names_a_challenge_that_evalais_own_worker_evaluates() {
+        for (takes_files, is_remote, is_named) in [
+            (true, false, true),
+            (true, true, false),
+            (false, false, false),
+            (false, true, false),
+        ] {
+            let target = Target {
+                takes_files,
+                ..target(&[1], &["A", "B"])
+            };
+            let catalog = Catalog {
+                is_remote,
+                ..catalog(Some("leaderboard"))
+            };
+            let found = compare(&target, &catalog);
+            let expected = is_named.then_some(Misfit::NotRemote { challenge: 1 });
+            assert_eq!(found.problems, Vec::from_iter(expected), "{takes_files} {is_remote}");
+            assert!(found.ok(), "results are published all the same");
         }
     }
 

@@ -28,6 +28,7 @@ pub mod token;
 mod transport;
 pub mod types;
 
+pub use files::{InputAddress, InputError, InputStream};
 pub use hub::{Hub, Options};
 pub use labels::{Labels, Misfit};
 pub use leaderboard_api::evalai_status::{Outcome, Progress, Status};

@@ -5,7 +5,7 @@ use std::sync::Arc;
 use jiff::Timestamp;
 
 use super::answer::Answer;
-use super::row::{DatasetSplit, Phase, PhaseSplit, Received, Row, Split};
+use super::row::{Challenge, DatasetSplit, FileUrl, Phase, PhaseSplit, Received, Row, Split};
 use super::types::{ImageAnswer, Key, Payload};
 use leaderboard_api::Attempt;
 use leaderboard_api::evalai_status::{Outcome, Progress};
@@ -50,7 +50,7 @@ impl Purpose {
 pub enum Request {
     Get(SubmissionRef),
     /// The uploaded file: not of the API, and not counted by it.
-    Image(SubmissionRef, String),
+    Image(SubmissionRef, FileUrl),
     Progress(SubmissionRef, Progress, Option<String>),
     Partial(SubmissionRef, Arc<Payload>),
     Final(SubmissionRef, Outcome, Arc<Payload>),
@@ -64,6 +64,8 @@ pub enum Request {
     DatasetSplit(i64, i64),
     /// The settings of a leaderboard of a challenge.
     PhaseSplit(i64, i64),
+    /// The settings of a challenge.
+    Challenge(i64),
     /// One message of a challenge's queue, by the queue's name.
     Receive(String),
     /// The row of a message's submission.
@@ -96,6 +98,7 @@ impl Request {
             | Self::Splits(_)
             | Self::DatasetSplit(..)
             | Self::PhaseSplit(..)
+            | Self::Challenge(_)
             | Self::Receive(_)
             | Self::MessageRow(_)
             | Self::DeleteMessage(..) => None,
@@ -122,6 +125,7 @@ impl Request {
             Self::Splits(_) => "get_splits",
             Self::DatasetSplit(..) => "get_dataset_split",
             Self::PhaseSplit(..) => "get_phase_split",
+            Self::Challenge(_) => "get_challenge",
             Self::Receive(_) => "receive_message",
             Self::MessageRow(_) => "get_message_row",
             Self::DeleteMessage(..) => "delete_message",
@@ -146,6 +150,7 @@ impl Request {
             Self::Splits(_) => "splits",
             Self::DatasetSplit(..) => "dataset split",
             Self::PhaseSplit(..) => "phase split",
+            Self::Challenge(_) => "challenge",
             Self::Receive(_) => "message",
             Self::MessageRow(_) => "row of a message",
             Self::DeleteMessage(..) => "deletion of a message",
@@ -165,6 +170,7 @@ pub enum Reply {
     Splits(Answer<Vec<Split>>),
     DatasetSplit(Answer<DatasetSplit>),
     PhaseSplit(Answer<PhaseSplit>),
+    Challenge(Answer<Challenge>),
     Message(Answer<Received>),
 }
 
@@ -189,6 +195,7 @@ impl Reply {
             Self::Splits(answer) => bare(answer),
             Self::DatasetSplit(answer) => bare(answer),
             Self::PhaseSplit(answer) => bare(answer),
+            Self::Challenge(answer) => bare(answer),
             Self::Message(answer) => bare(answer),
         }
     }

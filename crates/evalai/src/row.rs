@@ -3,6 +3,8 @@
 //! Called by `client`. Pure. Only an id and a status are required: a field that changes its form must not blind us to
 //! a cancellation.
 
+use std::fmt;
+
 use jiff::Timestamp;
 use serde::{Deserialize, Deserializer};
 use serde_json::Value;
@@ -32,9 +34,31 @@ pub struct Row {
     /// When it last came to an end; a re-run keeps that of the old row.
     pub completed_at: Option<Timestamp>,
     /// Where the uploaded file is.
-    pub input_file: Option<String>,
+    pub input_file: Option<FileUrl>,
     /// The last of all `job_name` ever sent, in lower case.
     pub jobs: Vec<String>,
+}
+
+/// Where an uploaded file is. It may be presigned, so that whoever has it can read the file: no `Debug` and no message shows it.
+#[derive(Clone, PartialEq, Eq)]
+pub struct FileUrl(String);
+
+impl FileUrl {
+    pub(crate) fn as_str(&self) -> &str {
+        &self.0
+    }
+}
+
+impl From<&str> for FileUrl {
+    fn from(url: &str) -> Self {
+        Self(url.to_owned())
+    }
+}
+
+impl fmt::Debug for FileUrl {
+    fn fmt(&self, out: &mut fmt::Formatter<'_>) -> fmt::Result {
+        out.write_str("FileUrl(…)")
+    }
 }
 
 impl Row {
@@ -119,10 +143,26 @@ impl<'de> Deserialize<'de> for Row {
             submitted_at: time(&raw.submitted_at),
             resumed_at: time(&raw.rerun_resumed_at),
             completed_at: time(&raw.completed_at),
-            input_file: text(&raw.input_file),
+            input_file: raw.input_file.as_str().map(FileUrl::from),
             jobs: raw.job_name.into(),
         })
     }
+}
+
+/// The settings of a challenge.
+#[derive(Clone, Copy, Debug, PartialEq, Eq, Deserialize)]
+pub struct Challenge {
+    /// EvalAI leaves the evaluation to the host. Where it does not say so, it is taken to.
+    #[serde(default = "yes", rename = "remote_evaluation", deserialize_with = "is_not_false")]
+    pub is_remote: bool,
+}
+
+fn yes() -> bool {
+    true
+}
+
+fn is_not_false<'de, D: Deserializer<'de>>(deserializer: D) -> Result<bool, D::Error> {
+    Ok(Value::deserialize(deserializer)?.as_bool() != Some(false))
 }
 
 /// A phase of a challenge.
@@ -310,6 +350,29 @@ mod tests {
             assert!(!of(json!({"id": 1, name: odd})));
         }
         assert!(!of(json!({"id": 1})));
+    }
+
+    #[test]
+    fn a_challenge_is_evaluated_by_its_host_unless_evalai_denies_it() {
+        for (settings, expected) in [
+            (json!({"id": 1, "remote_evaluation": false}), false),
+            (json!({"id": 1, "remote_evaluation": true}), true),
+            (json!({"id": 1, "remote_evaluation": null}), true),
+            (json!({"id": 1, "remote_evaluation": "false"}), true),
+            (json!({"id": 1}), true),
+        ] {
+            let challenge: Challenge = serde_json::from_value(settings.clone()).unwrap();
+            assert_eq!(challenge.is_remote, expected, "{settings}");
+        }
+    }
+
+    #[test]
+    fn the_address_of_a_file_is_not_shown() {
+        let url = "https://storage.example/x.csv?X-Amz-Signature=5ec2e7";
+        let row: Row = serde_json::from_value(json!({"id": 7, "status": "queued", "input_file": url})).unwrap();
+        let shown = format!("{row:?}");
+        assert!(!shown.contains("5ec2e7") && !shown.contains("x.csv"), "{shown}");
+        assert_eq!(row.input_file.unwrap().as_str(), url);
     }
 
     #[test]

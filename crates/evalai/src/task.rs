@@ -12,6 +12,7 @@ use tokio::time::Instant;
 
 use super::answer::{Answer, Silence};
 use super::client::Client;
+use super::files::Files;
 use super::queue::{Next, Now, PAYLOADS, Place, Queue, Ticket};
 use super::request::{Reply, Request};
 use super::types::{Changed, Key, Outline, Payload, PayloadProblem, PayloadReader, SweepRow, WriteGuard};
@@ -26,6 +27,8 @@ const DRAIN: Duration = Duration::from_secs(70);
 pub(super) struct Shared {
     queue: Mutex<Queue>,
     token: Arc<Token>,
+    /// Reads the files that the token's submissions have.
+    pub files: Files,
     /// Notified of new updates and questions.
     pub notify: Notify,
     /// The queue's time counts from here.
@@ -43,10 +46,11 @@ pub(super) struct Outlets {
 }
 
 impl Shared {
-    pub fn new(queue: Queue, token: Arc<Token>, start: Instant, clock: Clock) -> Self {
+    pub fn new(queue: Queue, token: Arc<Token>, files: Files, start: Instant, clock: Clock) -> Self {
         Self {
             queue: Mutex::new(queue),
             token,
+            files,
             notify: Notify::new(),
             start,
             clock,

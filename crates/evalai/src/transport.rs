@@ -140,7 +140,8 @@ async fn body(mut chunks: Body, largest: usize) -> Result<Vec<u8>, Unread> {
     Ok(body)
 }
 
-fn late(during: &str) -> Silence {
+/// Why there is no answer that was waited for long enough.
+pub(super) fn late(during: &str) -> Silence {
     Silence {
         sent: true,
         why: format!("EvalAI did not answer in time ({during}: operation timed out)"),

@@ -45,6 +45,8 @@ pub struct Target {
     pub inbox: Option<String>,
     /// Nothing is written there.
     pub is_observed: bool,
+    /// Its submissions are files, which EvalAI's own worker could evaluate, too.
+    pub takes_files: bool,
     /// When the Leaderboard was created: the sweep leaves alone what asked to be run before.
     pub since: Timestamp,
 }

@@ -63,7 +63,16 @@ impl Server {
 async fn read_as(server: &str, url: &str) -> Answer<ImageAnswer> {
     let timeouts = Timeouts::default();
     let network = Network::new(server, timeouts, Reach::of(is_internet)).unwrap();
-    Files::new(Arc::new(network), timeouts).image(url).await
+    Files::new(Arc::new(network), timeouts).image(&url.into()).await
+}
+
+/// The same for a file that is the submission itself.
+async fn content_as(server: &str, url: &str) -> Result<Vec<u8>, InputError> {
+    let timeouts = Timeouts::default();
+    let network = Network::new(server, timeouts, Reach::of(is_internet)).unwrap();
+    let chunks = Files::new(Arc::new(network), timeouts).open(&url.into()).await?;
+    let chunks: Vec<Bytes> = chunks.try_collect().await?;
+    Ok(chunks.concat())
 }
 
 fn named() -> Answer<ImageAnswer> {
@@ -145,4 +154,41 @@ async fn a_page_in_the_place_of_the_file_is_nobodys_image() {
     let evalai = Server::leading_to("127.0.0.1", &login.url).await;
     let message = refusal(read_as(&evalai.url, &format!("{}/media/1.json", evalai.url)).await);
     assert!(message.contains("a page") && message.contains("MEDIA_URL"), "{message}");
+}
+
+#[tokio::test]
+async fn a_submitted_file_is_read_from_where_images_are_and_from_nowhere_else() {
+    let (storage, inside) = (
+        Server::with_file("127.0.0.2").await,
+        Server::with_file("127.0.0.3").await,
+    );
+    let evalai = Server::leading_to("127.0.0.1", &storage.url).await;
+    let read = content_as(&evalai.url, &format!("{}/media/1.csv", evalai.url)).await;
+    assert_eq!(read, Ok(FILE.as_bytes().to_vec()));
+    let leading = Server::leading_to("127.0.0.2", &inside.url).await;
+    for first in [&leading, &inside] {
+        let url = format!("{}/1.csv?X-Amz-Signature=5ec2e7", first.url);
+        let Err(InputError::Refused(why)) = content_as(&evalai.url, &url).await else {
+            panic!("it is read from {}", first.url)
+        };
+        assert!(why.contains("127.0.0.3, which is no address of the internet"), "{why}");
+        assert!(!why.contains("5ec2e7"), "{why}");
+    }
+    assert_eq!(inside.requests(), 0, "nothing was sent there");
+}
+
+#[tokio::test]
+async fn a_connection_that_is_cut_in_the_middle_of_a_file_is_an_error() {
+    let head = "HTTP/1.1 200 OK\r\nconnection: close\r\n";
+    for rest in [
+        "content-length: 100\r\n\r\na,b\n",
+        "transfer-encoding: chunked\r\n\r\n4\r\na,b\n\r\n",
+    ] {
+        let storage = Server::start("127.0.0.2", format!("{head}{rest}")).await;
+        let url = format!("{}/1.csv?X-Amz-Signature=5ec2e7", storage.url);
+        let Err(InputError::Silent(why)) = content_as(&storage.url, &url).await else {
+            panic!("half of it is a file: {rest:?}")
+        };
+        assert!(why.contains("broke off") && !why.contains("5ec2e7"), "{why}");
+    }
 }

@@ -1,4 +1,5 @@
 mod drain;
+mod inputs;
 mod tokens;
 
 use super::*;
@@ -29,6 +30,7 @@ fn target(token: &str) -> Target {
         metrics: Metrics::Fixed([].into()),
         inbox: None,
         is_observed: false,
+        takes_files: false,
         since: Timestamp::UNIX_EPOCH,
     }
 }

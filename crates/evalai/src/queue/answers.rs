@@ -13,7 +13,7 @@ use super::{Busy, Now, Queue, Ticket};
 use crate::answer::{About, Answer, Refusal, Silence};
 use crate::request::{Reply, Request, SubmissionRef};
 use crate::row::Row;
-use crate::types::{Changed, Ended, ImageAnswer, Outline};
+use crate::types::{Changed, Ended, ImageAnswer, Key, Outline};
 use leaderboard_api::evalai_status::{Outcome, Status};
 use leaderboard_base::backoff::Backoff;
 
@@ -44,6 +44,13 @@ impl Queue {
         }
         if let Some(subject) = ticket.request.submission() {
             self.drop_lane(subject.pk, &now);
+        }
+    }
+
+    /// The row of a submission shows what is no longer so: if its end is waited for, it is read again soon.
+    pub fn outdate(&mut self, key: &Key) {
+        if let Some(sub) = self.subs.get_mut(key) {
+            sub.outdated = true;
         }
     }
 

@@ -70,6 +70,12 @@ impl Queue {
                     check.descending.insert(*split, is_descending);
                 });
             }
+            (Request::Challenge(id), Reply::Challenge(answer)) => {
+                let answer = or_hidden(answer, |challenge| challenge.is_remote);
+                self.took_of_check(*id, answer, now, |check, is_remote| {
+                    check.is_remote = Some(is_remote.unwrap_or(true));
+                });
+            }
             _ => {}
         }
     }

@@ -445,7 +445,7 @@ impl Queue {
             challenge.period = period.max(least);
             let since = of().map(|target| target.since).min();
             challenge.sweep = of().map(|target| target.sweep).min().zip(since);
-            challenge.check.wanted = of().flat_map(|target| target.phases.iter().copied()).collect();
+            challenge.check.want(of().map(Arc::as_ref));
         }
         let limit = self.share.budget(|budget| budget.limit());
         self.passing.set_limit(limit, now.at);

@@ -124,7 +124,7 @@ impl Queue {
         let catalog = challenge.and_then(|challenge| challenge.check.catalog.as_ref());
         let fit = |payload| {
             if has_results {
-                fitted(payload, &held, catalog, is_partial)
+                fitted(payload, &held.target, held.of.phase, catalog, is_partial)
             } else {
                 Some((payload, None))
             }
@@ -171,13 +171,13 @@ impl Queue {
 }
 
 /// Results as their Leaderboard publishes them, and why they are not sent. None while it is not known what EvalAI lists.
-fn fitted(
+pub(super) fn fitted(
     payload: Payload,
-    held: &Held,
+    target: &Target,
+    phase: i64,
     catalog: Option<&Catalog>,
     is_partial: bool,
 ) -> Option<(Payload, Option<String>)> {
-    let (target, phase) = (held.target.as_ref(), held.of.phase);
     if let Metrics::Fixed(labels) = &target.metrics {
         let payload = for_split(payload, &target.split);
         let misfit = check(&payload, &target.split, labels).err();

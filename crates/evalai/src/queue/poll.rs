@@ -10,6 +10,7 @@ use jiff::Timestamp;
 use crate::labels::Catalog;
 use crate::request::{Purpose, Request};
 use crate::row::{Phase, Split};
+use crate::types::Target;
 use leaderboard_base::backoff::Backoff;
 
 /// Waits after failures in a row. Without jitter: one task makes all requests of a token.
@@ -111,6 +112,10 @@ pub(super) struct ChallengeCheck {
     pub codenames: BTreeMap<i64, Option<String>>,
     /// Whether the highest value leads, by the ids of the leaderboards whose schemas leave it open.
     pub descending: BTreeMap<i64, Option<bool>>,
+    /// True if a Leaderboard takes files, which EvalAI's own worker could evaluate, too.
+    pub takes_files: bool,
+    /// True if EvalAI leaves the evaluation to the host, as far as it shows that. Read for one that takes files.
+    pub is_remote: Option<bool>,
     /// The last whole reading.
     pub catalog: Option<Catalog>,
     /// Why there is no newer one.
@@ -120,11 +125,21 @@ pub(super) struct ChallengeCheck {
 }
 
 impl ChallengeCheck {
+    /// From now on all is read that these Leaderboards need.
+    pub fn want<'a>(&mut self, served: impl Iterator<Item = &'a Target>) {
+        (self.wanted, self.takes_files) = (Vec::new(), false);
+        for target in served {
+            self.wanted.extend(target.phases.iter());
+            self.takes_files |= target.takes_files;
+        }
+    }
+
     /// Starts anew.
     pub fn restart(&mut self) {
         (self.phases, self.splits) = (None, None);
         self.codenames.clear();
         self.descending.clear();
+        self.is_remote = None;
     }
 
     /// Starts anew at once: a list was refused as if the token's user were no host of the challenge.
@@ -149,7 +164,8 @@ impl ChallengeCheck {
         codename.or_else(|| {
             let is_open = |split: &&Split| split.schema.leaves_order_open() && !self.descending.contains_key(&split.id);
             let open = wanted().find(is_open);
-            open.map(|split| Request::PhaseSplit(challenge, split.id))
+            let settings = (self.takes_files && self.is_remote.is_none()).then_some(Request::Challenge(challenge));
+            open.map(|split| Request::PhaseSplit(challenge, split.id)).or(settings)
         })
     }
 
@@ -160,6 +176,7 @@ impl ChallengeCheck {
         };
         let codenames = std::mem::take(&mut self.codenames);
         let descending = std::mem::take(&mut self.descending);
+        let is_remote = self.is_remote.take();
         (self.error, self.is_forbidden) = (None, false);
         self.catalog = Some(Catalog {
             at,
@@ -167,6 +184,7 @@ impl ChallengeCheck {
             splits,
             codenames,
             descending,
+            is_remote: is_remote.unwrap_or(true),
         });
     }
 }

@@ -106,7 +106,7 @@ async fn the_way_to_a_file_is_as_long_as_one_read_with_all_its_redirects() {
     });
     let files = Files::new(server, Timeouts::default());
     let asked = Instant::now();
-    let answer = files.image("https://evalai.example/media/1.json").await;
+    let answer = files.image(&"https://evalai.example/media/1.json".into()).await;
     assert!(
         matches!(&answer, Answer::Unanswered(silence) if silence.sent),
         "{answer:?}"

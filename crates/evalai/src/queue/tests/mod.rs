@@ -9,6 +9,7 @@ mod outage;
 mod passing;
 mod payloads;
 mod simulation;
+mod splits;
 mod sweep;
 
 use jiff::SignedDuration;
@@ -44,6 +45,7 @@ fn target() -> Target {
         metrics: Metrics::Fixed(["Driving score".to_owned()].into()),
         inbox: None,
         is_observed: false,
+        takes_files: false,
         since: wall(-3600),
     }
 }

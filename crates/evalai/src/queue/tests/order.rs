@@ -3,6 +3,8 @@
 use serde_json::Value;
 
 use super::*;
+use crate::labels::Misfit;
+use crate::row::Challenge;
 
 #[test]
 fn the_first_in_the_order_goes_first() {
@@ -198,6 +200,40 @@ fn phase(id: i64) -> Phase {
     Phase {
         id,
         shows_partial: false,
+    }
+}
+
+#[test]
+fn of_a_challenge_whose_submissions_are_files_it_is_read_who_evaluates_them() {
+    let of_host = |is_remote| Some(Answer::Done(Challenge { is_remote }));
+    let hidden = || Some(Answer::Refused(refusal(About::Request, 406)));
+    for (answer, is_named) in [
+        (of_host(false), true),
+        (of_host(true), false),
+        (hidden(), false),
+        (None, false),
+    ] {
+        let mut bench = Bench::new();
+        let board = Target {
+            takes_files: answer.is_some(),
+            ..target()
+        };
+        let now = bench.now();
+        bench.queue.serve(&key(100), &board, now);
+        bench.list("sweep of submitted", vec![]);
+        bench.list("sweep of resuming", vec![]);
+        let ticket = bench.expect("phases");
+        bench.answer(&ticket, Reply::Phases(Answer::Done(vec![phase(1)])));
+        let ticket = bench.expect("splits");
+        bench.answer(&ticket, Reply::Splits(Answer::Done(vec![])));
+        if let Some(answer) = answer.clone() {
+            let ticket = bench.expect("challenge");
+            bench.answer(&ticket, Reply::Challenge(answer));
+        }
+        bench.expect_nothing();
+        let problems = bench.queue.labels(&key(100)).0.unwrap().problems;
+        let named = problems.contains(&Misfit::NotRemote { challenge: 1 });
+        assert_eq!(named, is_named, "{answer:?}: {problems:?}");
     }
 }
 

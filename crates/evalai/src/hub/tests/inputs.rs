@@ -1,0 +1,94 @@
+//! The files that submissions are: from the row to the content.
+
+use bytes::Bytes;
+use futures::StreamExt;
+use futures::stream::{self, TryStreamExt};
+use http::Response;
+use std::sync::atomic::{AtomicUsize, Ordering};
+
+use super::*;
+use crate::files::InputError;
+use crate::transport::Body;
+use crate::transport::memory::{begun, server, whole};
+
+/// An EvalAI whose rows have an address of its file, another one in each read; the first one has expired.
+fn connect() -> Connect {
+    let reads = Arc::new(AtomicUsize::new(0));
+    Arc::new(move |_, _| {
+        let reads = Arc::clone(&reads);
+        Ok(server(move |request| {
+            let path = request.uri().path();
+            let is_file = path.starts_with("/files/");
+            assert!(!is_file || request.headers().is_empty(), "it has a token");
+            let answer = answer(path, &reads);
+            futures::future::ready(answer).boxed()
+        }))
+    })
+}
+
+fn answer(path: &str, reads: &AtomicUsize) -> Response<Body> {
+    match path {
+        "/api/jobs/submission/7" => {
+            let number = reads.fetch_add(1, Ordering::SeqCst) + 1;
+            let url = format!("https://storage.example/files/{number}");
+            let row = format!(r#"{{"id": 7, "status": "submitted", "challenge_phase": 1, "input_file": "{url}"}}"#);
+            begun(200, "", stream::iter([Ok(Bytes::from(row))]).boxed())
+        }
+        "/files/1" => whole(403, "<Code>AccessDenied</Code>"),
+        path if path.starts_with("/files/") => whole(200, "a,b\n"),
+        _ => whole(200, "[]"),
+    }
+}
+
+#[tokio::test(start_paused = true)]
+async fn an_address_that_has_expired_is_asked_for_anew_at_once() {
+    let (_stop, signal) = Stop::new();
+    let (changed, mut changes) = mpsc::unbounded_channel();
+    let hub = Hub::new(Options {
+        connect: connect(),
+        changed,
+        ..Options::unheard(&Tasks::new(signal), || true)
+    });
+    let run = Run {
+        attempt: Attempt(1),
+        job: "submission-7-1".into(),
+        by_hand: false,
+        has_job: false,
+        ended: None,
+        log: LogSpan::default(),
+    };
+    let target = Target {
+        requests_per_minute: 6000,
+        ..target("x")
+    };
+    let subject = Subject {
+        target: Arc::new(target),
+        key: key("7"),
+        pk: 7,
+        run,
+    };
+    assert!(hub.input_address(&subject.key).is_none());
+    hub.ask(&subject, false).unwrap();
+    let old = loop {
+        changes.recv().await.unwrap();
+        if let Some(address) = hub.input_address(&subject.key) {
+            break address;
+        }
+    };
+    hub.live(&subject, Timestamp::UNIX_EPOCH).unwrap();
+    let begun = Instant::now();
+    assert_eq!(hub.open_input(&old).await.err(), Some(InputError::Gone(403)));
+    let content = loop {
+        changes.recv().await.unwrap();
+        let address = hub.input_address(&subject.key).unwrap();
+        if let Ok(chunks) = hub.open_input(&address).await {
+            break chunks.try_collect::<Vec<Bytes>>().await;
+        }
+    };
+    assert_eq!(content.map(|chunks| chunks.concat()), Ok(b"a,b\n".to_vec()));
+    assert!(begun.elapsed() < Duration::from_secs(5), "{:?}", begun.elapsed());
+
+    hub.forget(&subject.key);
+    let error = hub.open_input(&old).await.err();
+    assert!(matches!(error, Some(InputError::Silent(_))), "{error:?}");
+}
