@@ -3,7 +3,7 @@
 use std::time::Duration;
 
 use crate::ask::{Ask, Failure, Service};
-use leaderboard_api::{Attempt, DynamoTable, RunId};
+use leaderboard_api::{Attempt, DynamoTable, RunId, S3Bucket, SubmittedFile};
 
 /// A run of another program, as its row shows it.
 #[derive(Clone, Debug, PartialEq, Eq)]
@@ -44,6 +44,63 @@ impl Ask for Row {
     }
 }
 
+/// The file of a submission in EvalAI, which is to be copied into the bucket of its run.
+#[derive(Clone, Debug, PartialEq)]
+pub struct Input {
+    /// An attempt asks anew: EvalAI may have another file since.
+    pub attempt: Attempt,
+    /// Names the prefix of the run.
+    pub run_id: RunId,
+    pub storage: S3Bucket,
+    /// Id of the submission in EvalAI.
+    pub submission: i64,
+    /// Most bytes that the file may have.
+    pub limit: u64,
+}
+
+/// Outcome of a copy.
+#[derive(Clone, Debug, PartialEq, Eq)]
+pub enum Fetched {
+    /// The bucket has it.
+    Stored(SubmittedFile),
+    /// It has more bytes than it may have.
+    TooLarge,
+    /// EvalAI's address of it answered with this HTTP status, so many times in a row.
+    Gone { status: u16, times: u32 },
+}
+
+/// Times that an address is asked for a file which it does not have.
+pub const INPUT_TRIES: u32 = 3;
+/// Time between two of them. In it EvalAI is asked for the address anew.
+const INPUT_PAUSE: Duration = Duration::from_mins(1);
+/// Pauses after a copy that has failed: each is twice as long as the one before.
+const FIRST_PAUSE: Duration = Duration::from_secs(10);
+const LONGEST_PAUSE: Duration = Duration::from_mins(5);
+
+impl Ask for Input {
+    type Answer = Fetched;
+    /// Each has a part of a file in memory.
+    const AT_ONCE: usize = 2;
+    const AT_ONCE_OF_A_SERVICE: usize = 2;
+    /// The copy has a limit of its own, which is shorter: it gives an upload up that it has begun.
+    const LONGEST: Duration = Duration::from_mins(50);
+
+    fn service(&self) -> Service {
+        Service::bucket(&self.storage)
+    }
+
+    fn again(&self, result: &Result<Fetched, Failure>, failures: u32, _waited: Duration) -> Option<Duration> {
+        match result {
+            Ok(Fetched::Gone { times, .. }) => (*times < INPUT_TRIES).then_some(INPUT_PAUSE),
+            Ok(Fetched::Stored(_) | Fetched::TooLarge) => None,
+            Err(_) => {
+                let doubled = 1_u32 << failures.saturating_sub(1).min(5);
+                Some(LONGEST_PAUSE.min(FIRST_PAUSE * doubled))
+            }
+        }
+    }
+}
+
 #[cfg(test)]
 mod tests {
     use super::*;
@@ -67,5 +124,37 @@ mod tests {
         assert_eq!(question.again(&Ok(None), 0, Duration::ZERO), None);
         assert_eq!(question.again(&Ok(Some(run)), 0, Duration::ZERO), Some(AGAIN));
         assert_eq!(question.again(&Err(unread), 9, Duration::ZERO), Some(AGAIN));
+    }
+
+    #[test]
+    fn a_file_is_fetched_once_and_what_failed_is_tried_again_later_each_time() {
+        let question = Input {
+            attempt: Attempt::FIRST,
+            run_id: "77".parse().unwrap(),
+            storage: serde_json::from_value(serde_json::json!({"bucket": "results"})).unwrap(),
+            submission: 77,
+            limit: 1 << 30,
+        };
+        let stored = Fetched::Stored(SubmittedFile {
+            sha256: "0".repeat(64),
+            size: 3,
+        });
+        let gone = |times| Ok(Fetched::Gone { status: 404, times });
+        let silent = || Err(Failure::silent("no"));
+        for (result, failures, pause) in [
+            (Ok(stored), 0, None),
+            (Ok(Fetched::TooLarge), 0, None),
+            (gone(1), 0, Some(60)),
+            (gone(2), 0, Some(60)),
+            (gone(INPUT_TRIES), 0, None),
+            (silent(), 1, Some(10)),
+            (silent(), 2, Some(20)),
+            (silent(), 5, Some(160)),
+            (silent(), 6, Some(300)),
+            (silent(), u32::MAX, Some(300)),
+        ] {
+            let again = question.again(&result, failures, Duration::ZERO);
+            assert_eq!(again.map(|pause| pause.as_secs()), pause, "{result:?} after {failures}");
+        }
     }
 }

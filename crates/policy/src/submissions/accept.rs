@@ -1,12 +1,12 @@
-//! Acceptance: a Leaderboard, EvalAI's word, a team, a track and an image. Then the plan is pinned: what is run stays as it was accepted,
-//! however the Leaderboard is edited.
+//! Acceptance: a Leaderboard, EvalAI's word, a team, a track, and an image or a file. Then the plan is pinned: what is run stays as it was
+//! accepted, however the Leaderboard is edited.
 
 use std::time::Duration;
 
 use k8s_openapi::apimachinery::pkg::apis::meta::v1::Time;
 
 use super::end;
-use super::failure::{self, charged};
+use super::failure::{self, charged, for_both, participant};
 use super::gates::{self, Gate};
 use super::plan::{Action, Question};
 use super::status::PlanBuilder;
@@ -16,8 +16,8 @@ use leaderboard_api::conditions::{self, Truth};
 use leaderboard_api::evalai_status::Status;
 use leaderboard_api::text::{LONGEST_NAME, one_line, sentence};
 use leaderboard_api::{
-    Attempt, Evaluation, Failure, ImagePattern, ImageReference, LeaderboardSpec, Reason, Repository, RunPlan, Team,
-    TeamStatus, Track, effective, image_pattern,
+    Attempt, ContainerEvaluation, Evaluation, Failure, ImagePattern, ImageReference, LeaderboardSpec, Reason,
+    Repository, RunPlan, Team, TeamStatus, Track, effective, image_pattern,
 };
 
 /// Pins the plan and returns true if the submission may go on to its turn. Otherwise the draft shows why not. EvalAI's own end goes before all
@@ -47,8 +47,12 @@ pub(super) fn decide(draft: &mut PlanBuilder<'_>) -> bool {
     if gates::closed(draft, &[Gate::OtherProgram, Gate::Phase]).is_some() {
         return false;
     }
-    let Some(image) = allowed_image(draft, leaderboard, track) else {
-        return false;
+    let image = match brought(draft, leaderboard) {
+        Ok(image) => image,
+        Err(untaken) => {
+            show_untaken(draft, leaderboard, track, untaken);
+            return false;
+        }
     };
     if gates::closed(draft, &[Gate::Leaderboard, Gate::Policy]).is_some() {
         return false;
@@ -56,34 +60,81 @@ pub(super) fn decide(draft: &mut PlanBuilder<'_>) -> bool {
     if !pin(draft, leaderboard, track, image) {
         return false;
     }
+    if let Some(file) = &draft.spec().input {
+        draft.status.input = Some(file.clone());
+    }
     draft.condition(conditions::ACCEPTED, Truth::True, Reason::Accepted, "");
     draft.condition(conditions::SUCCEEDED, Truth::Unknown, Reason::InProgress, "");
     true
 }
 
-/// The image, if one is named that the Leaderboard allows. Otherwise the draft shows why not. One that can never run ends the submission: the
-/// plan makes it a row of the table, as any other failure.
-fn allowed_image(draft: &mut PlanBuilder<'_>, leaderboard: &LeaderboardSpec, track: &Track) -> Option<String> {
-    let (image, fault) = match named_image(draft) {
-        Image::Named(image) => {
-            let fault = image_not_allowed(draft, leaderboard, &image);
-            (image, fault)
-        }
-        Image::Invalid { image, what } => (image, Some(failure::image_invalid(&what))),
-        Image::Unknown => {
+/// Why what a submission brings is not taken.
+enum Untaken {
+    /// It could not be asked for yet.
+    Unread,
+    /// It can never run.
+    Never { image: Option<String>, found: Box<Failure> },
+}
+
+impl Untaken {
+    fn never(image: Option<String>, found: Failure) -> Self {
+        let found = Box::new(found);
+        Self::Never { image, found }
+    }
+}
+
+/// The image of the submission, which the Leaderboard allows; None of one that is a file.
+fn brought(draft: &PlanBuilder<'_>, leaderboard: &LeaderboardSpec) -> Result<Option<String>, Untaken> {
+    let pinned = draft.status.plan.as_ref();
+    if pinned.is_some_and(|pinned| !is_of_kind(pinned, leaderboard)) {
+        // Nobody has submitted to what the Leaderboard is now, which `pin` shows.
+        return Ok(None);
+    }
+    let takes_files = leaderboard.evaluation.container().filter(|of| !of.mode.has_agent());
+    if let Some(evaluation) = takes_files {
+        let fault = file_not_allowed(draft, evaluation);
+        return fault.map_or(Ok(None), |found| Err(Untaken::never(None, found)));
+    }
+    if draft.spec().input.is_some() {
+        let what = "This leaderboard takes container images, and the submission is a file.";
+        let next = for_both("Submit a container image.");
+        return Err(Untaken::never(None, participant(Reason::InputInvalid, what, &next)));
+    }
+    let image = named_image(draft)?;
+    match image_not_allowed(draft, leaderboard, &image) {
+        Some(found) => Err(Untaken::never(Some(image), found)),
+        None => Ok(Some(image)),
+    }
+}
+
+/// Why a Leaderboard of files does not take the submission.
+fn file_not_allowed(draft: &PlanBuilder<'_>, evaluation: &ContainerEvaluation) -> Option<Failure> {
+    if draft.spec().image.is_some() {
+        let what = "This leaderboard takes files, and the submission is a container image.";
+        let next = for_both("Submit a file.");
+        return Some(participant(Reason::InputInvalid, what, &next));
+    }
+    let file = draft.spec().input.as_ref().filter(|_| !draft.status.has_run())?;
+    let limit = evaluation.input_bounds().max_bytes.bytes();
+    let is_within = u64::try_from(file.size).is_ok_and(|size| size <= limit);
+    (!is_within).then(|| gates::input::too_large(limit))
+}
+
+/// Shows why a submission is not taken. One that can never run is ended: the plan makes it a row of the table, as any other failure.
+fn show_untaken(draft: &mut PlanBuilder<'_>, leaderboard: &LeaderboardSpec, track: &Track, untaken: Untaken) {
+    match untaken {
+        Untaken::Unread => {
             let message = image_unread(draft);
             draft.stall_with(Reason::ImageMissing, &message);
             draft.refuse(Reason::ImageMissing, &message);
-            return None;
         }
-    };
-    let Some(found) = fault else { return Some(image) };
-    if !pin(draft, leaderboard, track, image) {
-        return None;
+        Untaken::Never { image, found } => {
+            if pin(draft, leaderboard, track, image) {
+                draft.condition(conditions::ACCEPTED, Truth::False, found.reason.clone(), &found.message);
+                end::failed(draft, *found);
+            }
+        }
     }
-    draft.condition(conditions::ACCEPTED, Truth::False, found.reason.clone(), &found.message);
-    end::failed(draft, found);
-    None
 }
 
 /// The message for a row that has come to its end without us. EvalAI resumes only what has failed, re-runs all but what was deleted,
@@ -104,40 +155,24 @@ fn ended_in_evalai(status: Status) -> String {
     format!("EvalAI shows {status}: nothing is run and {done}. {next}")
 }
 
-/// The participant's image, as far as it is known.
-enum Image {
-    Named(String),
-    /// It could not be asked for yet.
-    Unknown,
-    /// It can never be pulled, and why.
-    Invalid {
-        image: String,
-        what: String,
-    },
-}
-
 /// The image that was pinned, else the object's, else that of the file in EvalAI.
-fn named_image(draft: &PlanBuilder<'_>) -> Image {
+fn named_image(draft: &PlanBuilder<'_>) -> Result<String, Untaken> {
     let info = draft.evalai_info();
-    let pinned = draft.status.plan.as_ref().map(|plan| plan.image.clone());
+    let pinned = draft.status.plan.as_ref().and_then(|plan| plan.image.clone());
     let named = pinned
         .filter(|image| !image.is_empty())
         .or_else(|| draft.spec().image.clone())
         .or_else(|| info.and_then(|i| i.image.clone()));
     let Some(image) = named else {
-        let problem = info.and_then(|i| i.image_problem.as_deref());
-        return problem.map_or(Image::Unknown, |why| Image::Invalid {
-            image: String::new(),
-            what: sentence(&format!("The submission names no usable image: {why}")),
-        });
+        let why = info.and_then(|i| i.image_problem.as_deref()).ok_or(Untaken::Unread)?;
+        let what = sentence(&format!("The submission names no usable image: {why}"));
+        return Err(Untaken::never(None, failure::image_invalid(&what)));
     };
-    match ImageReference::parse(&image) {
-        Ok(_) => Image::Named(image),
-        Err(why) => {
-            let what = sentence(&format!("The submitted image is not a valid image reference: {why}"));
-            Image::Invalid { image, what }
-        }
+    if let Err(why) = ImageReference::parse(&image) {
+        let what = sentence(&format!("The submitted image is not a valid image reference: {why}"));
+        return Err(Untaken::never(Some(image), failure::image_invalid(&what)));
     }
+    Ok(image)
 }
 
 /// The message while the file in EvalAI cannot be read.
@@ -275,7 +310,7 @@ fn image_patterns(draft: &PlanBuilder<'_>, leaderboard: &LeaderboardSpec) -> Opt
 }
 
 /// Pins the plan. False, with the reason shown, if the Leaderboard of today can't run the submission.
-fn pin(draft: &mut PlanBuilder<'_>, leaderboard: &LeaderboardSpec, track: &Track, image: String) -> bool {
+fn pin(draft: &mut PlanBuilder<'_>, leaderboard: &LeaderboardSpec, track: &Track, image: Option<String>) -> bool {
     let plan = match draft.status.plan.take() {
         Some(pinned) if is_of_kind(&pinned, leaderboard) => Some(again(draft, leaderboard, pinned, image)),
         Some(pinned) => {
@@ -309,7 +344,12 @@ fn pin(draft: &mut PlanBuilder<'_>, leaderboard: &LeaderboardSpec, track: &Track
 }
 
 /// The plan of a submission that has none; `None` for a track without what its kind of evaluation needs.
-fn first_plan(draft: &PlanBuilder<'_>, leaderboard: &LeaderboardSpec, track: &Track, image: String) -> Option<RunPlan> {
+fn first_plan(
+    draft: &PlanBuilder<'_>,
+    leaderboard: &LeaderboardSpec,
+    track: &Track,
+    image: Option<String>,
+) -> Option<RunPlan> {
     let resumed = draft.evalai_info().is_some_and(|i| i.standing == Standing::Resumed);
     let resume = resumed || draft.spec().attempt > Attempt::FIRST || draft.is_adopted();
     let plan = effective::plan(leaderboard, track, draft.submission().run_id(), image, resume)?;
@@ -321,16 +361,16 @@ fn first_plan(draft: &PlanBuilder<'_>, leaderboard: &LeaderboardSpec, track: &Tr
     })
 }
 
-/// True if a plan is of the kind of evaluation that the Leaderboard has.
+/// True if a plan is of the kind of evaluation that the Leaderboard has, and of its mode.
 fn is_of_kind(plan: &RunPlan, leaderboard: &LeaderboardSpec) -> bool {
     match &leaderboard.evaluation {
         Evaluation::Carla(_) => plan.carla().is_some(),
-        Evaluation::Container(_) => plan.container().is_some(),
+        Evaluation::Container(now) => plan.container().is_some_and(|pinned| pinned.mode == now.mode),
     }
 }
 
 /// The plan of a submission that has one. A person who hands it over has it take up what is stored.
-fn again(draft: &PlanBuilder<'_>, leaderboard: &LeaderboardSpec, pinned: RunPlan, image: String) -> RunPlan {
+fn again(draft: &PlanBuilder<'_>, leaderboard: &LeaderboardSpec, pinned: RunPlan, image: Option<String>) -> RunPlan {
     let pinned = RunPlan {
         resume: pinned.resume || draft.is_adopted(),
         ..pinned

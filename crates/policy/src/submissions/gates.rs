@@ -1,4 +1,6 @@
-//! The gates between acceptance and a Job: another program's run, a Leaderboard that is ready, its NetworkPolicy, a slot.
+//! The gates between acceptance and a Job: another program's run, a Leaderboard that is ready, its NetworkPolicy, a slot, the submitted file.
+
+pub(super) mod input;
 
 use std::fmt;
 
@@ -32,6 +34,8 @@ pub(super) enum Gate {
     NextTry,
     /// It has a slot.
     Slot,
+    /// Its submitted file is in the bucket.
+    Input,
 }
 
 /// The first of these gates that is closed, which has shown why.
@@ -43,6 +47,7 @@ pub(super) fn closed(draft: &mut PlanBuilder<'_>, gates: &[Gate]) -> Option<Gate
         Gate::Policy => waits_for_policy(draft),
         Gate::NextTry => waits_for_next_try(draft),
         Gate::Slot => waits_for_slot(draft),
+        Gate::Input => input::waits(draft),
     })
 }
 

@@ -29,7 +29,7 @@ fn a_local_submission_is_accepted_and_its_job_made_in_one_reconcile() {
     assert_eq!(status.times.submitted, Some(Time(at(0))));
     let pinned = status.plan.unwrap();
     assert_eq!(pinned.carla().unwrap().slices, leaderboard_api::effective::slices(4, 2));
-    assert_eq!((pinned.image.as_str(), pinned.resume), ("team/agent:1", false));
+    assert_eq!((pinned.image.as_deref(), pinned.resume), (Some("team/agent:1"), false));
 }
 
 #[test]
@@ -70,8 +70,8 @@ fn evalais_submission_takes_team_and_time_from_evalai_and_is_reported_as_queued(
     let status = world.status();
     assert_eq!(status.plan.as_ref().unwrap().run_id.as_str(), "77");
     assert_eq!(
-        status.plan.unwrap().image,
-        "team/agent:1",
+        status.plan.unwrap().image.as_deref(),
+        Some("team/agent:1"),
         "the object's image goes before EvalAI's"
     );
     assert_eq!(status.times.submitted, Some(Time(at(-60))));
@@ -83,7 +83,7 @@ fn an_image_is_taken_from_evalai_where_the_object_names_none() {
     let mut world = World::evalai();
     world.submission().spec.image = None;
     world.pass();
-    assert_eq!(world.status().plan.unwrap().image, "ecr/agent:9");
+    assert_eq!(world.status().plan.unwrap().image.as_deref(), Some("ecr/agent:9"));
 
     let mut world = World::evalai();
     world.submission().spec.image = None;
@@ -273,7 +273,7 @@ fn a_later_attempt_with_an_image_runs_that_image() {
     world.pass();
     world.in_evalai().info.as_mut().unwrap().image = Some("ecr/agent:9".into());
     assert!(creates(&world.pass_to(Pending, Reason::Preparing)));
-    assert_eq!(world.status().plan.unwrap().image, "ecr/agent:9");
+    assert_eq!(world.status().plan.unwrap().image.as_deref(), Some("ecr/agent:9"));
 }
 
 /// EvalAI's row is of this phase.

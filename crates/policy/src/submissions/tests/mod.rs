@@ -16,6 +16,7 @@ mod failure;
 mod finalizer;
 mod foreign;
 mod image;
+mod input;
 mod interruption;
 mod isolation;
 mod line;

@@ -1,0 +1,93 @@
+//! The last gate before a Job: the file that EvalAI has of a submission is in the bucket of its run.
+
+use super::super::end;
+use super::super::failure::{for_both, infrastructure, participant};
+use super::super::plan::{Action, Question};
+use super::super::run;
+use super::super::status::PlanBuilder;
+use super::super::waits::Wait;
+use super::join;
+use crate::questions::{Fetched, INPUT_TRIES, Input};
+use leaderboard_api::text::sentence;
+use leaderboard_api::{Agents, Failure, Reason};
+
+/// True if the file is not in the bucket yet. The submission keeps its slot for the first try alone: what is not served now may not be for
+/// long.
+pub(super) fn waits(draft: &mut PlanBuilder<'_>) -> bool {
+    let Some(question) = question(draft) else {
+        return false;
+    };
+    let view = draft.view;
+    let answer = view.input.answer_to(&question);
+    match answer.map(|answer| answer.result.as_ref()) {
+        None => show_first_try(draft),
+        Some(Ok(Fetched::Stored(file))) => {
+            draft.status.input = Some(file.clone());
+            return false;
+        }
+        Some(Ok(Fetched::TooLarge)) => {
+            end::failed(draft, too_large(question.limit));
+            return true;
+        }
+        Some(Ok(Fetched::Gone { status, times })) if *times >= INPUT_TRIES => {
+            let what = format!("EvalAI's address of the submitted file has answered {status}, {times} times in a row.");
+            end::failed(draft, infrastructure(Reason::InputMissing, &what));
+            return true;
+        }
+        Some(Ok(Fetched::Gone { status, .. })) => {
+            let why = format!("EvalAI's address of the file answers {status}.");
+            show_failed_try(draft, &why, false);
+        }
+        Some(Err(failure)) => show_failed_try(draft, &failure.why, failure.is_refused),
+    }
+    draft.act(Action::Ask(Question::Input(Box::new(question))));
+    true
+}
+
+/// The file that is to be copied. None: the bucket has it, or the run takes none of EvalAI's.
+fn question(draft: &PlanBuilder<'_>) -> Option<Input> {
+    let plan = draft.status.plan.as_ref();
+    let plan = plan.filter(|plan| plan.agents() == Agents::Absent && draft.status.input.is_none())?;
+    let bounds = plan.container()?.input.clone().unwrap_or_default();
+    Some(Input {
+        attempt: draft.status.attempt.unwrap_or_default(),
+        run_id: plan.run_id.clone(),
+        storage: plan.storage.s3.clone(),
+        submission: draft.spec().evalai?.submission,
+        limit: bounds.max_bytes.bytes(),
+    })
+}
+
+/// The submitted file has more bytes than `limit`.
+pub(in super::super) fn too_large(limit: u64) -> Failure {
+    let what = format!("The submitted file has more than the {limit} bytes that this leaderboard takes.");
+    participant(Reason::InputInvalid, &what, &for_both("Submit a smaller file."))
+}
+
+fn show_first_try(draft: &mut PlanBuilder<'_>) {
+    // From its first Job on it has its slot anyway.
+    if !draft.status.has_run() {
+        join(draft);
+    }
+    if !draft.waits_quietly(Wait::INPUT, draft.view.input.waited.unwrap_or_default()) {
+        draft.waits(Reason::FetchingInput);
+        show(draft, "The submitted file is being copied from EvalAI into the bucket.");
+    }
+}
+
+fn show_failed_try(draft: &mut PlanBuilder<'_>, why: &str, is_refused: bool) {
+    let why = sentence(why);
+    let message = format!("The submitted file is not in the bucket yet: {why} It is tried again.");
+    if is_refused {
+        draft.stall_with(Reason::FetchingInput, &message);
+    } else {
+        draft.stalls_after(Wait::INPUT, Reason::FetchingInput, &message);
+    }
+    show(draft, &message);
+}
+
+fn show(draft: &mut PlanBuilder<'_>, message: &str) {
+    draft.status.waiting = None;
+    draft.show(Reason::FetchingInput, message);
+    run::update_evalai(draft);
+}
