@@ -21,6 +21,8 @@ pub(super) struct Detail {
     state: &'static str,
     failure: Option<Failed>,
     attempt: Option<Attempt>,
+    /// Bytes of the submitted file, if the submission is one.
+    file: Option<i64>,
     node: Option<String>,
     done: i32,
     total: i32,
@@ -65,11 +67,13 @@ impl Detail {
         let (done, total, unit) = progress(status);
         let state = status.known_state().unwrap_or(State::Pending);
         let score = status.score.as_ref();
+        let file = status.input.as_ref().or(submission.spec.input.as_ref());
         Self {
             waits: Waits::of(submission),
             state: state.as_str(),
             failure: (status.failure.as_ref()).map(|failure| Failed::of(submission, failure)),
             attempt: status.attempt,
+            file: file.map(|file| file.size),
             node: status.node_name.as_deref().map(name),
             done,
             total,
@@ -118,6 +122,7 @@ mod tests {
     fn the_details_of_a_full_evening() {
         let all: std::collections::BTreeMap<String, serde_json::Value> = samples::submissions()
             .iter()
+            .chain(&samples::of_modes())
             .map(|one| {
                 let evalai = samples::leaderboards()[0].spec.evalai.clone();
                 let detail = serde_json::to_value(Detail::of(one, evalai.as_ref())).unwrap();
@@ -145,6 +150,15 @@ mod tests {
             (&found["conditions"][1]["type"], &found["conditions"][1]["status"]),
             (&json!("Finished"), &json!("True"))
         );
+    }
+
+    #[test]
+    fn a_file_stands_in_place_of_an_image_and_no_agent_is_named() {
+        let [batch, predictions] = samples::of_modes().map(|one| detail(&one));
+        assert_eq!((&batch["file"], &predictions["file"]), (&json!(null), &json!(12_800)));
+        for word in ["agent", "route", "simulator", "pair"] {
+            assert!(!predictions.to_string().contains(word), "{word}: {predictions}");
+        }
     }
 
     #[test]

@@ -227,7 +227,7 @@ impl<'a> Sorted<'a> {
                 State::Cancelled => tally.cancelled += 1,
                 _ => tally.finished += 1,
             }
-            // A check drives one route: it says nothing about how long a run takes.
+            // A check does a small part of the work: it says nothing about how long a run takes.
             let counts = *state == State::Finished && !one.spec.check;
             if counts && tally.last_runs.len() < TYPICAL {
                 tally.last_runs.push(Phases::of(one));

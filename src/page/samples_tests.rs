@@ -239,6 +239,36 @@ pub(super) fn leaderboards() -> Vec<Arc<Leaderboard>> {
     ]
 }
 
+/// Two of a host's own evaluator that run: an image whose agent has run first, and a file.
+pub(super) fn of_modes() -> [Arc<Submission>; 2] {
+    ["Batch", "Predictions"].map(|mode| {
+        let name = format!("digits-{}", mode.to_lowercase());
+        let score = json!({"metric": "accuracy"});
+        let container = json!({"mode": mode, "workers": 1, "merge": "Mean", "score": score, "image": "evaluator:1"});
+        let status = json!({
+            "attempt": 1, "track": "test", "message": "40 of 100 units done", "jobName": format!("{name}-1"), "nodeName": "cpu-1",
+            "plan": {"runId": name, "container": container, "track": "test", "storage": {"s3": {"bucket": "results"}}},
+            "progress": {"done": 40, "total": 100, "unit": "units", "text": "40/100"},
+            "score": {"name": "accuracy", "value": "0.5", "final": false, "text": "~0.5"},
+            "workers": [{"id": 1, "done": 40, "total": 100, "crashes": 0, "state": "Running"}],
+            "resultsURL": format!("s3://results/{name}"),
+            "times": {"submitted": ago(2 * HOUR), "scheduled": ago(HOUR + 2 * MINUTE), "started": ago(HOUR)},
+            "conditions": [
+                condition("Accepted", "True", "Accepted", 2 * HOUR),
+                condition("Running", "True", "Running", HOUR),
+                condition("Finished", "False", "Running", 2 * HOUR),
+            ],
+        });
+        let mut one = submission(&name, "digits", "Team Seven", &status);
+        if mode == "Predictions" {
+            let spec = &mut Arc::make_mut(&mut one).spec;
+            spec.image = None;
+            spec.input = serde_json::from_value(json!({"sha256": "0".repeat(64), "size": 12_800})).unwrap();
+        }
+        one
+    })
+}
+
 /// A full evening.
 pub(super) fn submissions() -> Vec<Arc<Submission>> {
     let mut all = under_way();

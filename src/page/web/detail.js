@@ -1,6 +1,6 @@
 // One submission, in the dialog over the page.
 
-import { ago, badge, bar, element, link, number, span } from "./elements.js";
+import { ago, badge, bar, bytes, element, link, number, span } from "./elements.js";
 import { fault, outcome } from "./sections.js";
 import { axis, steps } from "./timeline.js";
 
@@ -60,7 +60,7 @@ function ways(row) {
 }
 
 export function detail(row, now) {
-  const facts = [row.track, row.leaderboard, row.attempt > 1 ? `attempt ${row.attempt}` : null, row.node ? `on ${row.node}` : null].filter(Boolean);
+  const facts = [row.track, row.leaderboard, row.attempt > 1 ? `attempt ${row.attempt}` : null, row.file === null ? null : `file (${bytes(row.file)})`, row.node ? `on ${row.node}` : null].filter(Boolean);
   const open = row.open.length ? badge("warn", `Not yet in ${row.open.join(", ")}`) : null;
   return element(
     "div",

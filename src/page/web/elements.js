@@ -102,6 +102,12 @@ export function number(count) {
   return count.toLocaleString("en");
 }
 
+// A number of bytes, rounded down.
+export function bytes(count) {
+  const power = [4, 3, 2, 1].find((each) => count >= 1024 ** each) ?? 0;
+  return `${Math.floor(count / 1024 ** power)} ${["B", "KiB", "MiB", "GiB", "TiB"][power]}`;
+}
+
 // A bar that is filled to a share; decorative, the number stands next to it.
 export function bar(share, kind = "running") {
   const width = (100 * Math.min(1, Math.max(0, share))).toFixed(2);
