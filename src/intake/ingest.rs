@@ -269,6 +269,7 @@ fn new_submission(leaderboard: &str, incoming: &Incoming) -> Submission {
         spec: SubmissionSpec {
             leaderboard_name: leaderboard.to_owned(),
             image: incoming.image.clone(),
+            input: None,
             evalai: Some(incoming.reference()),
             track: None,
             check: false,

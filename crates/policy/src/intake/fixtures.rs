@@ -28,3 +28,10 @@ pub fn with_queue(mut board: Leaderboard, url: &str) -> Arc<Leaderboard> {
     board.spec.queue = Some(serde_json::from_value(json!({"sqs": {"url": url}})).unwrap());
     Arc::new(board)
 }
+
+/// The same with an evaluation by a container in this mode.
+pub fn in_mode(mut board: Leaderboard, mode: &str) -> Leaderboard {
+    let evaluation = json!({"container": {"mode": mode, "image": "e", "command": ["e"]}});
+    board.spec.evaluation = serde_json::from_value(evaluation).unwrap();
+    board
+}

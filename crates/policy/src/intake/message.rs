@@ -7,6 +7,9 @@ use thiserror::Error;
 
 use leaderboard_api::image;
 
+/// The key that a message of a challenge with static code upload has set.
+pub const STATIC_CODE_UPLOAD: &str = "is_static_dataset_code_upload_submission";
+
 /// A message that names a submission of EvalAI.
 #[derive(Clone, Debug, PartialEq, Eq)]
 pub struct Message {
@@ -19,6 +22,8 @@ pub struct Message {
     /// The participant's image. None if the message names none, or none that a Submission could hold: the
     /// controller then asks EvalAI, and a bad image ends as a failure that the participant sees.
     pub image: Option<String>,
+    /// The files that its image leaves are evaluated once that has ended.
+    pub is_static_code_upload: bool,
 }
 
 /// Why a message can never be used.
@@ -36,9 +41,6 @@ pub enum Malformed {
     /// An id is no positive whole number.
     #[error("{0} is not a positive whole number")]
     NotAnId(&'static str),
-    /// The message asks for the evaluation of a static dataset, which has no image to run.
-    #[error("is_static_dataset_code_upload_submission is set: such submissions have no image to run here")]
-    StaticDataset,
 }
 
 /// Parses the body of a message. Ids come as numbers or as decimal strings; unknown keys are ignored.
@@ -50,14 +52,12 @@ pub fn parse(body: &str) -> Result<Message, Malformed> {
     let Value::Object(map) = value else {
         return Err(Malformed::NotAnObject);
     };
-    if is_set(map.get("is_static_dataset_code_upload_submission")) {
-        return Err(Malformed::StaticDataset);
-    }
     Ok(Message {
         challenge: id(&map, "challenge_pk")?,
         phase: id(&map, "phase_pk")?,
         submission: id(&map, "submission_pk")?,
         image: map.get("submitted_image_uri").and_then(Value::as_str).and_then(fitting),
+        is_static_code_upload: is_set(map.get(STATIC_CODE_UPLOAD)),
     })
 }
 
@@ -97,6 +97,7 @@ mod tests {
             phase: 2,
             submission: 3,
             image: image.map(str::to_owned),
+            is_static_code_upload: false,
         }
     }
 
@@ -158,9 +159,27 @@ mod tests {
         for (body, want) in cases {
             assert_eq!(parse(body), Err(want), "{body}");
         }
-        let static_dataset =
-            r#"{"challenge_pk":1,"phase_pk":2,"submission_pk":3,"is_static_dataset_code_upload_submission":true}"#;
-        assert_eq!(parse(static_dataset), Err(Malformed::StaticDataset));
+    }
+
+    #[test]
+    fn a_static_code_upload_is_a_message_like_any_other() {
+        for (flag, expected) in [
+            ("true", true),
+            (r#""True""#, true),
+            ("false", false),
+            (r#""false""#, false),
+            ("null", false),
+            ("1", false),
+        ] {
+            let body = format!(
+                r#"{{"challenge_pk":1,"phase_pk":2,"submission_pk":3,"{STATIC_CODE_UPLOAD}":{flag},"submitted_image_uri":"r.example/a:1"}}"#
+            );
+            let read = Message {
+                is_static_code_upload: expected,
+                ..message(Some("r.example/a:1"))
+            };
+            assert_eq!(parse(&body), Ok(read), "{body}");
+        }
     }
 
     #[test]

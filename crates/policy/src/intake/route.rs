@@ -4,8 +4,8 @@
 
 use std::sync::Arc;
 
-use super::message::{Malformed, Message};
-use leaderboard_api::{Attempt, Foreign, Leaderboard, ResourceExt, SqsQueue};
+use super::message::{Malformed, Message, STATIC_CODE_UPLOAD};
+use leaderboard_api::{Attempt, EvaluationMode, Foreign, Leaderboard, ResourceExt, SqsQueue};
 
 /// First wait of a message that can't be used yet, in seconds; it doubles with each receive.
 const FIRST_WAIT: i32 = 30;
@@ -204,9 +204,6 @@ pub fn route(
     }
     let message = match &envelope.content {
         Ok(message) => message,
-        Err(Malformed::StaticDataset) if rules.leaves_foreign => {
-            return later(envelope.receives, SHORT_WAIT, Later::Foreign);
-        }
         Err(malformed) => return MessageOutcome::Dead(DeadReason::Malformed(malformed.to_string())),
     };
     let is_of_reader =
@@ -220,9 +217,14 @@ pub fn route(
         None => {}
     }
     if let Some(leaderboard) = readers.iter().find(|lb| lb.serves(message.challenge, message.phase)) {
-        return MessageOutcome::Ingest {
-            namespace: leaderboard.namespace().unwrap_or_default(),
-            leaderboard: leaderboard.name_any(),
+        return match misfit(message, leaderboard) {
+            None => MessageOutcome::Ingest {
+                namespace: leaderboard.namespace().unwrap_or_default(),
+                leaderboard: leaderboard.name_any(),
+            },
+            // The other reader of the queue may evaluate it.
+            Some(_) if rules.leaves_foreign => later(envelope.receives, SHORT_WAIT, Later::Foreign),
+            Some(why) => MessageOutcome::Dead(DeadReason::Malformed(why)),
         };
     }
     if rules.leaves_foreign {
@@ -235,6 +237,19 @@ pub fn route(
         "no Leaderboard that reads this queue serves challenge {}, phase {}",
         message.challenge, message.phase
     )))
+}
+
+/// Why a Leaderboard cannot run the submission of a message.
+fn misfit(message: &Message, leaderboard: &Leaderboard) -> Option<String> {
+    let mode = leaderboard.spec.evaluation.container().map(|container| container.mode);
+    if !message.is_static_code_upload || mode == Some(EvaluationMode::Batch) {
+        return None;
+    }
+    let name = leaderboard.name_any();
+    let kind = mode.map_or_else(|| "evaluation.carla".to_owned(), |mode| format!("the mode {mode:?}"));
+    Some(format!(
+        "{STATIC_CODE_UPLOAD} is set, and the Leaderboard {name} has {kind}: such submissions need evaluation.container with the mode Batch"
+    ))
 }
 
 /// The outcome of a message after its Submission was, or could not be, created or bumped.

@@ -3,7 +3,7 @@
 use std::collections::BTreeSet;
 
 use super::*;
-use crate::intake::fixtures::{board, with_queue};
+use crate::intake::fixtures::{board, in_mode, with_queue};
 use leaderboard_api::Attempt;
 
 fn with(mut board: Arc<Leaderboard>, change: fn(&mut Leaderboard)) -> Arc<Leaderboard> {
@@ -25,6 +25,7 @@ fn envelope(challenge: i64, phase: i64, age_seconds: i64) -> Envelope {
             phase,
             submission: 7,
             image: None,
+            is_static_code_upload: false,
         }),
         sent_ms: NOW - age_seconds * 1000,
         receives: 1,
@@ -116,11 +117,7 @@ fn a_malformed_message_is_given_up_at_once() {
         ..envelope(1, 2, 0)
     };
     let dead = |why: &Malformed| MessageOutcome::Dead(DeadReason::Malformed(why.to_string()));
-    for why in [
-        Malformed::NotAnObject,
-        Malformed::Missing("phase_pk"),
-        Malformed::StaticDataset,
-    ] {
+    for why in [Malformed::NotAnObject, Malformed::Missing("phase_pk")] {
         check("synced", &malformed(why.clone()), &one(), true, &dead(&why));
         check("not synced", &malformed(why.clone()), &one(), false, &dead(&why));
     }
@@ -131,14 +128,38 @@ fn a_malformed_message_is_given_up_at_once() {
         true,
         &dead(&Malformed::NotAnObject),
     );
-    let theirs = malformed(Malformed::StaticDataset);
-    check(
-        "a static dataset may be theirs",
-        &theirs,
-        &leaving(),
-        true,
-        &wait(30, Later::Foreign),
-    );
+}
+
+#[test]
+fn a_static_code_upload_runs_in_the_mode_batch_alone() {
+    let of = |phase| {
+        let mut envelope = envelope(1, phase, 0);
+        envelope.content.as_mut().unwrap().is_static_code_upload = true;
+        envelope
+    };
+    let dead = |kind: &str| {
+        MessageOutcome::Dead(DeadReason::Malformed(format!(
+            "is_static_dataset_code_upload_submission is set, and the Leaderboard a has {kind}: such submissions need \
+             evaluation.container with the mode Batch"
+        )))
+    };
+    let with_mode = |mode| vec![with_queue(in_mode(board("a", 1), mode), URL)];
+    for (readers, expected) in [
+        (with_mode("Batch"), to("a")),
+        (with_mode("Interactive"), dead("the mode Interactive")),
+        (with_mode("Predictions"), dead("the mode Predictions")),
+        (one(), dead("evaluation.carla")),
+        (leaving(), wait(30, Later::Foreign)),
+    ] {
+        check("of its phase", &of(2), &readers, true, &expected);
+        check("of its phase, not synced", &of(2), &readers, false, &expected);
+    }
+    let young = wait(30, Later::Unknown);
+    check("its Leaderboard may come", &of(9), &with_mode("Batch"), true, &young);
+    for mode in ["Batch", "Interactive", "Predictions"] {
+        let plain = envelope(1, 2, 0);
+        check(mode, &plain, &with_mode(mode), true, &to("a"));
+    }
 }
 
 #[test]
