@@ -281,13 +281,14 @@ impl Actor<'_> {
             return Err(ActError::NoPlan { object: self.name() });
         };
         let plan = RunPlan {
-            image: pinned(&plan.image, status.image.as_ref()),
+            image: plan.image.as_deref().map(|image| pinned(image, status.image.as_ref())),
             ..plan.clone()
         };
         let object = job_spec::build_object(&JobInput {
             submission: self.submission(),
             leaderboard,
             plan: &plan,
+            input: status.input.as_ref(),
             number,
             own: &self.uses.settings.own,
             failed_nodes: &status.failed_nodes,

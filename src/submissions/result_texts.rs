@@ -86,7 +86,7 @@ pub(super) fn row(report: Option<&ReportDigest>, status: &SubmissionStatus) -> O
         submission_status: table_status(status.state_of_conditions()).to_owned(),
         track_id: plan.phase.map(|p| p.to_string()).unwrap_or_default(),
         track_name: plan.carla().map_or(&plan.track, |carla| &carla.codename).to_string(),
-        submitted_image_uri: plan.image.clone(),
+        submitted_image_uri: plan.image.clone().unwrap_or_default(),
         submitted_time: text(status.times.submitted.as_ref()),
         start_time: text(status.times.started.as_ref()),
         end_time: text(status.times.finished.as_ref()),
@@ -233,6 +233,17 @@ mod tests {
             (row.track_name.as_str(), row.metrics),
             ("sensors", vec![("accuracy".to_owned(), None)])
         );
+    }
+
+    #[test]
+    fn the_row_of_a_submitted_file_names_no_image() {
+        let mut of_file = of_container(None);
+        of_file.as_object_mut().unwrap().remove("image");
+        for (plan, expected) in [(plan(), "i"), (of_file, "")] {
+            let status = json!({"team": {"id": "3"}, "plan": plan});
+            let row = row(None, &serde_json::from_value(status).unwrap()).unwrap();
+            assert_eq!(row.submitted_image_uri, expected);
+        }
     }
 
     #[test]

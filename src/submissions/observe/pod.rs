@@ -6,7 +6,7 @@ use leaderboard_api::text::{LONGEST_MESSAGE, one_line};
 use leaderboard_contract::run::Stop;
 use leaderboard_contract::verdict::{NotAVerdict, WorkspaceReason, WorkspaceVerdict};
 use leaderboard_policy::view::{ContainerView, EndView, PodView};
-use leaderboard_protocol::files::Member;
+use leaderboard_protocol::files::{Host, Member, Side};
 use leaderboard_protocol::verdict::Verdict;
 
 /// Reduces a Pod.
@@ -55,12 +55,20 @@ fn unschedulable(status: &PodStatus) -> Option<String> {
     Some(short(found.message.as_deref().unwrap_or("no node takes the Pod")))
 }
 
+/// When the first agent started, which may be an init container; of a Pod without agents, the first evaluator.
 fn agent_started(status: &PodStatus) -> Option<jiff::Timestamp> {
-    let agents = status
-        .container_statuses
-        .iter()
-        .filter(|c| names::is_agent_container(&c.name));
-    agents.flat_map(started_times).min()
+    let has_agents = status.all_containers().any(|c| side(c) == Some(Side::Agent));
+    let first = if has_agents {
+        Side::Agent
+    } else {
+        Side::Host(Host::Evaluator)
+    };
+    let its = status.all_containers().filter(|c| side(c) == Some(first));
+    its.flat_map(started_times).min()
+}
+
+fn side(status: &ContainerStatus) -> Option<Side> {
+    Member::parse(&status.name).map(|member| member.side)
 }
 
 /// The hosts' containers leave once the final report is stored; logcopy's farewell and the kubelet's last word come seconds later.
@@ -120,7 +128,7 @@ fn container(status: &ContainerStatus) -> ContainerView {
 /// True if people may read a container's own words. A participant's program can write anything, such as a private route, where the
 /// runner leaves its verdict. Only a verdict's closed words and numbers are used of that.
 fn may_speak(container: &str, ended: &Ended) -> bool {
-    let is_hosts = names::INIT_CONTAINERS.contains(&container);
+    let is_hosts = names::INIT_CONTAINERS.contains(&container) || container == names::CONTAINER_COLLECT;
     // Without a start there was no program yet; the words are the kubelet's.
     is_hosts || matches!(ended.reason.as_deref(), Some("StartError" | "ContainerCannotRun"))
 }
@@ -143,7 +151,7 @@ fn end(container: &str, terminated: &Ended) -> EndView {
         at: terminated.finished_at.as_ref().map(|t| t.0),
         verdict,
         own_reason: foreign
-            .filter(|_| container == names::CONTAINER_WORKSPACE)
+            .filter(|_| [names::CONTAINER_WORKSPACE, names::CONTAINER_COLLECT].contains(&container))
             .and_then(own_reason),
         why: foreign.and_then(foreign_why),
     }
@@ -278,6 +286,62 @@ mod tests {
             "state": {"running": {}}, "lastState": {"terminated": {"exitCode": 0}}});
         assert_eq!(seen(vec![agent.clone(), running]), None);
         assert_eq!((seen(vec![agent]), seen(vec![])), (None, None), "not all are known yet");
+    }
+
+    #[test]
+    fn work_begins_with_the_first_agent_wherever_it_is_and_without_agents_with_the_first_evaluator() {
+        let (early, late) = ("2026-01-01T00:00:07Z", "2026-01-01T05:00:00Z");
+        let ran = |name: &str, from: &str| {
+            json!({"name": name, "image": "i", "imageID": "", "ready": false, "restartCount": 0,
+                   "state": {"terminated": {"exitCode": 0, "startedAt": from, "finishedAt": "2026-01-01T09:00:00Z"}}})
+        };
+        let waits = |name: &str| {
+            json!({"name": name, "image": "i", "imageID": "", "ready": false, "restartCount": 0,
+                   "state": {"waiting": {"reason": "PodInitializing"}}})
+        };
+        for (init, main, expected) in [
+            (
+                vec![ran("workspace", early), waits("agent-1")],
+                vec![waits("evaluator-1")],
+                None,
+            ),
+            (
+                vec![ran("workspace", early), ran("agent-1", late)],
+                vec![waits("evaluator-1")],
+                Some(late),
+            ),
+            (
+                vec![ran("workspace", early)],
+                vec![waits("evaluator-1"), ran("evaluator-2", late)],
+                Some(late),
+            ),
+            (
+                vec![ran("workspace", early)],
+                vec![ran("evaluator-1", early), waits("agent-1")],
+                None,
+            ),
+            (
+                vec![ran("workspace", early)],
+                vec![ran("evaluator-1", early), ran("agent-1", late)],
+                Some(late),
+            ),
+        ] {
+            let status = json!({"initContainerStatuses": init, "containerStatuses": main});
+            let pod = json!({"metadata": {"name": "p"}, "status": status});
+            let found = view(&serde_json::from_value(pod).unwrap()).agent_started;
+            assert_eq!(found.map(|at| at.to_string()).as_deref(), expected, "{status}");
+        }
+    }
+
+    #[test]
+    fn collect_gives_a_verdict_as_workspace_does_and_no_other_container() {
+        let refused = WorkspaceVerdict::new(WorkspaceReason::InputRefused, "a.csv is a link.".to_owned()).to_json();
+        let end = seen("collect", "Error", &refused);
+        let found = (end.own_reason, end.why.as_deref());
+        assert_eq!(found, (Some(WorkspaceReason::InputRefused), Some("a.csv is a link.")));
+        for other in ["agent-1", "evaluator-1", "dataset", "labels"] {
+            assert_eq!(seen(other, "Error", &refused).own_reason, None, "{other}");
+        }
     }
 
     #[test]
