@@ -9,7 +9,7 @@ from labkit import doccheck, kubeversions, toolsets
 
 REPOSITORY = Path(__file__).resolve().parents[2]
 # Numbered as in the review that they come from, so that none can be lost.
-ATTACKS = 150
+ATTACKS = 160
 TABLE = """
 The table has 5 attacks: 1 are held, 1 are held by policy, 1 are inherent, 1 are open, and 1 are struck.
 
