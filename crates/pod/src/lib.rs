@@ -1,10 +1,11 @@
 //! The programs of the operator that run inside a submission's Pod: `workspace` prepares its volumes and restores what an earlier attempt
-//! stored, `logcopy` stores results and logs round by round and reports.
+//! stored, `logcopy` stores results and logs round by round and reports, `collect` copies what an agent has left for the evaluators.
 //!
 //! They know S3, CloudWatch and the Pod's volumes. They know no Kubernetes API, no EvalAI and no DynamoDB, and read nothing of a stranger's
 //! but through `leaderboard-evidence`.
 #![cfg_attr(not(test), deny(clippy::indexing_slicing, clippy::arithmetic_side_effects))]
 
+pub mod collect;
 pub mod daily;
 pub mod identity;
 pub mod isolation;

@@ -2,6 +2,7 @@
 //!
 //! Made by the programs' entry points from [`super::run`]'s constants, and by tests from temporary folders.
 
+use std::fs;
 use std::net::{IpAddr, SocketAddr};
 use std::path::{Path, PathBuf};
 
@@ -9,6 +10,7 @@ use leaderboard_contract::run::{
     ENV_POD_UID, ENV_ROLE_ARN, ENV_RUN, IDENTITY, IDENTITY_TOKEN_FILE, LOGS, PODINFO, RUNNER, RUNNER_IN_IMAGE, Run,
     SCHEMA, STATUS_FOLDER, STOP_FILE, TOOLS,
 };
+use leaderboard_contract::verdict::WorkspaceVerdict;
 use leaderboard_evaluation::judge::Pace;
 
 /// Files and folders.
@@ -59,6 +61,13 @@ impl Places {
     pub fn status(&self) -> PathBuf {
         self.logs.join(STATUS_FOLDER)
     }
+
+    /// Leaves a verdict for the controller, in the termination log.
+    pub(crate) fn tell(&self, verdict: &WorkspaceVerdict) {
+        if let Err(error) = fs::write(&self.termination_log, verdict.to_json()) {
+            tracing::warn!("the termination log can't be written: {error}");
+        }
+    }
 }
 
 /// All that a program in the Pod is given.
@@ -98,9 +107,8 @@ pub enum SettingError {
 impl Setting {
     /// Reads the environment of a Pod.
     pub fn read(places: Places, pace: Pace) -> Result<Self, SettingError> {
-        let variable = |name| std::env::var(name).map_err(|_| SettingError::Missing(name));
         Ok(Self {
-            run: read_run(&variable(ENV_RUN)?)?,
+            run: run()?,
             pod_uid: variable(ENV_POD_UID)?,
             api_server: api_server(),
             role_arn: std::env::var(ENV_ROLE_ARN).ok().filter(|arn| !arn.is_empty()),
@@ -108,6 +116,15 @@ impl Setting {
             pace,
         })
     }
+}
+
+/// The run in the environment of a Pod.
+pub fn run() -> Result<Run, SettingError> {
+    read_run(&variable(ENV_RUN)?)
+}
+
+fn variable(name: &'static str) -> Result<String, SettingError> {
+    std::env::var(name).map_err(|_| SettingError::Missing(name))
 }
 
 fn read_run(json: &str) -> Result<Run, SettingError> {
