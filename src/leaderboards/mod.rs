@@ -5,6 +5,7 @@
 //! and gives the way to EvalAI to `external`. `decide` and `reach` are pure.
 
 pub mod claims;
+mod data_claims;
 pub mod isolation;
 pub mod operator;
 mod places;

@@ -9,6 +9,7 @@ use kube::api::{ApiResource, DynamicObject, PostParams};
 use kube::{Api, Client, ResourceExt};
 
 use super::claims;
+use super::data_claims;
 use super::priority;
 use crate::ask::Asked;
 use crate::kubernetes::call;
@@ -121,10 +122,11 @@ async fn try_templates(client: &Client, settings: &Settings, leaderboard: &Leade
     };
     let asked = priority::asked(&leaderboard.spec.tracks, &pods);
     let classes = priority::look(client, &asked).await;
+    let data = data_claims::look(client, leaderboard).await;
     let notes = notes(&pods).into_iter().chain(pod_notes::unnamed(&pods, hosts));
     TriedPods {
-        refused: refused.or(classes.refused),
-        notes: notes.chain(classes.notes).collect(),
+        refused: refused.or(classes.refused).or(data.refused),
+        notes: notes.chain(classes.notes).chain(data.notes).collect(),
         claims: Claims::default(),
         may_change: !asked.is_empty(),
     }
@@ -150,22 +152,21 @@ async fn refused_job(client: &Client, leaderboard: &Leaderboard, job: &DynamicOb
 }
 
 fn sample_job(settings: &Settings, leaderboard: &Leaderboard, track: &Track) -> Option<DynamicObject> {
-    let spec = serde_json::json!({ "leaderboardName": leaderboard.name_any(), "track": track.name, "image": "example/agent:1" });
+    let container = leaderboard.spec.evaluation.container();
+    let takes_files = container.is_some_and(|container| !container.mode.has_agent());
+    let image = (!takes_files).then_some("example/agent:1");
+    let spec = serde_json::json!({ "leaderboardName": leaderboard.name_any(), "track": track.name, "image": image });
     let mut sample = Submission::new("sample", serde_json::from_value(spec).ok()?);
     sample.metadata.namespace = leaderboard.namespace();
     sample.metadata.uid = leaderboard.uid();
-    let plan = effective::plan(
-        &leaderboard.spec,
-        track,
-        sample.run_id(),
-        "example/agent:1".into(),
-        false,
-    )?;
+    let image = image.map(str::to_owned);
+    let plan = effective::plan(&leaderboard.spec, track, sample.run_id(), image, false)?;
     Some(job_spec::build_object(&JobInput {
         submission: &sample,
         leaderboard,
         plan: &plan,
         number: JobNumber::default(),
+        input: None,
         own: &settings.own,
         failed_nodes: &[],
         // How old a measurement of the isolation is changes nothing that a Job is refused for.

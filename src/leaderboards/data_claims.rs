@@ -1,0 +1,156 @@
+//! The claims that hold a challenge's dataset and labels: they have to be there, and the Pods of all submissions have to get them at once.
+//!
+//! Reads the claims while the Pods of a Leaderboard are tried; one that may not be read goes unchecked. `judge` is pure.
+
+use k8s_openapi::api::core::v1::PersistentVolumeClaim;
+use kube::{Api, Client, ResourceExt};
+
+use super::priority::Problems;
+use crate::kubernetes::call;
+use leaderboard_api::{DataSource, Leaderboard};
+
+/// How a claim was found.
+#[derive(Clone, Debug, PartialEq, Eq)]
+enum ObservedClaim {
+    Unreadable,
+    Missing,
+    /// It is there, with these access modes.
+    Present(Vec<String>),
+}
+
+/// Reads the claims that the Leaderboard names.
+pub(super) async fn look(client: &Client, leaderboard: &Leaderboard) -> Problems {
+    let namespace = leaderboard.namespace().unwrap_or_default();
+    let api: Api<PersistentVolumeClaim> = Api::namespaced(client.clone(), &namespace);
+    let mut problems = Problems::default();
+    for (field, claim) in named(leaderboard) {
+        let seen = match call("reading the PersistentVolumeClaim", claim, api.get(claim)).await {
+            Ok(found) => ObservedClaim::Present(access_modes(found)),
+            Err(error) if error.is_gone() => ObservedClaim::Missing,
+            Err(_) => ObservedClaim::Unreadable,
+        };
+        judge(field, claim, &seen, &mut problems);
+    }
+    problems
+}
+
+/// The claims, each with the field that names it.
+fn named(leaderboard: &Leaderboard) -> Vec<(&'static str, &str)> {
+    let Some(container) = leaderboard.spec.evaluation.container() else {
+        return Vec::new();
+    };
+    let sources = [("dataset", &container.dataset), ("labels", &container.labels)];
+    let claims = sources.into_iter().filter_map(|(field, source)| match source {
+        Some(DataSource::PersistentVolumeClaim(claim)) => Some((field, claim.claim_name.as_str())),
+        Some(DataSource::Image(_)) | None => None,
+    });
+    claims.collect()
+}
+
+/// Those of the volume, and before there is one, those that are asked for.
+fn access_modes(claim: PersistentVolumeClaim) -> Vec<String> {
+    let of_volume = claim.status.and_then(|status| status.access_modes);
+    let asked_for = claim.spec.and_then(|spec| spec.access_modes);
+    of_volume.or(asked_for).unwrap_or_default()
+}
+
+fn judge(field: &str, claim: &str, seen: &ObservedClaim, problems: &mut Problems) {
+    let what = format!("PersistentVolumeClaim {claim} of evaluation.container.{field}");
+    let is = |mode: &str| matches!(seen, ObservedClaim::Present(modes) if modes.iter().any(|found| found == mode));
+    let limit = match seen {
+        ObservedClaim::Unreadable => return,
+        ObservedClaim::Missing => {
+            let text = format!("{what} does not exist in this namespace. Create it, or correct its name.");
+            problems.refused.get_or_insert(text);
+            return;
+        }
+        ObservedClaim::Present(_) if is("ReadOnlyMany") || is("ReadWriteMany") => return,
+        ObservedClaim::Present(_) if is("ReadWriteOnce") => "on one node at a time, to which all Pods are pinned",
+        ObservedClaim::Present(_) => "by one Pod at a time, so that submissions run one by one",
+    };
+    problems.notes.push(format!(
+        "{what} can be mounted {limit}. Use one with ReadOnlyMany or ReadWriteMany."
+    ));
+}
+
+#[cfg(test)]
+mod tests {
+    use serde_json::{Value, json};
+
+    use super::*;
+
+    fn board(container: &Value) -> Leaderboard {
+        let mut evaluation = json!({"mode": "Batch", "image": "e", "command": ["e"]});
+        let fields = container.as_object().unwrap().clone();
+        evaluation.as_object_mut().unwrap().extend(fields);
+        let spec = json!({
+            "tracks": [{"name": "test"}], "evaluation": {"container": evaluation}, "storage": {"s3": {"bucket": "bucket"}},
+        });
+        Leaderboard::new("board", serde_json::from_value(spec).unwrap())
+    }
+
+    #[test]
+    fn the_claims_of_dataset_and_labels_are_asked_for() {
+        let claim = |name: &str| json!({"persistentVolumeClaim": {"claimName": name}});
+        let image = json!({"image": {"reference": "data:1"}});
+        for (fields, expected) in [
+            (json!({}), vec![]),
+            (json!({"dataset": image, "labels": image}), vec![]),
+            (json!({"dataset": claim("d"), "labels": image}), vec![("dataset", "d")]),
+            (
+                json!({"dataset": claim("d"), "labels": claim("l")}),
+                vec![("dataset", "d"), ("labels", "l")],
+            ),
+        ] {
+            assert_eq!(named(&board(&fields)), expected, "{fields}");
+        }
+        let carla = crate::fixtures::leaderboard("carla", "http://127.0.0.1:1");
+        assert!(named(&carla).is_empty());
+    }
+
+    #[test]
+    fn a_missing_claim_is_refused_and_one_that_few_pods_get_is_noted() {
+        let present = |modes: &[&str]| ObservedClaim::Present(modes.iter().map(|mode| (*mode).to_owned()).collect());
+        let what = "PersistentVolumeClaim d of evaluation.container.dataset";
+        for (seen, refused, note) in [
+            (ObservedClaim::Unreadable, None, None),
+            (ObservedClaim::Missing, Some("does not exist in this namespace"), None),
+            (present(&["ReadOnlyMany"]), None, None),
+            (present(&["ReadWriteMany"]), None, None),
+            (present(&["ReadWriteOnce", "ReadOnlyMany"]), None, None),
+            (
+                present(&["ReadWriteOnce"]),
+                None,
+                Some("can be mounted on one node at a time, to which all Pods are pinned"),
+            ),
+            (
+                present(&["ReadWriteOncePod"]),
+                None,
+                Some("can be mounted by one Pod at a time"),
+            ),
+        ] {
+            let mut problems = Problems::default();
+            judge("dataset", "d", &seen, &mut problems);
+            let begins = |found: Option<&String>, rest: Option<&str>| match (found, rest) {
+                (Some(found), Some(rest)) => found.starts_with(&format!("{what} {rest}")),
+                (found, rest) => found.is_none() && rest.is_none(),
+            };
+            let found = (&problems.refused, &problems.notes);
+            assert!(begins(problems.refused.as_ref(), refused), "{seen:?}: {found:?}");
+            assert!(begins(problems.notes.first(), note), "{seen:?}: {found:?}");
+        }
+    }
+
+    #[test]
+    fn a_volume_may_be_mounted_more_often_than_its_claim_asks_for() {
+        let of = |claim: Value| access_modes(serde_json::from_value(claim).unwrap());
+        let spec = json!({"accessModes": ["ReadWriteOnce"]});
+        assert_eq!(of(json!({ "spec": spec })), ["ReadWriteOnce"]);
+        let bound = json!({"spec": spec, "status": {"accessModes": ["ReadWriteOnce", "ReadOnlyMany"]}});
+        assert_eq!(of(bound), ["ReadWriteOnce", "ReadOnlyMany"]);
+        assert_eq!(
+            of(json!({"spec": spec, "status": {"phase": "Pending"}})),
+            ["ReadWriteOnce"]
+        );
+    }
+}
