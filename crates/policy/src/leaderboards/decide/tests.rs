@@ -268,6 +268,16 @@ fn a_leaderboard_whose_runs_have_no_time_limit_shows_it() {
         "Runs of the track sensors have no time limit: an agent that does not end keeps its nodes until it is cancelled; \
          set deadlines.runSeconds."
     );
+    let evaluation = json!({"container": {"mode": "Predictions", "image": "e", "command": ["e"]}});
+    let mut files = one.as_ref().clone();
+    files.spec.evaluation = serde_json::from_value(evaluation).unwrap();
+    let plan = decide(&view(&Arc::new(files), &[]));
+    let ready = conditions::get(&plan.status.conditions, conditions::READY).unwrap();
+    assert!(
+        ready.message.contains("an evaluator that does not end"),
+        "{}",
+        ready.message
+    );
     Arc::make_mut(&mut one).spec.tracks[0].deadlines = Some(leaderboard_api::TrackDeadlines {
         run_seconds: Some(7200),
         ..Default::default()
