@@ -7,6 +7,7 @@ mod error;
 mod keeping;
 mod listing;
 mod parts;
+mod stream;
 mod upload;
 
 use aws_sdk_s3::error::{ProvideErrorMetadata, SdkError};
@@ -23,6 +24,7 @@ use leaderboard_base::meter::Meter;
 pub use error::{ArchiveError, Cause};
 pub use listing::{Listed, Listing};
 pub use parts::{MIN_PART, PART, Part, PartsError, plan as plan_parts};
+pub use stream::StreamError;
 pub use upload::read_range;
 
 use keeping::Keeping;

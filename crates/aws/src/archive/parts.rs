@@ -75,10 +75,7 @@ pub fn plan(kept: u64, size: u64) -> Result<Vec<Part>, PartsError> {
         parts.push(Part::Copy { from, len: end - from });
     }
     let room = MAX_PARTS.saturating_sub(pieces).max(1);
-    let step = PART.max(new.div_ceil(room).next_multiple_of(1 << 20));
-    if step > MAX_PART {
-        return Err(PartsError::TooLarge(size));
-    }
+    let step = step(new, room).ok_or(PartsError::TooLarge(size))?;
     let mut from = kept;
     while from < size {
         let len = step.min(size - from);
@@ -87,6 +84,17 @@ pub fn plan(kept: u64, size: u64) -> Result<Vec<Part>, PartsError> {
     }
     check(&parts)?;
     Ok(parts)
+}
+
+/// Bytes of each part but the last of an object that has `most` bytes at most, and whose size is not known yet.
+pub fn step_within(most: u64) -> Result<u64, PartsError> {
+    step(most, MAX_PARTS).ok_or(PartsError::TooLarge(most))
+}
+
+/// Bytes of a part with which so many bytes need `room` parts at most; None: more than a part may have.
+fn step(bytes: u64, room: u64) -> Option<u64> {
+    let step = PART.max(bytes.div_ceil(room).next_multiple_of(1 << 20));
+    (step <= MAX_PART).then_some(step)
 }
 
 /// Refuses what S3 would refuse.
@@ -155,6 +163,17 @@ mod tests {
         for size in [most + 1, 4 << 40, u64::MAX / 2] {
             assert_eq!(plan(0, size), Err(PartsError::TooLarge(size)));
         }
+    }
+
+    #[test]
+    fn a_stream_has_parts_of_8_mib_unless_that_would_be_too_many() {
+        for (most, expected) in [(1, PART), (1 << 30, PART), (100 << 30, 11 * MIB), (150 << 30, MAX_PART)] {
+            let step = step_within(most).unwrap();
+            assert_eq!(step, expected, "{most}");
+            assert!(most.div_ceil(step) <= MAX_PARTS, "{most}");
+        }
+        let more = MAX_PART * MAX_PARTS + 1;
+        assert_eq!(step_within(more), Err(PartsError::TooLarge(more)));
     }
 
     #[test]

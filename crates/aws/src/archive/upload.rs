@@ -9,11 +9,15 @@ use std::time::{Duration, Instant};
 
 use aws_sdk_s3::config::RequestChecksumCalculation;
 use aws_sdk_s3::primitives::ByteStream;
+use aws_sdk_s3::types::builders::CompletedPartBuilder;
 use aws_sdk_s3::types::{ChecksumAlgorithm, CompletedMultipartUpload, CompletedPart};
 use percent_encoding::{AsciiSet, NON_ALPHANUMERIC, utf8_percent_encode};
 
 use super::{Archive, ArchiveError, Cause, Kept, Part, parts};
+use crate::metered::Metered;
 
+const OP: &str = "storing";
+const OP_PART: &str = "storing a part of";
 /// Time S3 may take for copying a part or joining them.
 const LONG_TRY: Duration = Duration::from_mins(5);
 /// Characters that stay as they are in `x-amz-copy-source`.
@@ -35,20 +39,9 @@ impl Archive {
         size: u64,
         cut_at: Option<Instant>,
     ) -> Result<Option<String>, ArchiveError> {
-        const OP: &str = "storing";
         let parts = parts::plan(kept.map_or(0, |kept| kept.size), size);
         let parts = parts.map_err(|e| self.error(OP, key, e.into()))?;
-        let request = self.client.create_multipart_upload().bucket(&self.bucket);
-        let request = request.key(self.full(key)).set_checksum_algorithm(self.announced());
-        let output = self
-            .keeping
-            .of_upload(request)
-            .send()
-            .await
-            .map_err(|e| self.failed(OP, key, &e))?;
-        let Some(id) = output.upload_id else {
-            return Err(self.error(OP, key, Cause::Refused("no upload id in the answer".to_owned())));
-        };
+        let id = self.begin_upload(key).await?;
         let sending = self.send_parts(key, &id, file, kept, &parts);
         let stored = match cut_at {
             Some(cut_at) => tokio::time::timeout_at(cut_at.into(), sending)
@@ -57,11 +50,42 @@ impl Archive {
             None => sending.await,
         };
         if stored.is_err() {
-            let abort = self.client.abort_multipart_upload().bucket(&self.bucket);
-            // A failed abort leaves parts that cost storage only; the bucket's lifecycle rule removes them.
-            let _ = abort.key(self.full(key)).upload_id(&id).send().await;
+            self.abort_upload(key, &id).await;
         }
         stored
+    }
+
+    /// Begins an upload in parts. Returns its id.
+    pub(super) async fn begin_upload(&self, key: &str) -> Result<String, ArchiveError> {
+        let request = self.client.create_multipart_upload().bucket(&self.bucket);
+        let request = request.key(self.full(key)).set_checksum_algorithm(self.announced());
+        let request = self.keeping.of_upload(request).send();
+        let output = self.meter.aws("s3", "CreateMultipartUpload", request).await;
+        let id = output.map_err(|e| self.failed(OP, key, &e))?.upload_id;
+        id.ok_or_else(|| self.error(OP, key, Cause::Refused("no upload id in the answer".to_owned())))
+    }
+
+    /// Gives an upload up.
+    pub(super) async fn abort_upload(&self, key: &str, id: &str) {
+        let request = self.client.abort_multipart_upload().bucket(&self.bucket);
+        let request = request.key(self.full(key)).upload_id(id).send();
+        // A failed abort leaves parts that cost storage only; the bucket's lifecycle rule removes them.
+        let _ = self.meter.aws("s3", "AbortMultipartUpload", request).await;
+    }
+
+    /// Makes the object of the parts of an upload.
+    pub(super) async fn join_parts(
+        &self,
+        key: &str,
+        id: &str,
+        parts: Vec<CompletedPart>,
+    ) -> Result<Option<String>, ArchiveError> {
+        let upload = CompletedMultipartUpload::builder().set_parts(Some(parts)).build();
+        let request = self.client.complete_multipart_upload().bucket(&self.bucket);
+        let request = request.key(self.full(key)).upload_id(id).multipart_upload(upload);
+        let request = request.customize().config_override(patient()).send();
+        let output = self.meter.aws("s3", "CompleteMultipartUpload", request).await;
+        Ok(output.map_err(|e| self.failed(OP, key, &e))?.e_tag)
     }
 
     /// The SDK adds this checksum to each part, which S3 takes only if the upload has announced it. Without it where the SDK is not to add
@@ -92,11 +116,7 @@ impl Archive {
             };
             done.push(completed.part_number(number).build());
         }
-        let upload = CompletedMultipartUpload::builder().set_parts(Some(done)).build();
-        let request = self.client.complete_multipart_upload().bucket(&self.bucket);
-        let request = request.key(self.full(key)).upload_id(id).multipart_upload(upload);
-        let output = request.customize().config_override(patient()).send().await;
-        Ok(output.map_err(|e| self.failed("storing", key, &e))?.e_tag)
+        self.join_parts(key, id, done).await
     }
 
     async fn send_part(
@@ -106,15 +126,25 @@ impl Archive {
         number: i32,
         file: &Arc<File>,
         range: std::ops::Range<u64>,
-    ) -> Result<aws_sdk_s3::types::builders::CompletedPartBuilder, ArchiveError> {
-        const OP: &str = "storing a part of";
-        let bytes = read_range(file, range)
-            .await
-            .map_err(|e| self.error(OP, key, e.into()))?;
+    ) -> Result<CompletedPartBuilder, ArchiveError> {
+        let bytes = read_range(file, range).await;
+        let bytes = bytes.map_err(|e| self.error(OP_PART, key, e.into()))?;
+        self.send_bytes(key, id, number, bytes).await
+    }
+
+    /// Stores one part of an upload.
+    pub(super) async fn send_bytes(
+        &self,
+        key: &str,
+        id: &str,
+        number: i32,
+        bytes: Vec<u8>,
+    ) -> Result<CompletedPartBuilder, ArchiveError> {
         let request = self.client.upload_part().bucket(&self.bucket).key(self.full(key));
         let request = request.upload_id(id).part_number(number);
-        let output = request.body(ByteStream::from(bytes)).send().await;
-        let output = output.map_err(|e| self.failed(OP, key, &e))?;
+        let request = request.body(ByteStream::from(bytes)).send();
+        let output = self.meter.aws("s3", "UploadPart", request).await;
+        let output = output.map_err(|e| self.failed(OP_PART, key, &e))?;
         let part = CompletedPart::builder().set_e_tag(output.e_tag);
         Ok(part.set_checksum_crc32(output.checksum_crc32))
     }
@@ -126,7 +156,7 @@ impl Archive {
         number: i32,
         etag: &str,
         range: std::ops::Range<u64>,
-    ) -> Result<aws_sdk_s3::types::builders::CompletedPartBuilder, ArchiveError> {
+    ) -> Result<CompletedPartBuilder, ArchiveError> {
         const OP: &str = "copying a part of";
         let source = format!("{}/{}", self.bucket, self.full(key));
         let source = utf8_percent_encode(&source, PLAIN).to_string();
