@@ -82,7 +82,7 @@ pub struct SubmissionSpec {
     #[serde(default, skip_serializing_if = "Option::is_none")]
     #[schemars(length(min = 1, max = 32))]
     pub track: Option<String>,
-    /// A check of the Leaderboard: it drives one route with one pair, goes first in line, starts while the Leaderboard is paused, and
+    /// A check of the Leaderboard: it does the first unit of work with one worker, goes first in line, starts while the Leaderboard is paused, and
     /// is published and recorded nowhere. Its name begins with `check-`.
     #[serde(default, skip_serializing_if = "is_false")]
     pub check: bool,

@@ -85,10 +85,10 @@ reasons! {
             "Leaderboard, track and image are known, and the plan is pinned (condition `Accepted`).",
             "Nothing.";
         Running,
-            "The agents of the first attempt are running.",
+            "The run of the first attempt is under way.",
             "Nothing.";
         Resumed,
-            "The agents are running and continue from the stored results.",
+            "The run continues from the stored results.",
             "Nothing.";
         Replacing,
             "The Pod or the Job was lost, a failure of the infrastructure is retried, or a host has raised `spec.attempt` of a live \
@@ -142,12 +142,12 @@ reasons! {
             log: "the log of agent `<n>`, `agent/agent<n>/leaderboard.log`";
         TimeLimit,
             "The run took longer than `deadlines.runSeconds`. Completed work is kept.",
-            "Make the agent faster, or ask the host for more time.",
+            "Submit what takes less time, or ask the host for more.",
             log: "the log of the agent of the first worker that was not done, else of the first worker";
         InvalidResults,
             "A checkpoint was refused: malformed, implausible, or incomplete at the end. Or it names a crash of the simulation that \
              its simulator did not have. Or the host's evaluator refused the submission.",
-            "Check what the agent writes into its checkpoint or sends to the evaluator, and submit again.",
+            "Check what was submitted against what the track asks for, and submit again.",
             log: "the log of the agent whose results were refused";
         InputInvalid,
             "What the submission brings cannot be taken: no file, too many, too large, or something that is no regular file. Or the \
@@ -156,7 +156,7 @@ reasons! {
             log: "the log of the agent, if there is one";
         NotEligible,
             "The run is complete, but its results do not count (`Rejected`, `Invalid`).",
-            "Compare the agent's sensors with those the track allows, and submit again.",
+            "Compare what was submitted with the rules of the track, and submit again.",
             log: "the log of the agent of the first worker that was not done, else of the first worker";
         ImageInvalid,
             "The name is no valid image reference, or its registry has no container image there, or the Pod sets `runAsNonRoot` and \
