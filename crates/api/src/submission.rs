@@ -82,8 +82,8 @@ pub struct SubmissionSpec {
     #[serde(default, skip_serializing_if = "Option::is_none")]
     #[schemars(length(min = 1, max = 32))]
     pub track: Option<String>,
-    /// A check of the Leaderboard: it does the first unit of work with one worker, goes first in line, starts while the Leaderboard is paused, and
-    /// is published and recorded nowhere. Its name begins with `check-`.
+    /// A check of the Leaderboard: it does the first unit of work with one worker, goes first in line, starts while the Leaderboard is
+    /// paused, and is published and recorded nowhere. Its name begins with `check-`.
     #[serde(default, skip_serializing_if = "is_false")]
     pub check: bool,
     /// Team that submitted; asked from EvalAI when absent.
