@@ -23,15 +23,19 @@ const CARLAS: [&str; 9] = [
     "CARLA",
 ];
 
-/// A Leaderboard with two evaluators and their agents.
-fn local() -> World {
+/// A Leaderboard with two evaluators, and agents as their mode has them.
+pub(super) fn of_mode(mode: &str) -> World {
     let mut world = World::local();
     let evaluation =
-        json!({"container": {"mode": "Interactive", "image": "evaluator:1", "command": ["/evaluate"], "workers": 2}});
+        json!({"container": {"mode": mode, "image": "evaluator:1", "command": ["/evaluate"], "workers": 2}});
     let spec = world.leaderboard();
     spec.evaluation = serde_json::from_value(evaluation).unwrap();
     spec.tracks[0].container = Some(serde_json::from_value(json!({"score": {"metric": "accuracy"}})).unwrap());
     world
+}
+
+fn local() -> World {
+    of_mode("Interactive")
 }
 
 /// Its evaluators and agents run since second 10.
@@ -52,7 +56,7 @@ fn under_way() -> World {
 }
 
 /// The report of two evaluators that have done so many of ten units together.
-fn told(done: u32) -> Report {
+pub(super) fn told(done: u32) -> Report {
     let worker = |id: u32, done: u32| ReportWorker {
         done,
         total: 5,
@@ -69,7 +73,7 @@ fn told(done: u32) -> Report {
     }
 }
 
-fn complete() -> Report {
+pub(super) fn complete() -> Report {
     Report {
         is_final: true,
         eligible: true,
@@ -87,7 +91,7 @@ fn spoiled(worker: Option<u32>, why: &str) -> Report {
 }
 
 /// All that people read of a status.
-fn texts(plan: &Plan) -> String {
+pub(super) fn texts(plan: &Plan) -> String {
     let status = &plan.status;
     let failure = status.failure.as_deref();
     let of_failure = failure.map(|failure| (&failure.message, &failure.next_step, &failure.participant_message));
@@ -97,7 +101,7 @@ fn texts(plan: &Plan) -> String {
 }
 
 #[track_caller]
-fn speaks_of_no_other_kind(plan: &Plan) {
+pub(super) fn speaks_of_no_other_kind(plan: &Plan) {
     let texts = texts(plan);
     for word in CARLAS {
         assert!(!texts.contains(word), "{word}: {texts}");
@@ -200,8 +204,8 @@ fn an_evaluator_that_fails_is_the_infrastructures_and_its_log_is_kept() {
             (Infrastructure, Some(Reason::EvaluatorFailed))
         );
         assert_eq!((failure.message.as_str(), failure.worker), (expected, Some(1)));
-        let expected = "The challenge's evaluator failed. Your agent is not the cause. Ask the challenge's hosts to resume the submission, or \
-                        submit again.";
+        let expected = "The challenge's evaluator failed. Your submission is not the cause. Ask the challenge's hosts to resume the \
+                        submission, or submit again.";
         assert_eq!(failure.participant_message.as_deref(), Some(expected));
     }
     let mut world = under_way();
@@ -297,7 +301,8 @@ fn results_that_the_evaluator_has_spoiled_are_no_fault_of_the_participants() {
         .failure
         .unwrap();
     assert_eq!((failure.class, failure.worker), (Infrastructure, Some(2)));
-    let begin = "Evaluator 2: result.json can't be used: its schema is 2, and this operator reads 1. Write \"schema\": 1. Look at";
+    let begin = "Evaluator 2: result.json can't be used: its schema is 2, and this operator reads 1. Write \"schema\": 1. A file that cannot be \
+                 used is kept at logcopy/refused/evaluators/2/result.json. Look at the evaluator's log and at evaluators/2/result.json; ";
     assert!(failure.message.starts_with(begin), "{}", failure.message);
     assert!(!failure.participant_message.unwrap().contains("schema"));
     let together = ends_with(

@@ -102,7 +102,7 @@ fn a_participant_is_sent_to_nothing_that_only_hosts_can_read() {
         );
         assert_eq!(
             failure.class == FailureClass::Infrastructure,
-            text.contains("Your agent is not the cause."),
+            text.contains("Your submission is not the cause."),
             "{text}"
         );
     }

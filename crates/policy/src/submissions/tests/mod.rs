@@ -2,7 +2,9 @@
 
 mod accept;
 mod after;
+mod batch;
 mod blame;
+mod blame_alone;
 mod blame_of_evaluators;
 mod blame_of_neither;
 mod builders;
@@ -25,6 +27,7 @@ mod nodes;
 mod not_crashes;
 mod observe;
 mod phases;
+mod predictions;
 mod properties;
 mod provoked;
 mod pulls;

@@ -8,6 +8,8 @@ use proptest::prelude::*;
 use proptest::sample::select;
 
 use super::builders::*;
+use super::container::of_mode;
+use super::predictions;
 use crate::submissions::job_name;
 use crate::view::{
     EvalaiEnd, EvalaiView, JobEnd, JobView, ObservedFence, ObservedJob, ObservedLog, ObservedNode, ObservedReport,
@@ -94,6 +96,8 @@ fn container() -> impl Strategy<Value = crate::view::ContainerView> {
         "simulator-1",
         "agent-1",
         "agent-2",
+        "collect",
+        "evaluator-1",
         "sidecar",
         "agent-x",
     ];
@@ -106,6 +110,8 @@ fn container() -> impl Strategy<Value = crate::view::ContainerView> {
         "cannotStart",
         "stopped",
         "PrefixInUse",
+        "InputMissing",
+        "InputRefused",
         "finished",
     ];
     let reasons = ["Error", "OOMKilled", "StartError", "Completed"];
@@ -419,8 +425,13 @@ proptest! {
 
     /// `World::pass` checks the rules.
     #[test]
-    fn the_rules_hold_in_any_world(is_evalais: bool, changes in prop::collection::vec(change(), 1..40)) {
-        let mut world = if is_evalais { World::evalai() } else { World::local() };
+    fn the_rules_hold_in_any_world(kind in 0..4, changes in prop::collection::vec(change(), 1..40)) {
+        let mut world = match kind {
+            0 => World::evalai(),
+            1 => World::local(),
+            2 => of_mode("Batch"),
+            _ => predictions::local(),
+        };
         world.pass();
         for change in changes {
             apply(&mut world, change);

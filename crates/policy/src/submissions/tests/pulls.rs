@@ -1,9 +1,9 @@
 //! How long the start of a Pod may take: its pulls apart from all the rest.
 
 use jiff::Timestamp;
-use leaderboard_api::Deadlines;
+use leaderboard_api::{Agents, Deadlines};
 
-use super::super::start::{limit, waiting};
+use super::super::limits::{limit, waiting};
 use crate::view::{ContainerView, EndView, PodView};
 
 fn at(second: i64) -> Timestamp {
@@ -118,8 +118,8 @@ fn stages() -> [(&'static str, Vec<ContainerView>, &'static [&'static str], i64)
 fn pulls_and_the_rest_of_a_start_have_deadlines_of_their_own() {
     for (what, containers, names, second) in stages() {
         let pod = pod(containers);
-        assert_eq!(waiting(&pod), names, "{what}");
-        let limit = limit(&pod, &deadlines(), None).unwrap();
+        assert_eq!(waiting(&pod, Agents::Beside), names, "{what}");
+        let limit = limit(&pod, Agents::Beside, &deadlines(), None).unwrap();
         assert_eq!((limit.at, limit.is_of_pulls), (at(second), !names.is_empty()), "{what}");
         assert_eq!(limit.seconds, if names.is_empty() { 1800 } else { 5400 }, "{what}");
     }
@@ -133,11 +133,87 @@ fn what_does_not_start_has_its_time_from_when_it_was_seen_and_never_more_than_al
         contents.last.as_mut().unwrap().exit_code = 3;
         pod(vec![contents, waits("workspace", "PodInitializing")])
     };
-    assert!(waiting(&failing()).is_empty(), "a restart pulls nothing");
+    assert!(
+        waiting(&failing(), Agents::Beside).is_empty(),
+        "a restart pulls nothing"
+    );
     for (stalled, second) in [(None, 1800), (Some(3900), 5700), (Some(9000), 5400 + 1800)] {
-        let found = limit(&failing(), &deadlines(), stalled.map(at)).unwrap();
+        let found = limit(&failing(), Agents::Beside, &deadlines(), stalled.map(at)).unwrap();
         assert_eq!((found.at, found.is_of_pulls), (at(second), false), "{stalled:?}");
     }
     let unscheduled = PodView::default();
-    assert_eq!(limit(&unscheduled, &deadlines(), None), None, "there is no node yet");
+    assert_eq!(
+        limit(&unscheduled, Agents::Beside, &deadlines(), None),
+        None,
+        "there is no node yet"
+    );
+}
+
+/// The Pod of an agent that ends at second 9000, before two evaluators.
+fn agent_first(containers: Vec<ContainerView>, later: &[&str]) -> PodView {
+    let first = [
+        ran("workspace", 0, 10),
+        ran("dataset", 500, 1000),
+        runs("logcopy", 1010),
+    ];
+    pod(starts(first.into_iter().chain(containers).collect(), later))
+}
+
+#[test]
+fn after_an_agent_that_runs_first_the_evaluators_have_the_deadlines_of_a_start_from_its_end() {
+    const EVALUATORS: [&str; 2] = ["evaluator-1", "evaluator-2"];
+    let agent = || ran("agent-1", 2000, 9000);
+    let after_collect = |later: &[ContainerView], waits: &[&str]| {
+        let first = [agent(), ran("collect", 9010, 9020)];
+        agent_first(first.into_iter().chain(later.iter().cloned()).collect(), waits)
+    };
+    let failing = waits("evaluator-1", "ErrImagePull");
+    for (what, pod, stalled, names, second) in [
+        (
+            "its image is pulled",
+            agent_first(vec![], &["agent-1", "collect", "evaluator-1", "evaluator-2"]),
+            None,
+            &["agent-1"][..],
+            510 + 5400,
+        ),
+        (
+            "collect is next",
+            agent_first(vec![agent()], &["collect", "evaluator-1", "evaluator-2"]),
+            None,
+            &["collect"],
+            9000 + 5400,
+        ),
+        (
+            "its files are copied",
+            agent_first(vec![agent(), runs("collect", 9010)], &EVALUATORS),
+            None,
+            &[],
+            9010 + 1800,
+        ),
+        (
+            "the images of the evaluators are pulled",
+            after_collect(&[], &EVALUATORS),
+            None,
+            &EVALUATORS,
+            9000 + 5400,
+        ),
+        (
+            "one cannot be pulled",
+            after_collect(std::slice::from_ref(&failing), &["evaluator-2"]),
+            Some(9100),
+            &["evaluator-2"],
+            9100 + 1800,
+        ),
+        (
+            "causes take turns",
+            after_collect(std::slice::from_ref(&failing), &["evaluator-2"]),
+            Some(80_000),
+            &["evaluator-2"],
+            9000 + 5400 + 1800,
+        ),
+    ] {
+        assert_eq!(waiting(&pod, Agents::First), names, "{what}");
+        let found = limit(&pod, Agents::First, &deadlines(), stalled.map(at)).unwrap();
+        assert_eq!(found.at, at(second), "{what}");
+    }
 }

@@ -150,7 +150,7 @@ fn the_image_is_the_first_attempts() {
         info: Some(info()),
         ..EvalaiView::default()
     });
-    assert_eq!(world.pass().status.plan.unwrap().image, "team/agent:1");
+    assert_eq!(world.pass().status.plan.unwrap().image.as_deref(), Some("team/agent:1"));
 }
 
 fn note(world: &mut World, record: &serde_json::Value) {
