@@ -1,4 +1,4 @@
-"""Owns the images that examples/quickstart.yaml names, made by the lab in place of those that a release publishes: same names, same tag.
+"""Owns the images that examples/quickstart.yaml and its first submission name, made by the lab in place of those that a release publishes: same names, same tag.
 
 Called by `lab test` for the cluster's tests. What a release publishes is made by local/quickstart/Dockerfile.
 """
@@ -13,7 +13,7 @@ from . import build, demo, image, release
 from .image_spec import ImageSpec, parse
 from .settings import Settings
 
-MANIFEST = "examples/quickstart.yaml"
+MANIFEST, GAME = "examples/quickstart.yaml", "examples/quickstart-game.yaml"
 # Where a release puts its images; the release workflow and those who have images of their own write another name there.
 PUBLISHED = "ghcr.io/OWNER/"
 IMAGE = re.compile(r"^ +image: (\S+)$", re.MULTILINE)
@@ -26,7 +26,7 @@ def images(settings: Settings) -> list[str]:
 
 
 def specs(repository: Path) -> Iterator[ImageSpec]:
-    """The stand-ins, and of the challenge's images one of each kind, under the tag of the version."""
+    """The stand-ins, the guessing game, and of CARLA's stand-in one image of each kind, under the tag of the version."""
     tag = release.version(repository)
     for file in ("challenge/images.toml", "quickstart/images.toml"):
         for spec in parse((repository / "local" / file).read_text(), file):
@@ -35,5 +35,5 @@ def specs(repository: Path) -> Iterator[ImageSpec]:
 
 
 def named(repository: Path) -> list[str]:
-    """The images that the manifest names."""
-    return IMAGE.findall((repository / MANIFEST).read_text())
+    """The images that the manifests name."""
+    return [image for file in (MANIFEST, GAME) for image in IMAGE.findall((repository / file).read_text())]

@@ -89,7 +89,7 @@ class Elsewhere(unittest.TestCase):
         self.assertIn("Driving score 69.410625", printed)
         notes = self.notes()
         pushed = [words[1] for name, words, _ in notes if name == "docker" and words[0] == "push"]
-        self.assertEqual(len(pushed), 6)
+        self.assertEqual(len(pushed), 8)
         self.assertEqual(pushed, [words[1] for name, words, _ in notes if name == "docker" and words[0] == "rmi"])
         self.assertTrue(all(one.startswith("registry.example/demo/") for one in pushed), pushed)
         [install] = [words for name, words, _ in notes if name == "helm"]
@@ -99,7 +99,7 @@ class Elsewhere(unittest.TestCase):
         [applied] = [given for name, words, given in notes if words[0] == "apply"]
         self.assertNotIn(quickstart.PUBLISHED, applied)
         named = set(quickstart.IMAGE.findall(applied))
-        self.assertEqual(len(named), 4)
+        self.assertEqual(len(named), 5)
         self.assertLessEqual(named, set(pushed))
         changing = [words for name, words, _ in notes if name == "kubectl" and words[0] in ("apply", "exec", "wait")]
         self.assertTrue(all("--namespace=leaderboard-demo" in words for words in changing), changing)
