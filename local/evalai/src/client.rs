@@ -9,7 +9,7 @@ use thiserror::Error;
 /// A command that did not work out.
 #[derive(Debug, Error)]
 pub(crate) enum Failure {
-    /// The server could not be started.
+    /// The server could not be started, or a file not be read.
     #[error("{0}")]
     Start(String),
     /// The server could not be reached.

@@ -19,7 +19,10 @@ use crate::submissions::{self, Bulk, NewSubmission, Upload};
 struct Submit {
     team: Name,
     phase: u64,
-    image: String,
+    /// The image that the uploaded file names.
+    image: Option<String>,
+    /// The uploaded file itself, in place of one that names an image.
+    content: Option<String>,
     #[serde(default)]
     file: Upload,
     #[serde(default)]
@@ -63,6 +66,10 @@ pub(crate) async fn answer(app: &App, method: &str, path: &str, query: &[(String
         ("POST", "submit") => submit(app, body).await,
         ("POST", "bulk") => bulk(app, body),
         ("POST", "file") => set_file(app, body),
+        ("POST", "expire") => {
+            app.state().expire_addresses();
+            Ok(done())
+        }
         ("POST", "reset") => reset(app, body),
         _ => Err(wrong(
             &format!("{method} /_stand-in/{path} is not known; local/evalai/README.md lists what is"),
@@ -144,7 +151,7 @@ async fn submit(app: &App, body: &[u8]) -> Answer {
             .is_some_and(|challenge| challenge.is_docker_based);
         (
             id,
-            submissions::first_message(&state, row, asked.file, docker.then_some(asked.image.as_str())),
+            submissions::first_message(&state, row, asked.file, asked.image.as_deref().filter(|_| docker)),
         )
     };
     publish(app, id, message.clone()).await?;
@@ -161,11 +168,16 @@ fn new_submission(state: &State, asked: &Submit) -> Result<NewSubmission, Reply>
     state
         .phase(asked.phase)
         .ok_or_else(|| wrong(&format!("no phase {}", asked.phase), 400))?;
+    let input = match (&asked.content, &asked.image) {
+        (Some(content), _) => content.clone(),
+        (None, Some(image)) => json!({ "submitted_image_uri": image }).to_string(),
+        (None, None) => return Err(wrong("neither image nor content", 400)),
+    };
     Ok(NewSubmission {
         team: team.id,
         phase: asked.phase,
         user: team.members.first().copied().unwrap_or(0),
-        input: json!({"submitted_image_uri": asked.image}).to_string().into_bytes(),
+        input: input.into_bytes(),
         fields: Map::from_iter([("method_name".to_owned(), Value::from(asked.method_name.as_str()))]),
     })
 }

@@ -223,6 +223,8 @@ error_texts! {
     TEAM_NOT_FOUND = 404 Shape::Detail, "ParticipantTeam {} does not exist";
     /// An unknown challenge where the server answers "not acceptable".
     NO_CHALLENGE = 406 Shape::Error, "Challenge does not exist";
+    /// A challenge that is asked for by its key, and is unknown.
+    UNKNOWN_CHALLENGE = 406 Shape::Error, "Challenge does not exist!";
     /// An unknown phase of a known challenge.
     NO_PHASE_OF_CHALLENGE = 406 Shape::Error, "Challenge phase {} does not exist for challenge {}";
     /// A leaderboard that is not public.

@@ -16,6 +16,7 @@ mod handlers;
 mod idle;
 mod leaderboards;
 pub mod log;
+mod media;
 pub mod model;
 mod pages;
 pub mod python;

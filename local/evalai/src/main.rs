@@ -27,7 +27,7 @@ struct Cli {
 enum Command {
     /// Run the server.
     Serve(Serve),
-    /// Submit an image for a team.
+    /// Submit an image, or a file, for a team.
     Submit(Submit),
     /// Cancel a submission, as the web page does: no message is sent.
     Cancel(One),
@@ -97,7 +97,11 @@ struct One {
 #[derive(Args)]
 struct Submit {
     /// The image's name.
-    image: String,
+    #[arg(required_unless_present = "content")]
+    image: Option<String>,
+    /// A text file that is the submission itself, in place of an image.
+    #[arg(long, value_name = "FILE", conflicts_with = "image")]
+    content: Option<String>,
     /// The team.
     #[arg(long, default_value = "team-a")]
     team: String,
@@ -126,15 +130,7 @@ async fn main() -> ExitCode {
         .init();
     let result = match Cli::parse().command {
         Command::Serve(options) => run(options).await,
-        Command::Submit(asked) => {
-            let body = serde_json::json!({
-                "team": asked.team, "phase": asked.phase, "image": asked.image,
-                "file": asked.file, "method_name": asked.name,
-            });
-            Client::new(&asked.server.server, &asked.server.token)
-                .submit(&body)
-                .await
-        }
+        Command::Submit(asked) => submit(asked).await,
         Command::Cancel(one) => one.client().cancel(one.pk).await,
         Command::Resume(one) => one.client().again(one.pk, "resume").await,
         Command::Rerun(one) => one.client().again(one.pk, "re-run").await,
@@ -152,6 +148,19 @@ async fn main() -> ExitCode {
             ExitCode::FAILURE
         }
     }
+}
+
+async fn submit(asked: Submit) -> Result<String, Failure> {
+    let content = asked.content.map(|path| {
+        let read = std::fs::read_to_string(&path);
+        read.map_err(|error| Failure::Start(format!("cannot read {path}: {error}; choose another --content")))
+    });
+    let body = serde_json::json!({
+        "team": asked.team, "phase": asked.phase, "image": asked.image, "content": content.transpose()?,
+        "file": asked.file, "method_name": asked.name,
+    });
+    let client = Client::new(&asked.server.server, &asked.server.token);
+    client.submit(&body).await
 }
 
 impl One {

@@ -75,7 +75,7 @@ impl Status {
     }
 }
 
-/// Result when EvalAI fetches a submission's input file again for a re-run or a resume.
+/// Result when somebody fetches a submission's input file: a worker, or EvalAI for a re-run or a resume.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, Default, Serialize, Deserialize)]
 #[serde(rename_all = "kebab-case")]
 pub enum FileState {
@@ -84,8 +84,16 @@ pub enum FileState {
     Stored,
     /// 404: the message goes out without an image.
     Missing,
-    /// No answer: no message goes out, and the request ends in a 500.
+    /// 410, otherwise as `Missing`.
+    Gone,
+    /// The connection is closed: no message goes out, and the request ends in a 500.
     Unreachable,
+    /// No answer for as long as the client waits, otherwise as `Unreachable`.
+    Silent,
+    /// The first half of it, and then the connection is closed.
+    Cut,
+    /// So many zeros in its place.
+    Zeros(u64),
 }
 
 /// How a token is used.
@@ -162,6 +170,9 @@ pub struct Challenge {
     /// Participants push images.
     #[serde(default = "yes")]
     pub is_docker_based: bool,
+    /// These images leave files, which are evaluated once they have ended.
+    #[serde(default)]
+    pub is_static_dataset_code_upload: bool,
     /// Between its dates.
     #[serde(default = "yes")]
     pub is_active: bool,

@@ -37,6 +37,8 @@ pub enum Endpoint {
     Leaderboard(u64),
     /// `challenges/challenge/queues/{queue}/`
     ChallengeOfQueue(String),
+    /// `challenges/challenge/{c}/`
+    Challenge(u64),
     /// `challenges/challenge/{c}/challenge_phase/{p}`
     Phase(u64, u64),
     /// `challenges/{c}/phases/`
@@ -66,18 +68,18 @@ impl Endpoint {
     pub fn is_public(&self) -> bool {
         matches!(
             self,
-            Self::Leaderboard(_) | Self::Phase(..) | Self::Splits(_) | Self::PhaseSplit(_)
+            Self::Leaderboard(_) | Self::Challenge(_) | Self::Phase(..) | Self::Splits(_) | Self::PhaseSplit(_)
         )
     }
 
     /// A user who signs in must have a confirmed e-mail address.
     pub fn wants_email(&self) -> bool {
-        !matches!(self, Self::Leaderboard(_) | Self::Splits(_))
+        !matches!(self, Self::Leaderboard(_) | Self::Challenge(_) | Self::Splits(_))
     }
 
     /// Counts against the user's requests a minute.
     pub fn counts(&self) -> bool {
-        !matches!(self, Self::Splits(_))
+        !matches!(self, Self::Challenge(_) | Self::Splits(_))
     }
 }
 
@@ -128,6 +130,7 @@ fn endpoint(path: &str) -> Option<Endpoint> {
         ["challenges", "challenge", "queues", queue, ""] => Endpoint::ChallengeOfQueue(name(queue)?),
         ["challenges", "challenge", "create", "dataset_split", d, ""] => Endpoint::DatasetSplit(key(d)?),
         ["challenges", "challenge", "create", "challenge_phase_split", s, ""] => Endpoint::PhaseSplit(key(s)?),
+        ["challenges", "challenge", c, ""] => Endpoint::Challenge(key(c)?),
         ["challenges", "challenge", c, "challenge_phase", p] => Endpoint::Phase(key(c)?, key(p)?),
         ["challenges", c, "phases", ""] => Endpoint::Phases(key(c)?),
         ["challenges", c, "challenge_phase_split"] => Endpoint::Splits(key(c)?),

@@ -24,11 +24,10 @@ use crate::faults::{Failure, Fault, Knobs, When};
 use crate::handlers::{self, Call};
 use crate::idle::Idle;
 use crate::log::{Entry, RequestLog};
-use crate::model::FileState;
 use crate::reply::{Answer, Reply};
 use crate::routes::{self, Found};
 use crate::state::State;
-use crate::{control, errors, pages};
+use crate::{control, errors, media, pages};
 
 /// The largest body EvalAI's nginx lets through.
 const BODY_LIMIT: usize = 200 << 20;
@@ -144,9 +143,9 @@ async fn converse(app: Arc<App>, stream: TcpStream) {
     }
 }
 
-/// The connection is closed without an answer.
+/// The connection is closed without an answer, or in the middle of one.
 #[derive(Debug)]
-struct Closed;
+pub(crate) struct Closed;
 
 impl fmt::Display for Closed {
     fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
@@ -157,8 +156,10 @@ impl fmt::Display for Closed {
 impl std::error::Error for Closed {}
 
 /// The way in which a request ends.
-enum Outcome {
+pub(crate) enum Outcome {
     Reply(Reply),
+    /// An answer with status 200 that is made while it is sent.
+    Stream(Response<Body>),
     Close,
     Hang,
 }
@@ -197,6 +198,7 @@ async fn respond(
         .unwrap_or_else(|_| Outcome::Reply(Reply::server_error()))
     {
         Outcome::Reply(reply) => Ok(reply.into_response()),
+        Outcome::Stream(response) => Ok(response),
         Outcome::Close => Err(Closed),
         Outcome::Hang => {
             let _ = stop.wait_for(|stop| *stop).await;
@@ -231,10 +233,10 @@ async fn process(app: Arc<App>, asked: Asked) -> Outcome {
             fault.as_ref().map_or(outcome, fail)
         }
     };
-    let status = if let Outcome::Reply(reply) = &outcome {
-        Some(reply.status)
-    } else {
-        None
+    let status = match &outcome {
+        Outcome::Reply(reply) => Some(reply.status),
+        Outcome::Stream(response) => Some(response.status().as_u16()),
+        Outcome::Close | Outcome::Hang => None,
     };
     let fault = fault.map(|fault| serde_json::json!(fault.answer).to_string().replace('"', ""));
     app.log().end(id, status, now(), fault);
@@ -259,31 +261,9 @@ fn fail(fault: &Fault) -> Outcome {
 
 async fn work(app: &Arc<App>, asked: Asked) -> Outcome {
     if let Some(path) = asked.path.strip_prefix("/media/") {
-        return media(app, path);
+        return media::serve(&app.state(), path, &query(asked.query.as_deref()));
     }
     Outcome::Reply(api(app, asked).await.unwrap_or_else(|error| error))
-}
-
-/// An uploaded or stored file. Links need no signing in.
-fn media(app: &App, path: &str) -> Outcome {
-    let state = app.state();
-    let of_input = |s: &&crate::model::Submission| s.input_file.as_deref() == Some(path);
-    let file_state = state
-        .submissions
-        .values()
-        .find(of_input)
-        .map(|submission| submission.file_state);
-    match (file_state, state.files.get(path)) {
-        (Some(FileState::Unreachable), _) => Outcome::Close,
-        (Some(FileState::Missing), _) | (_, None) => Outcome::Reply(Reply::error(&errors::PAGE_NOT_FOUND, &[])),
-        (_, Some(content)) => {
-            let json = std::path::Path::new(path)
-                .extension()
-                .is_some_and(|extension| extension == "json");
-            let content_type = if json { "application/json" } else { "text/plain" };
-            Outcome::Reply(Reply::of(200, content_type, content.clone()))
-        }
-    }
 }
 
 /// The order of the real server: path, signing in, e-mail, throttle, method, and only then the body.

@@ -43,6 +43,8 @@ pub struct State {
     pub files: BTreeMap<String, Vec<u8>>,
     /// Every message that went out, oldest first.
     pub published: Vec<Published>,
+    /// What the address of each input file has, and has to have, once the first such address has expired.
+    pub signature: Option<u64>,
     /// Refresh tokens that profile pages gave in place of older ones, with their users; the newest last.
     renewed: Vec<(u64, String)>,
     /// Refresh tokens that are no longer valid.
@@ -72,6 +74,7 @@ impl State {
             last_place: 0,
             last_row: 0,
             last_file: 0,
+            signature: None,
         }
     }
 
@@ -286,6 +289,11 @@ impl State {
         );
         self.files.insert(path.clone(), content);
         path
+    }
+
+    /// Ends the life of every address of an input file that was handed out.
+    pub fn expire_addresses(&mut self) {
+        self.signature = Some(self.signature.unwrap_or_default() + 1);
     }
 
     /// Forgets everything but the seed.

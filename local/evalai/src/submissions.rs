@@ -142,7 +142,7 @@ pub fn first_message(state: &State, submission: &Submission, upload: Upload, ima
     let mut message = json!({
         "challenge_pk": challenge.to_string(),
         "phase_pk": phase.to_string(),
-        "is_static_dataset_code_upload_submission": false,
+        "is_static_dataset_code_upload_submission": is_static(state, challenge),
         "submission_pk": submission.id,
     });
     if let (Upload::Normal, Some(image)) = (upload, image) {
@@ -168,14 +168,21 @@ pub fn again_message(state: &State, id: u64) -> Option<Value> {
         return Some(message);
     }
     match submission.file_state {
-        FileState::Unreachable => None,
-        FileState::Missing => Some(message),
-        FileState::Stored => {
+        FileState::Unreachable | FileState::Silent => None,
+        FileState::Missing | FileState::Gone => Some(message),
+        FileState::Stored | FileState::Cut | FileState::Zeros(_) => {
             let content = submission.input_file.as_ref().and_then(|path| state.files.get(path))?;
             message["submitted_image_uri"] = Value::from(image_of(content).ok()?);
+            message["is_static_dataset_code_upload_submission"] = Value::from(is_static(state, challenge));
             Some(message)
         }
     }
+}
+
+/// True if the images of a challenge leave files that are evaluated later.
+fn is_static(state: &State, challenge: u64) -> bool {
+    let row = state.challenge(challenge);
+    row.is_some_and(|row| row.is_docker_based && row.is_static_dataset_code_upload)
 }
 
 fn keys(state: &State, submission: &Submission) -> (u64, u64) {

@@ -54,6 +54,8 @@ pub fn parse_time(text: &str) -> Result<Timestamp, BadTime> {
 /// A submission, as `viewer` may see it: only hosts see the environment's log.
 pub fn submission(state: &State, row: &Submission, viewer: &User, base: &str) -> Value {
     let file = |path: &Option<String>| path.as_ref().map(|path| format!("{base}/media/{path}"));
+    let signature = state.signature.map(|signature| format!("?signature={signature}"));
+    let input_file = file(&row.input_file).map(|url| url + signature.as_deref().unwrap_or_default());
     let execution_time = match (row.started_at, row.completed_at) {
         (Some(started), Some(completed)) => Value::from(completed.duration_since(started).as_secs_f64()),
         _ => Value::from("None"),
@@ -66,7 +68,7 @@ pub fn submission(state: &State, row: &Submission, viewer: &User, base: &str) ->
         "challenge_phase": row.challenge_phase,
         "created_by": row.created_by,
         "status": row.status,
-        "input_file": file(&row.input_file),
+        "input_file": input_file,
         "submission_input_file": file(&row.submission_input_file),
         "stdout_file": file(&row.stdout_file),
         "stderr_file": file(&row.stderr_file),
@@ -97,7 +99,7 @@ pub fn submission(state: &State, row: &Submission, viewer: &User, base: &str) ->
     view
 }
 
-/// A challenge, as a worker learns of it by its queue.
+/// A challenge, as far as workers read it.
 pub fn challenge(row: &Challenge) -> Value {
     json!({
         "id": row.id,
@@ -107,7 +109,7 @@ pub fn challenge(row: &Challenge) -> Value {
         "submission_time_limit": 86_400,
         "remote_evaluation": row.remote_evaluation,
         "is_docker_based": row.is_docker_based,
-        "is_static_dataset_code_upload": false,
+        "is_static_dataset_code_upload": row.is_static_dataset_code_upload,
         "is_active": row.is_active,
         "allow_resuming_submissions": row.allow_resuming_submissions,
         "allow_host_cancel_submissions": row.allow_host_cancel_submissions,

@@ -115,6 +115,13 @@ pub(super) fn leaderboard(call: &Call, split: u64) -> Answer {
     call.page(entries)
 }
 
+/// One challenge.
+pub(super) fn challenge(call: &Call, challenge: u64) -> Answer {
+    let state = call.app.state();
+    let row = state.challenge(challenge).ok_or(&errors::UNKNOWN_CHALLENGE)?;
+    Ok(Reply::ok(&views::challenge(row)))
+}
+
 /// One phase.
 pub(super) fn phase(call: &Call, challenge: u64, phase: u64) -> Answer {
     let state = call.app.state();

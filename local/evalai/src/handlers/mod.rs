@@ -119,6 +119,7 @@ pub(crate) async fn answer(call: Call, endpoint: Endpoint) -> Answer {
         Endpoint::RenewToken => context::renew_token(&call),
         Endpoint::CountByStatus(phase) => context::count_by_status(&call, phase),
         Endpoint::Leaderboard(split) => context::leaderboard(&call, split),
+        Endpoint::Challenge(challenge) => context::challenge(&call, challenge),
         Endpoint::Phase(challenge, phase) => context::phase(&call, challenge, phase),
         Endpoint::Phases(challenge) => context::phases(&call, challenge),
         Endpoint::Splits(challenge) => context::splits(&call, challenge),

@@ -88,6 +88,7 @@ async fn submit_url(call: &Call, form: &Form, new: NewSubmission) -> Answer {
         value => value.as_str().unwrap_or_default(),
     };
     let path = url.split_once("/media/").map(|(_, path)| path).unwrap_or_default();
+    let path = path.split('?').next().unwrap_or_default();
     let input = call
         .app
         .state()
