@@ -21,6 +21,12 @@ pub struct Spent {
 }
 
 impl Spent {
+    /// An allowance without a bound.
+    pub const ENDLESS: Self = Self {
+        requests: u64::MAX,
+        bytes: u64::MAX,
+    };
+
     /// Both together.
     #[must_use]
     pub fn plus(self, more: Self) -> Self {

@@ -18,7 +18,7 @@ use leaderboard_api::RunId;
 use leaderboard_aws::logs::{BETWEEN_BATCHES, LogClient, LogEvent, LogsError, Miss, OVERHEAD, cut};
 use leaderboard_base::backoff::Backoff;
 use leaderboard_base::clock::Clock;
-use leaderboard_contract::keys::{CONTENTS_LOG, OWN_LOG, WORKSPACE_LOG, agent_log, host_log};
+use leaderboard_contract::keys::{COLLECT_LOG, CONTENTS_LOG, OWN_LOG, WORKSPACE_LOG, agent_log, host_log};
 use leaderboard_contract::report::Logs;
 use leaderboard_evidence::{Tree, TreeError};
 use leaderboard_protocol::files::{Host, Pair};
@@ -97,6 +97,7 @@ impl Shipper {
                 (OWN_LOG.to_owned(), format!("{run_id}/logcopy")),
                 (WORKSPACE_LOG.to_owned(), format!("{run_id}/workspace")),
                 (CONTENTS_LOG.to_owned(), format!("{run_id}/contents")),
+                (COLLECT_LOG.to_owned(), format!("{run_id}/collect")),
             ])
             .collect();
         let note = tree.read(NOTE, NOTE_LIMIT).ok().flatten();

@@ -4,6 +4,7 @@
 //! Called by `leaderboard-operator workspace`. Knows S3 and the volumes. Everything it does may be done again: the kubelet
 //! restarts it when it fails.
 
+mod input;
 pub mod restore;
 
 use std::collections::BTreeMap;
@@ -22,7 +23,7 @@ use super::places::{Places, Setting};
 use leaderboard_api::names::FAILURE_LOG_KEY;
 use leaderboard_api::{Attempt, Enforcement};
 use leaderboard_aws::archive::{Archive, ArchiveError};
-use leaderboard_contract::keys::host_folder;
+use leaderboard_contract::keys::{INPUT, SUBMISSION_FOLDER, host_folder};
 use leaderboard_contract::report::{MAX_BYTES, OWNER_KEY, Owner, REPORT_KEY, Report};
 use leaderboard_contract::run::{Run, STATUS_FOLDER};
 use leaderboard_contract::verdict::{WorkspaceReason, WorkspaceVerdict};
@@ -36,6 +37,9 @@ const FOLDERS: [&str; 4] = ["agent", STATUS_FOLDER, "logcopy", "contents"];
 const PREPARED: &str = "logcopy/.prepared";
 /// Tries while S3 does not answer, before the kubelet is left to start this again.
 const TRIES: u32 = 6;
+/// Most objects below a prefix that may be the input of a run.
+const INPUT_OBJECTS: usize = 10_001;
+
 /// Verdict on the isolation of a Pod that goes on.
 fn verdict_of(finding: &Finding) -> WorkspaceVerdict {
     let reason = match finding {
@@ -58,6 +62,16 @@ pub enum WorkspaceError {
     /// The plan does not hold.
     #[error(transparent)]
     Plan(#[from] Refused),
+    /// The submitted file of the mode Predictions.
+    #[error(
+        "The submitted file s3://{place} {why}. Put the file of the submission there and resume it, or submit the file again."
+    )]
+    InputMissing {
+        /// Bucket and key.
+        place: String,
+        /// What is there.
+        why: &'static str,
+    },
     /// S3.
     #[error(transparent)]
     Storage(#[from] ArchiveError),
@@ -95,6 +109,7 @@ impl WorkspaceError {
             Self::NotIsolated(Finding::Unmeasured(_)) => WorkspaceReason::NotKnownIsolated,
             Self::NotIsolated(_) => WorkspaceReason::NotIsolated,
             Self::Plan(_) => WorkspaceReason::PlanInvalid,
+            Self::InputMissing { .. } => WorkspaceReason::InputMissing,
             Self::Storage(_) => WorkspaceReason::StorageFailed,
             Self::Volume { .. } | Self::NameFile { .. } | Self::Runner { .. } => WorkspaceReason::VolumeFailed,
         };
@@ -109,10 +124,8 @@ pub async fn main(setting: Setting) -> Result<(), WorkspaceError> {
         Ok(finding) => finding.as_ref().map(verdict_of),
         Err(error) => Some(error.verdict()),
     };
-    if let Some(verdict) = verdict
-        && let Err(error) = fs::write(&setting.places.termination_log, verdict.to_json())
-    {
-        tracing::warn!("the termination log can't be written: {error}");
+    if let Some(verdict) = verdict {
+        setting.places.tell(&verdict);
     }
     result.map(|_| ())
 }
@@ -190,6 +203,7 @@ async fn take(setting: &Setting, archive: &Archive, tree: &Arc<Tree>) -> Result<
             );
         }
     }
+    input::submitted(run, archive, tree).await?;
     let noted = tree.write(PREPARED, setting.pod_uid.as_bytes());
     noted.map_err(|error| WorkspaceError::Volume {
         path: PREPARED.to_owned(),
@@ -220,18 +234,29 @@ async fn claim(run: &Run, archive: &Archive) -> Result<Claim, WorkspaceError> {
     if stored.is_some_and(|report| report.submission_uid == run.uid) {
         return Ok(Claim::TakeUp);
     }
-    // The controller may have taken the fence from a Pod that never came this far, and stored why it failed.
+    // The controller may have taken the fence from a Pod that never came this far, and stored why it failed. A submitted file is there first.
     let controllers = [OWNER_KEY, FAILURE_LOG_KEY];
-    let there = archive.list("", controllers.len().saturating_add(1)).await?.objects;
-    if there.iter().all(|object| controllers.contains(&object.key.as_str())) {
+    let has_input = has_input(run);
+    let inputs = if has_input { INPUT_OBJECTS } else { 0 };
+    let most = controllers.len().saturating_add(inputs);
+    let there = archive.list("", most.saturating_add(1)).await?.objects;
+    let is_ours = |key: &str| controllers.contains(&key) || (has_input && input::is_input(key));
+    if there.len() <= most && there.iter().all(|object| is_ours(&object.key)) {
         return Ok(Claim::Fresh);
     }
-    let plan = &run.plan;
-    let prefix = leaderboard_api::effective::key_prefix(&plan.storage.s3, &plan.run_id);
-    Err(WorkspaceError::PrefixInUse(format!(
-        "{}/{prefix}",
-        plan.storage.s3.bucket
-    )))
+    Err(WorkspaceError::PrefixInUse(place(run, "")))
+}
+
+/// True if the evaluators read what a submission brings.
+fn has_input(run: &Run) -> bool {
+    run.plan.container().is_some_and(|container| container.mode.has_input())
+}
+
+/// Bucket and key of an object, for people.
+fn place(run: &Run, key: &str) -> String {
+    let s3 = &run.plan.storage.s3;
+    let prefix = leaderboard_api::effective::key_prefix(s3, &run.plan.run_id);
+    format!("{}/{prefix}{key}", s3.bucket)
 }
 
 /// The report of a run in which no container has started. It names no stored files.
@@ -266,7 +291,9 @@ fn folders(setting: &Setting) -> Result<Arc<Tree>, WorkspaceError> {
     let tree = Tree::open(&setting.places.logs).map_err(|error| volume("/", error.into()))?;
     let (plan, host) = (&setting.run.plan, of_plan(&setting.run.plan).host());
     let of_hosts = Pair::first(plan.workers()).map(|worker| host_folder(host, worker));
-    for folder in FOLDERS.map(str::to_owned).into_iter().chain(of_hosts) {
+    let of_input = [SUBMISSION_FOLDER, INPUT.trim_end_matches('/')].map(str::to_owned);
+    let of_input = of_input.into_iter().filter(|_| has_input(&setting.run));
+    for folder in FOLDERS.map(str::to_owned).into_iter().chain(of_hosts).chain(of_input) {
         tree.folder(&folder).map_err(|error| volume(&folder, error))?;
     }
     Ok(Arc::new(tree))
@@ -276,6 +303,7 @@ fn folders(setting: &Setting) -> Result<Arc<Tree>, WorkspaceError> {
 mod tests {
     use super::*;
     use crate::isolation::Blocked;
+    use leaderboard_api::{EvaluationMode, PlannedEvaluation};
     use leaderboard_contract::report::RefusedResults;
     use leaderboard_contract::verdict::{NotAVerdict, VERDICT_BYTES};
     use leaderboard_evaluation::fixtures;
@@ -339,11 +367,15 @@ mod tests {
         }
     }
 
-    #[test]
-    fn each_evaluator_finds_a_folder_that_any_user_may_write() {
+    /// The volume of a run of evaluators, with its folders.
+    fn prepared(mode: EvaluationMode) -> (tempfile::TempDir, Arc<Tree>) {
         let root = tempfile::tempdir().unwrap();
+        let mut run = fixtures::container_run();
+        if let PlannedEvaluation::Container(plan) = &mut run.plan.evaluation {
+            plan.mode = mode;
+        }
         let setting = Setting {
-            run: fixtures::container_run(),
+            run,
             pod_uid: "pod-1".to_owned(),
             api_server: None,
             role_arn: None,
@@ -352,11 +384,30 @@ mod tests {
         };
         fs::create_dir(&setting.places.logs).unwrap();
         let made = folders(&setting).unwrap();
+        (root, made)
+    }
+
+    #[test]
+    fn each_evaluator_finds_a_folder_that_any_user_may_write() {
+        let (_root, made) = prepared(EvaluationMode::Interactive);
         for folder in ["agent", "evaluators/1", "evaluators/2"] {
             let mode = fs::metadata(made.path().join(folder)).unwrap().permissions().mode();
             assert_eq!(mode & 0o777, 0o777, "{folder}");
         }
-        assert!(!made.path().join("evaluators/3").exists() && !made.path().join("simulator").exists());
+        for other in ["evaluators/3", "simulator", "submission", "input"] {
+            assert!(!made.path().join(other).exists(), "{other}");
+        }
+    }
+
+    #[test]
+    fn an_agent_of_any_user_may_leave_files() {
+        let (_root, made) = prepared(EvaluationMode::Batch);
+        let mode = fs::metadata(made.path().join("submission"))
+            .unwrap()
+            .permissions()
+            .mode();
+        assert_eq!(mode & 0o777, 0o777);
+        assert!(made.path().join("input").is_dir());
     }
 
     #[test]

@@ -9,7 +9,9 @@ use std::fmt;
 use super::Decision;
 use crate::daily::Spent;
 use leaderboard_aws::archive::PART;
-use leaderboard_contract::keys::{AGENTS, EVALAI, EVALUATORS, REFUSED, RESULT_FILE, SIMULATORS, known_logs};
+use leaderboard_contract::keys::{
+    AGENTS, COLLECTED, EVALAI, EVALUATORS, INPUT, REFUSED, RESULT_FILE, SIMULATORS, known_logs,
+};
 use leaderboard_contract::run::STATUS_FOLDER;
 use leaderboard_protocol::files::{Host, Pair};
 
@@ -29,6 +31,8 @@ pub enum Kind {
     Result,
     /// A known log; see [`known_logs`].
     Log,
+    /// What the evaluators read, and its list: bounded where it is copied, and sent once.
+    Input,
     /// Another file of the host's containers or of logcopy.
     Host,
     /// Another file of an agent, or its refused checkpoint.
@@ -113,6 +117,9 @@ impl Quota {
         if self.logs.contains(key) {
             return Kind::Log;
         }
+        if key.starts_with(INPUT) || key == COLLECTED {
+            return Kind::Input;
+        }
         let is_result = key.starts_with(EVALAI)
             || key
                 .strip_prefix(STATUS_FOLDER)
@@ -134,6 +141,7 @@ impl Quota {
     pub fn purse<'a>(&self, key: &'a str) -> (&'a str, Spent) {
         match self.kind(key) {
             Kind::Result | Kind::Log => (key, self.log_a_day),
+            Kind::Input => ("input", Spent::ENDLESS),
             Kind::Host => ("hosts", self.files_a_day),
             Kind::Agent => ("agents", self.files_a_day),
         }
@@ -168,10 +176,10 @@ impl Quota {
     /// Bytes of a key that count against what is common.
     fn weight(&self, kind: Kind, size: u64) -> u64 {
         let counted = size.max(LEAST);
-        if kind == Kind::Log {
-            counted.saturating_sub(self.log_share())
-        } else {
-            counted
+        match kind {
+            Kind::Log => counted.saturating_sub(self.log_share()),
+            Kind::Input => 0,
+            Kind::Result | Kind::Host | Kind::Agent => counted,
         }
     }
 }
@@ -224,7 +232,7 @@ impl Ledger<'_> {
         let kind = quota.kind(key);
         let weight = quota.weight(kind, size);
         let weight_before = before.map_or(0, |before| quota.weight(kind, before));
-        if kind == Kind::Result || (before.is_some() && weight <= weight_before) {
+        if matches!(kind, Kind::Result | Kind::Input) || (before.is_some() && weight <= weight_before) {
             return Ok(size);
         }
         let room = |limit: u64, used: u64| limit.saturating_sub(used.saturating_sub(weight_before));
@@ -324,6 +332,10 @@ mod tests {
             ("agent/agent1/leaderboard.log.1", Kind::Agent),
             ("logcopy/refused/agent/agent1/agent_results.json", Kind::Agent),
             ("containers-status-x/y", Kind::Agent),
+            ("input/a/agent_results.json", Kind::Input),
+            ("logcopy/collected.json", Kind::Input),
+            ("inputs/a", Kind::Agent),
+            ("submission/a", Kind::Agent),
         ];
         for (key, kind) in table {
             assert_eq!(quota().kind(key), kind, "{key}");
@@ -408,6 +420,19 @@ mod tests {
         }
         assert_eq!(ledger.admit("simulator/one-more", None, 0), Err(Limit::Objects(15_500)));
         assert_eq!(ledger.admit("simulator/console-16.log", None, 7), Ok(7));
+    }
+
+    #[test]
+    fn what_the_evaluators_read_takes_nothing_of_the_limits() {
+        let quota = quota();
+        let mut ledger = quota.ledger([("agent/agent1/a", 50 * MIB), ("simulator/a", 25 * MIB)].into_iter());
+        assert_eq!(ledger.admit("input/a", None, 1 << 40), Ok(1 << 40), "all is full");
+        ledger.take("input/a", None, 1 << 40);
+        assert_eq!(ledger.admit("agent/agent1/a", Some(50 * MIB), MIB), Ok(MIB));
+        ledger.take("agent/agent1/a", Some(50 * MIB), MIB);
+        assert_eq!(ledger.admit("agent/agent1/b", None, 49 * MIB), Ok(49 * MIB));
+        let whole = cost(Decision::PutWhole, 100 << 30);
+        assert!(whole.fits(quota.purse("input/a").1), "on one day");
     }
 
     #[test]

@@ -1,13 +1,15 @@
-//! Which files there are to store: those of the workers' folders, as far as they are looked at, and the known logs in any case. Reads
-//! names and stamps only.
+//! Which files there are to store: those of the workers' folders, as far as they are looked at, what the evaluators read once it is listed, and
+//! the known logs in any case. Reads names and stamps only.
 
 use std::collections::BTreeMap;
 use std::collections::hash_map::DefaultHasher;
 use std::hash::{Hash, Hasher};
 
 use super::Haste;
+use crate::collect;
 use leaderboard_contract::keys::{
-    AGENTS, EVALUATORS, REFUSED, SIMULATORS, agent_folder, host_folder, known_logs, results_path,
+    AGENTS, COLLECTED, EVALUATORS, INPUT, REFUSED, SIMULATORS, SUBMISSION_FOLDER, agent_folder, host_folder,
+    known_logs, results_path,
 };
 use leaderboard_evaluation::judge::Ending;
 use leaderboard_evidence::{Stamp, Tree};
@@ -82,16 +84,17 @@ impl Files {
             .below(&[AGENTS, EVALUATORS])
             .for_each(|file| file.hash(&mut activity));
         found.activity = activity.finish();
-        let bytes = |folder| {
-            found
-                .below(&[folder])
-                .map(|(_, stamp)| stamp.size)
-                .fold(0, u64::saturating_add)
-        };
+        let bytes = |folder| bytes_of(found.below(&[folder]));
         // A file with holes counts whole: an agent that makes one speaks against itself alone.
-        let agents = bytes(AGENTS);
+        let left = tree.walk(SUBMISSION_FOLDER, collect::ENTRIES);
+        let agents = bytes(AGENTS).saturating_add(bytes_of(left.files.iter()));
         let is_most = agents > bytes(SIMULATORS).max(bytes(EVALUATORS));
         found.agents_fill_disk = agents >= FILLING && is_most;
+        // Without the list they are not all there. A submitted file has none: it is in the bucket.
+        if let Ok(Some((_, stamp))) = tree.file(COLLECTED) {
+            found.walk(tree, INPUT.trim_end_matches('/'), collect::ENTRIES);
+            found.files.insert(COLLECTED.to_owned(), stamp);
+        }
         found
     }
 
@@ -126,6 +129,10 @@ impl Files {
         });
         wanted.collect()
     }
+}
+
+fn bytes_of<'a>(files: impl Iterator<Item = (&'a String, &'a Stamp)>) -> u64 {
+    files.map(|(_, stamp)| stamp.size).fold(0, u64::saturating_add)
 }
 
 #[cfg(test)]
@@ -214,6 +221,29 @@ mod tests {
                 !holds(FILLING - 1, 0, host) && !holds(FILLING, FILLING, host) && !holds(FILLING, 2 * FILLING, host)
             );
         }
+    }
+
+    #[test]
+    fn what_an_agent_leaves_fills_the_volume_as_its_own_and_is_stored_only_as_it_is_listed() {
+        let dir = tempfile::tempdir().unwrap();
+        for (path, size) in [("submission/a", FILLING), ("input/a", 5), ("evaluators/1/saved", 9)] {
+            let path = dir.path().join(path);
+            fs::create_dir_all(path.parent().unwrap()).unwrap();
+            fs::File::create(path).unwrap().set_len(size).unwrap();
+        }
+        let tree = Tree::open(dir.path()).unwrap();
+        let found = || Files::find(&tree, 1, Host::Evaluator);
+        let keys = |found: &Files| -> Vec<String> {
+            let wanted = found.wanted(&[None], Host::Evaluator);
+            wanted.into_iter().map(|wanted| wanted.key).collect()
+        };
+        let before = found();
+        assert!(before.agents_fill_disk);
+        assert_eq!(keys(&before), ["evaluators/1/saved"]);
+        fs::create_dir(dir.path().join("logcopy")).unwrap();
+        fs::write(dir.path().join(COLLECTED), "{}").unwrap();
+        assert_eq!(keys(&found()), ["evaluators/1/saved", "input/a", COLLECTED]);
+        assert_eq!(found().activity, before.activity);
     }
 
     #[test]

@@ -11,7 +11,7 @@ use std::sync::Arc;
 
 use futures::{StreamExt, TryStreamExt};
 
-use super::WorkspaceError;
+use super::{WorkspaceError, input};
 use crate::blocking;
 use crate::daily::Daily;
 use crate::upload::quota::{LEAST, Quota};
@@ -28,7 +28,7 @@ use leaderboard_protocol::files::Pair;
 /// Most objects of a run.
 const MAX_OBJECTS: usize = 100_000;
 /// Downloads at once.
-const AT_ONCE: usize = 4;
+pub(super) const AT_ONCE: usize = 4;
 
 /// Restored files.
 #[derive(Clone, Copy, Debug, Default, PartialEq, Eq)]
@@ -49,17 +49,18 @@ pub async fn restore(
     tree: &Arc<Tree>,
 ) -> Result<Restored, WorkspaceError> {
     let statuses = archive.list(&format!("{STATUS_FOLDER}/"), MAX_OBJECTS).await?;
-    let keys: Vec<String> = statuses.objects.into_iter().map(|object| object.key).collect();
-    archive.delete(&keys).await?;
+    remove(archive, statuses.objects).await?;
 
     let listing = archive.list("", MAX_OBJECTS).await?;
     if !listing.complete {
         tracing::warn!("the prefix holds more than {MAX_OBJECTS} objects; the rest is not restored");
     }
+    let mut objects = listing.objects;
+    let input = input::take(run, archive, tree, &mut objects).await?;
     let limit = run.plan.storage.s3.size_limit.bytes();
     let workers = run.plan.workers();
     let quota = Quota::new(limit, workers, of_plan(&run.plan).host());
-    let chosen = choose(listing.objects, &quota, workers);
+    let chosen = choose(objects, &quota, workers);
     let others = chosen.unknown();
     let of_workers = chosen.of_workers.len();
     for object in chosen.of_workers {
@@ -84,6 +85,7 @@ pub async fn restore(
     };
     // An object that is not restored stays stored all the same, and counts.
     memory.stored.extend(others);
+    memory.stored.extend(input);
     memory.save(tree).map_err(|error| volume("logcopy", error))?;
     if restored.left_out > 0 {
         tracing::warn!(
@@ -92,6 +94,16 @@ pub async fn restore(
         );
     }
     Ok(restored)
+}
+
+pub(super) async fn remove(archive: &Archive, objects: Vec<Listed>) -> Result<(), WorkspaceError> {
+    let keys: Vec<String> = objects.into_iter().map(|object| object.key).collect();
+    Ok(archive.delete(&keys).await?)
+}
+
+/// Objects whose content is not known.
+pub(super) fn unknown<'a>(objects: impl Iterator<Item = &'a Listed>) -> impl Iterator<Item = (String, Stored)> {
+    objects.map(|one| (one.key.clone(), Stored::unknown(one.size)))
 }
 
 #[derive(Debug, PartialEq, Eq)]
@@ -106,10 +118,9 @@ struct Chosen {
 }
 
 impl Chosen {
-    /// Objects that are not restored as they are: their content is not known.
+    /// Objects that are not restored as they are.
     fn unknown(&self) -> Vec<(String, Stored)> {
-        let all = self.others.iter().chain(&self.of_workers);
-        all.map(|one| (one.key.clone(), Stored::unknown(one.size))).collect()
+        unknown(self.others.iter().chain(&self.of_workers)).collect()
     }
 }
 
@@ -120,7 +131,6 @@ fn choose(objects: Vec<Listed>, quota: &Quota, pairs: usize) -> Chosen {
     // With another number of evaluators each had another share, and the run begins anew. Each has a log.
     let evaluators = objects.iter().filter_map(|object| evaluator_of(&object.key)).max();
     let are_ours = evaluators == Pair::first(pairs).last();
-    let is_evaluators = |key: &str| key.starts_with(EVALUATORS);
     let (mut objects, mut others): (Vec<_>, Vec<_>) = objects
         .into_iter()
         .filter(|object| !not_counted.contains(&object.key.as_str()))
@@ -183,6 +193,10 @@ fn log_of_worker(key: &str) -> Option<Pair> {
         .then(|| worker.parse().ok())?
 }
 
+pub(super) fn is_evaluators(key: &str) -> bool {
+    key.starts_with(EVALUATORS)
+}
+
 /// The number of the evaluator whose file a key is.
 fn evaluator_of(key: &str) -> Option<Pair> {
     key.strip_prefix(EVALUATORS)?.split_once('/')?.0.parse().ok()
@@ -225,7 +239,7 @@ async fn download_all(
     downloads.buffer_unordered(AT_ONCE).try_collect().await
 }
 
-async fn download(
+pub(super) async fn download(
     archive: &Archive,
     tree: &Arc<Tree>,
     object: Listed,
@@ -265,7 +279,7 @@ fn fingerprint_of(tree: &Tree, path: &str) -> Result<Option<(String, Stamp)>, Tr
     Ok(Some((fingerprint(&file, stamp.size)?, stamp)))
 }
 
-fn volume(path: &str, error: TreeError) -> WorkspaceError {
+pub(super) fn volume(path: &str, error: TreeError) -> WorkspaceError {
     WorkspaceError::Volume {
         path: path.to_owned(),
         error,

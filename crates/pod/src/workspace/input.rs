@@ -1,0 +1,167 @@
+//! Brings what the evaluators read at `/input`: the submitted file of the mode Predictions, or the files that `collect` of an earlier Pod
+//! has copied.
+//!
+//! Called by `workspace`. A file counts only with exactly the size and the digest that it has to have.
+
+use std::collections::BTreeMap;
+use std::sync::Arc;
+
+use futures::{StreamExt, TryStreamExt};
+
+use super::restore::{AT_ONCE, download, is_evaluators, remove, unknown, volume};
+use super::{WorkspaceError, place};
+use crate::blocking;
+use crate::collect::{bounds, digest_of, usable};
+use crate::upload::Stored;
+use leaderboard_api::Agents;
+use leaderboard_aws::archive::{Archive, Listed};
+use leaderboard_contract::collected::{Collected, MAX_BYTES};
+use leaderboard_contract::keys::{COLLECTED, INPUT, INPUT_FILE};
+use leaderboard_contract::report::StoredFile;
+use leaderboard_contract::run::{Run, STATUS_FOLDER};
+use leaderboard_evidence::{Tree, TreeError};
+use leaderboard_protocol::files::{Mark, Pair, StatusFile};
+
+/// True for the key of what evaluators read, or of its list.
+pub(super) fn is_input(key: &str) -> bool {
+    key.starts_with(INPUT) || key == COLLECTED
+}
+
+/// Brings the submitted file of the mode Predictions, which is in the bucket before the Pod is.
+pub(super) async fn submitted(run: &Run, archive: &Archive, tree: &Arc<Tree>) -> Result<(), WorkspaceError> {
+    if run.plan.agents() != Agents::Absent {
+        return Ok(());
+    }
+    let missing = |why| {
+        let place = place(run, INPUT_FILE);
+        Err(WorkspaceError::InputMissing { place, why })
+    };
+    let Some(file) = &run.input else {
+        return missing("is not named by the submission's status");
+    };
+    let file = StoredFile {
+        size: u64::try_from(file.size).unwrap_or(0),
+        sha256: file.sha256.clone(),
+    };
+    let listing = archive.list(INPUT_FILE, 1).await?;
+    let Some(object) = listing.objects.into_iter().find(|object| object.key == INPUT_FILE) else {
+        return missing("is not there");
+    };
+    match fetch(archive, tree, object, file).await? {
+        Some(_) => Ok(()),
+        None => missing("has another size or SHA-256 than the one that was submitted"),
+    }
+}
+
+/// Takes what evaluators read out of the stored objects, and brings it in the mode Batch. Returns what is stored of it.
+pub(super) async fn take(
+    run: &Run,
+    archive: &Archive,
+    tree: &Arc<Tree>,
+    objects: &mut Vec<Listed>,
+) -> Result<BTreeMap<String, Stored>, WorkspaceError> {
+    let input: Vec<Listed> = objects.extract_if(.., |object| is_input(&object.key)).collect();
+    let mut stored: BTreeMap<String, Stored> = unknown(input.iter()).collect();
+    if run.plan.agents() == Agents::First {
+        if let Some(brought) = collected(run, archive, tree, &input).await? {
+            stored.extend(brought);
+        } else {
+            // The agent runs anew. What the evaluators have made of its files before does not go with the files that it leaves now.
+            let others = objects.extract_if(.., |object| is_evaluators(&object.key)).collect();
+            remove(archive, others).await?;
+        }
+    }
+    Ok(stored)
+}
+
+/// Brings the files that `collect` of an earlier Pod has copied, if each of them is stored; the agent is done then. `None` if not, and
+/// nothing is left of them.
+async fn collected(
+    run: &Run,
+    archive: &Archive,
+    tree: &Arc<Tree>,
+    stored: &[Listed],
+) -> Result<Option<Vec<(String, Stored)>>, WorkspaceError> {
+    let folder = INPUT.trim_end_matches('/');
+    tree.clear(folder).map_err(|error| volume(folder, error))?;
+    let Some(wanted) = listed(run, archive, stored).await? else {
+        return Ok(None);
+    };
+    let fetched = futures::stream::iter(wanted.files)
+        .map(|(object, file)| fetch(archive, tree, object, file))
+        .buffer_unordered(AT_ONCE);
+    let fetched: Vec<Option<(String, Stored)>> = fetched.try_collect().await?;
+    let Some(fetched) = fetched.into_iter().collect::<Option<Vec<_>>>() else {
+        tracing::warn!("a stored file of the agent's is another one than {COLLECTED} names; the agent runs anew");
+        tree.clear(folder).map_err(|error| volume(folder, error))?;
+        return Ok(None);
+    };
+    tree.write(COLLECTED, &wanted.list.to_json())
+        .map_err(|error| volume(COLLECTED, error))?;
+    end_agent(tree)?;
+    Ok(Some(fetched))
+}
+
+/// Files of a list, each with its object.
+struct Wanted {
+    list: Collected,
+    files: Vec<(Listed, StoredFile)>,
+}
+
+/// The stored list and its files; `None` unless the run can use it and each file is there by its size.
+async fn listed(run: &Run, archive: &Archive, stored: &[Listed]) -> Result<Option<Wanted>, WorkspaceError> {
+    let by_key: BTreeMap<&str, &Listed> = stored.iter().map(|object| (object.key.as_str(), object)).collect();
+    let is_readable = by_key.get(COLLECTED).is_some_and(|object| object.size <= MAX_BYTES);
+    if !is_readable {
+        return Ok(None);
+    }
+    let object = archive.get(COLLECTED, MAX_BYTES).await?;
+    let Some(list) = object.and_then(|object| usable(&object.bytes, &bounds(run))) else {
+        tracing::warn!("{COLLECTED} can't be used; the agent runs anew");
+        return Ok(None);
+    };
+    let files = list.files.iter().map(|(path, file)| {
+        let object = by_key.get(format!("{INPUT}{path}").as_str())?;
+        (object.size == file.size).then(|| ((*object).clone(), file.clone()))
+    });
+    let files: Option<Vec<(Listed, StoredFile)>> = files.collect();
+    if files.is_none() {
+        tracing::info!("not all files of {COLLECTED} are stored; the agent runs anew");
+    }
+    Ok(files.map(|files| Wanted { list, files }))
+}
+
+/// Downloads a file. `None` if it is not the one with this size and digest.
+async fn fetch(
+    archive: &Archive,
+    tree: &Arc<Tree>,
+    object: Listed,
+    file: StoredFile,
+) -> Result<Option<(String, Stored)>, WorkspaceError> {
+    if object.size != file.size {
+        return Ok(None);
+    }
+    let path = object.key.clone();
+    let stored = match download(archive, tree, object, &path).await {
+        // Another one has taken its place since it was listed.
+        Err(WorkspaceError::Storage(error)) if error.is_too_large() => return Ok(None),
+        stored => stored?,
+    };
+    let (reading, key) = (Arc::clone(tree), path.clone());
+    let found = blocking(move || digest_of(&reading, &key)).await;
+    let found = found.map_err(TreeError::from).flatten();
+    let is_it = found.map_err(|error| volume(&path, error))? == Some(file);
+    Ok(stored.filter(|_| is_it))
+}
+
+/// Marks the one agent as done, so that it does not run again.
+fn end_agent(tree: &Tree) -> Result<(), WorkspaceError> {
+    for agent in Pair::first(1).map(Pair::agent) {
+        let folder = format!("{STATUS_FOLDER}/{agent}");
+        // Its own runner writes there, too.
+        tree.folder(&folder).map_err(|error| volume(&folder, error))?;
+        let done = StatusFile::Of(agent, Mark::Done).create(&tree.path().join(STATUS_FOLDER));
+        done.map_err(|error| volume(&folder, error.into()))?;
+    }
+    Ok(())
+}
