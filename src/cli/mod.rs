@@ -50,6 +50,9 @@ enum Command {
     /// Merge, upload and report the results of a submission's Pod (a sidecar).
     #[command(after_help = serve::POD_EXIT_CODES)]
     Logcopy(InPod),
+    /// Copy what the agent has left for the evaluators of a submission's Pod (an init container).
+    #[command(after_help = serve::POD_EXIT_CODES)]
+    Collect(InPod),
     /// Print the custom resource definitions.
     Crd,
     /// Merge and render the checkpoint files of a CARLA run without a cluster; no other kind of evaluation has such files.
@@ -63,7 +66,7 @@ impl Command {
     fn asks_aws(&self) -> bool {
         match self {
             Self::Controller(_) | Self::Bridge(_) | Self::Workspace(_) | Self::Logcopy(_) => true,
-            Self::Preflight(_) | Self::Crd | Self::Results(_) | Self::Labels(_) => false,
+            Self::Collect(_) | Self::Preflight(_) | Self::Crd | Self::Results(_) | Self::Labels(_) => false,
         }
     }
 }
@@ -89,7 +92,7 @@ struct Server {
 struct Controller {
     #[command(flatten)]
     server: Server,
-    /// The operator's own image, used in Pods for workspace and logcopy.
+    /// The operator's own image, used in Pods for workspace, logcopy and collect.
     #[arg(long, env = "LEADERBOARD_IMAGE")]
     image: String,
     /// Pull policy of that image in Pods.
@@ -174,6 +177,7 @@ pub fn run() -> ExitCode {
         Command::Preflight(options) => options.run(),
         Command::Workspace(options) => serve::workspace(&options),
         Command::Logcopy(options) => serve::logcopy(&options),
+        Command::Collect(options) => serve::collect(&options),
     }
 }
 

@@ -1,4 +1,4 @@
-//! Subcommands that stay: `controller`, `bridge`, and the two programs of a Pod. Sets up logging, TLS, clients and the
+//! Subcommands that stay: `controller`, `bridge`, and the programs of a Pod. Sets up logging, TLS, clients and the
 //! stop signal, then runs the program's module.
 
 use std::future::Future;
@@ -28,8 +28,8 @@ use leaderboard_aws::clients::Aws;
 use leaderboard_base::shutdown::on_signals;
 use leaderboard_contract::run::ENV_CHECKSUMS;
 use leaderboard_evaluation::judge::Pace;
-use leaderboard_pod::places::{Places, Setting};
-use leaderboard_pod::{logcopy as logcopy_program, ownlog, workspace as workspace_program};
+use leaderboard_pod::places::{self, Places, Setting};
+use leaderboard_pod::{collect as collect_program, logcopy as logcopy_program, ownlog, workspace as workspace_program};
 use leaderboard_pod_spec::job::OwnImage;
 
 /// Exit codes of controller and bridge, for their help.
@@ -74,6 +74,21 @@ pub(super) fn logcopy(options: &InPod) -> ExitCode {
         Box::pin(logcopy_program::main(setting, async move { stop.wait().await }))
             .await
             .map_err(|e| e.to_string())
+    })
+}
+
+pub(super) fn collect(options: &InPod) -> ExitCode {
+    let places = Places::below(&options.root);
+    ownlog::start(&places.logs, leaderboard_contract::keys::COLLECT_LOG);
+    start_logged("collect", THREADS, || async {
+        let run = places::run().map_err(|e| e.to_string())?;
+        let stop = on_signals().map_err(|e| e.to_string())?;
+        tokio::select! {
+            biased;
+            copied = collect_program::main(run, places) => copied.map_err(|e| e.to_string()),
+            // The first process of a container ignores a signal that it does not ask for.
+            () = stop.wait() => Err("it was asked to end before all files were copied".to_owned()),
+        }
     })
 }
 
