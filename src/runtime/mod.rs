@@ -264,7 +264,7 @@ impl Parts {
             settings: self.settings.clone(),
             stores: self.watches.stores(),
             memory: Memory::default(),
-            workers: Workers::start(aws, tables, client, tasks, answered),
+            workers: Workers::start(aws, tables, &external.hub, client, tasks, answered),
             causes: self.causes(queues),
             slots: Arc::new(Slots::new(self.watches.stores(), turned)),
             leaderboards: LeaderboardState::default(),

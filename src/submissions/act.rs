@@ -166,13 +166,15 @@ impl Actor<'_> {
 
     fn ask(&self, question: Question, status: &SubmissionStatus) {
         let (uses, workers, submission) = (self.uses, self.uses.workers, self.submission());
+        let (key, log) = (key_of(submission), log_span_of(submission));
         match question {
-            Question::Row(row) => workers.rows.want(&key_of(submission), *row, log_span_of(submission)),
+            Question::Row(row) => workers.rows.want(&key, *row, log),
+            Question::Input(input) => workers.inputs.want(&key, *input, log),
             Question::Evalai => {
                 uses.memory.asks_evalai(submission);
                 uses.external.ask(self.view);
             }
-            Question::EvalaiAnew => uses.external.hub.forget(&key_of(submission)),
+            Question::EvalaiAnew => uses.external.hub.forget(&key),
             Question::EvalaisEnd => uses.external.follow(self.view, status),
         }
     }

@@ -80,10 +80,11 @@ impl ExternalSystems {
             });
         };
         let observes = leaderboard.is_some_and(|board| board.spec.observes());
+        let wants_image = wants_image(submission, leaderboard);
         Some(EvalaiView {
             writes_from,
             shows_partial: leaderboard.is_some_and(|board| self.hub.shows_partial(&key_of(board), evalai.phase)),
-            ..map_view(&as_observed(seen, observes), submission)
+            ..map_view(&as_observed(seen, observes), submission, wants_image)
         })
     }
 
@@ -104,7 +105,7 @@ impl ExternalSystems {
     /// Asks EvalAI whether a submission wants to run, or what became of one that has ended.
     pub fn ask(&self, view: &View) {
         let Some(subject) = self.subject(view) else { return };
-        let wants_image = wants_image(&view.submission);
+        let wants_image = wants_image(&view.submission, view.leaderboard.as_deref());
         let asked = self.hub.ask(&subject, wants_image);
         log_refused(asked);
     }
@@ -199,11 +200,13 @@ fn final_update(workers: &Workers, view: &View, status: &SubmissionStatus, outco
     DesiredUpdate::Final(outcome, Arc::new(outline))
 }
 
-/// True if a submission names no image and has not ended, so that it needs the image that EvalAI names.
-fn wants_image(submission: &Submission) -> bool {
+/// True if a submission names no image and has not ended, so that it needs the image that EvalAI names. A Leaderboard of files needs none.
+fn wants_image(submission: &Submission, leaderboard: Option<&Leaderboard>) -> bool {
     let status = submission.status.as_ref();
     let has_ended = status.is_some_and(SubmissionStatus::has_ended);
-    submission.spec.image.is_none() && !has_ended
+    let evaluation = leaderboard.and_then(|board| board.spec.evaluation.container());
+    let takes_images = evaluation.is_none_or(|evaluation| evaluation.mode.has_agent());
+    takes_images && submission.spec.image.is_none() && !has_ended
 }
 
 /// In Observe mode only a cancel in EvalAI ends our run; `finished` and `failed` are the other program's.
@@ -215,10 +218,10 @@ fn as_observed(seen: SubmissionState, observes: bool) -> SubmissionState {
     }
 }
 
-fn map_view(seen: &SubmissionState, submission: &Submission) -> EvalaiView {
+fn map_view(seen: &SubmissionState, submission: &Submission, wants_image: bool) -> EvalaiView {
     let attempt = submission.present_attempt();
     // An image that was asked for is waited for; why there is none is an answer too.
-    let image_known = !wants_image(submission) || seen.image.is_some();
+    let image_known = !wants_image || seen.image.is_some();
     let present = seen.attempt == attempt;
     let ended = seen.ended.filter(|_| present);
     let answered = seen.answered >= Some(attempt);

@@ -113,6 +113,7 @@ pub async fn surroundings(cluster: Cluster, endpoint: &str) -> Surroundings {
     let stores = stores(cluster);
     let (turning, _) = mpsc::unbounded_channel();
     let tables = Arc::new(Tables::new(aws.clone()));
+    let external = external(Arc::clone(&tables), &tasks);
     let context = Context {
         clock: Clock::system(),
         writer: Writer::new(client.clone(), || true),
@@ -120,13 +121,13 @@ pub async fn surroundings(cluster: Cluster, endpoint: &str) -> Surroundings {
         slots: Arc::new(Slots::new(stores.clone(), noting(&turning))),
         stores,
         memory: Memory::default(),
-        workers: Workers::start(&aws, Arc::clone(&tables), &client, &tasks, || noting(&answering)),
+        workers: Workers::start(&aws, tables, &external.hub, &client, &tasks, || noting(&answering)),
         causes: Causes::default(),
         leaderboards: LeaderboardState::default(),
         asks: Asks::start(&client, &aws, &settings(), &tasks, || {
             by_key(noting::<Leaderboard>(&waking))
         }),
-        external: external(tables, &tasks),
+        external,
         recorder: EventRecorder::new(client.clone(), Reporter::from("test")),
         metrics: Arc::default(),
         traces: Traces::default(),

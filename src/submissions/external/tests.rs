@@ -230,7 +230,7 @@ fn an_attempt_that_is_asked_for_early_is_not_the_one_that_runs() {
         ended: Some(Status::Cancelled),
         ..SubmissionState::default()
     };
-    assert!(map_view(&ended_in_evalai, &submission).cancelled);
+    assert!(map_view(&ended_in_evalai, &submission, false).cancelled);
     submission.status = None;
     assert_eq!(run_of(&submission).attempt, Attempt(2));
 }
@@ -249,7 +249,7 @@ fn an_end_that_evalai_showed_already_is_published_at_one_moment_whatever_is_read
             read_at: Timestamp::from_second(seconds).ok(),
             ..SubmissionState::default()
         };
-        map_view(&seen, &submission).end
+        map_view(&seen, &submission, false).end
     };
     for seconds in [0, 10] {
         assert_eq!(end_after(seconds), Some(EvalaiEnd::Published { at }));
@@ -264,4 +264,37 @@ fn what_had_finished_in_evalai_before_is_its_own_end() {
     let kept = EvalaiEnd::Ended(Status::Finished);
     assert_eq!(of(agreed(Status::Finished)), kept);
     assert_eq!(of(agreed(Status::Cancelled)), EvalaiEnd::Published { at });
+}
+
+#[test]
+fn the_image_of_an_uploaded_file_is_asked_for_where_images_are_submitted() {
+    let (mut submission, _) = with_job("sub", &leaderboard("one", "http://s3"));
+    submission.spec.image = None;
+    let of_mode = |mode: &str| {
+        let mut board = leaderboard("one", "http://s3");
+        let evaluation = json!({"container": {"mode": mode, "image": "e", "command": ["/e"]}});
+        board.spec.evaluation = serde_json::from_value(evaluation).unwrap();
+        board
+    };
+    let carla = leaderboard("one", "http://s3");
+    assert!(wants_image(&submission, Some(&carla)));
+    for (mode, expected) in [("Interactive", true), ("Batch", true), ("Predictions", false)] {
+        assert_eq!(wants_image(&submission, Some(&of_mode(mode))), expected, "{mode}");
+    }
+    submission.spec.image = Some("team/agent:1".into());
+    assert!(!wants_image(&submission, Some(&of_mode("Batch"))));
+}
+
+#[test]
+fn a_row_is_an_answer_without_the_image_that_nobody_asked_for() {
+    let (submission, _) = with_job("sub", &leaderboard("one", "http://s3"));
+    let row: evalai::Row = serde_json::from_value(json!({"id": 7, "status": "submitted"})).unwrap();
+    let seen = SubmissionState {
+        attempt: Attempt(1),
+        answered: Some(Attempt(1)),
+        row: Some(Arc::new(row)),
+        ..SubmissionState::default()
+    };
+    let is_known = |wants_image| map_view(&seen, &submission, wants_image).info.is_some();
+    assert_eq!((is_known(false), is_known(true)), (true, false));
 }

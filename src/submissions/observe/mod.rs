@@ -55,6 +55,7 @@ pub fn observe(uses: Uses<'_>, submission: Arc<Submission>, is_policy_in_place: 
         is_policy_in_place: may_create(&job) && leaderboard.as_deref().is_some_and(is_policy_in_place),
         not_allowed: leaderboard.as_deref().and_then(|board| uses.external.refusal(board)),
         row: workers.rows.get(key),
+        input: workers.inputs.get(key),
         turn: uses.slots.turn(&submission, leaderboard.as_deref()),
         node: node(uses, pod.as_ref()),
         report: reports::seen(&workers.reports.get(key), number, pod_uid),

@@ -9,13 +9,15 @@ use crate::ask::Asker;
 use crate::runtime::objects::{Wake, by_key, key_of, log_span_of, uid};
 use crate::submissions::failure_log::{self, FailureLog, Tail};
 use crate::submissions::fences::{self, Fence};
+use crate::submissions::inputs;
 use crate::submissions::reports::{self, Report, RunFiles};
 use crate::submissions::rows;
 use leaderboard_api::{Submission, SubmissionStatus};
 use leaderboard_aws::clients::Aws;
 use leaderboard_aws::table::Tables;
 use leaderboard_base::tasks::Tasks;
-use leaderboard_policy::questions::Row;
+use leaderboard_evalai::Hub;
+use leaderboard_policy::questions::{Input, Row};
 use leaderboard_policy::view::{LogPlace, ReportDemand};
 
 /// Asks them, and has what was answered.
@@ -24,6 +26,7 @@ pub struct Workers {
     pub fences: Asker<Fence>,
     pub logs: Asker<FailureLog>,
     pub rows: Asker<Row>,
+    pub inputs: Asker<Input>,
 }
 
 impl Workers {
@@ -31,6 +34,7 @@ impl Workers {
     pub fn start(
         aws: &Aws,
         tables: Arc<Tables>,
+        hub: &Hub,
         client: &Client,
         tasks: &Tasks,
         wake: impl Fn() -> Wake<Submission>,
@@ -40,6 +44,7 @@ impl Workers {
             fences: fences::start(aws, tasks, by_key(wake())),
             logs: failure_log::start(client, aws, tasks, by_key(wake())),
             rows: rows::start(tables, tasks, by_key(wake())),
+            inputs: inputs::start(aws, hub, tasks, by_key(wake())),
         }
     }
 
@@ -94,6 +99,7 @@ impl Workers {
         self.fences.forget(uid);
         self.logs.forget(uid);
         self.rows.forget(uid);
+        self.inputs.forget(uid);
     }
 }
 

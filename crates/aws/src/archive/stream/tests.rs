@@ -52,12 +52,11 @@ impl Server {
         let serving = server.clone();
         let router = axum::Router::new().fallback(move |request: Request| serving.clone().answer(request));
         tokio::spawn(async move { axum::serve(listener, router).await });
-        let config = aws_config::defaults(BehaviorVersion::latest())
+        let loader = aws_config::defaults(BehaviorVersion::latest())
             .http_client(aws_smithy_http_client::Builder::new().build_http())
             .region(Region::new("us-east-1"))
-            .credentials_provider(Credentials::new("test", "test", None, None, "tests"))
-            .load()
-            .await;
+            .credentials_provider(Credentials::new("test", "test", None, None, "tests"));
+        let config = Box::pin(loader.load()).await;
         // A body is then the content alone.
         let when = RequestChecksumCalculation::WhenRequired;
         let config = config.into_builder().request_checksum_calculation(when).build();
