@@ -64,6 +64,7 @@ fn job(number: usize) -> Value {
         leaderboard: &board(),
         plan,
         number: JobNumber::first(Attempt(1)),
+        input: None,
         own: &settings().own,
         failed_nodes: &[],
         now: jiff::Timestamp::now(),

@@ -164,7 +164,7 @@ fn of_job(draft: &PlanBuilder<'_>, end: &JobEnd) -> Failure {
         JobEnd::Failed { reason, .. } if reason == "DeadlineExceeded" && draft.deadlines().run_seconds.is_some() => {
             let units = draft.words().units;
             let what = format!("The Pod reached its time limit; finished {units} are kept.");
-            failure::time_limit(&what, &draft.status)
+            failure::charged(Reason::TimeLimit, &what)
         }
         JobEnd::Failed { reason, message, .. } => failure::worst(&draft.status).unwrap_or_else(|| {
             let what = format!("The Job failed with {reason}: {}", sentence(message));

@@ -85,19 +85,12 @@ pub(super) fn node_lost(node: Option<&str>, node_state: ObservedNode, words: &Wo
     infrastructure(Reason::NodeLost, &what)
 }
 
-/// A run that took too long: `what` happened.
-pub(super) fn time_limit(what: &str, status: &SubmissionStatus) -> Failure {
-    match agents_of(status) {
-        Agents::Beside | Agents::First => charged(Reason::TimeLimit, what),
-        Agents::Absent => participant(
-            Reason::TimeLimit,
-            what,
-            &Steps {
-                hosts: "Look at the evaluator's log, and give the run more time.".to_owned(),
-                participant: "Ask the challenge's hosts for more time.".to_owned(),
-            },
-        ),
-    }
+pub(super) fn time_limit(seconds: i64, words: &Words) -> Failure {
+    let what = format!(
+        "The run took longer than {seconds} s and was stopped; finished {} are kept.",
+        words.units
+    );
+    charged(Reason::TimeLimit, &what)
 }
 
 pub(super) fn results_not_stored() -> Failure {

@@ -54,9 +54,7 @@ pub(super) fn watch(draft: &mut PlanBuilder<'_>) {
         return;
     };
     if ran >= limit {
-        let units = draft.words().units;
-        let what = format!("The run took longer than {limit} s and was stopped; finished {units} are kept.");
-        draft.fail(failure::time_limit(&what, &draft.status));
+        draft.fail(failure::time_limit(limit, draft.words()));
     } else if goes_on(draft) {
         draft.requeue_at(after(draft.now(), limit - ran));
     }
