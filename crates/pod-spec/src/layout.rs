@@ -23,7 +23,7 @@ pub(super) const STATUS: &str = "/tmp/status";
 /// Annotation that keeps EKS from putting the ServiceAccount's role into the containers it names.
 pub(super) const ANNOTATION_SKIP_CONTAINERS: &str = "eks.amazonaws.com/skip-containers";
 
-/// True for a volume of ours beside the contents. Nothing but our own mounts of it keeps a stranger from what is in it.
+/// True for a volume of ours in every Pod. Nothing but our own mounts of it keeps a stranger from what is in it.
 pub(super) fn is_own_volume(name: &str) -> bool {
     let member = name.strip_prefix(SHM_VOLUME).and_then(Member::parse);
     OWN_VOLUMES.contains(&name) || member.is_some()

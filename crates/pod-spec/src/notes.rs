@@ -7,7 +7,7 @@ use std::net::IpAddr;
 
 use serde_json::Value;
 
-use leaderboard_api::names;
+use leaderboard_api::{AgentContainer, Agents, LeaderboardSpec, names};
 
 /// Pods of one track.
 pub struct TrackPods {
@@ -140,6 +140,15 @@ pub fn unnamed(tracks: &[TrackPods], hosts: Result<Vec<String>, String>) -> Opti
     })
 }
 
+/// Settings of agents where none runs.
+pub fn unused(spec: &LeaderboardSpec) -> Option<String> {
+    let has_agents = leaderboard_evaluation::of(spec).agents() != Agents::Absent;
+    let is_set = spec.agent != AgentContainer::default() || spec.tracks.iter().any(|track| track.agent.is_some());
+    (is_set && !has_agents).then(|| {
+        "Unused: no image is submitted to this Leaderboard, so that agent and tracks[].agent have no effect; leave them out.".to_owned()
+    })
+}
+
 fn agents(pod: &Value) -> impl Iterator<Item = &Value> {
     let lists = ["initContainers", "containers"].map(|field| list(pod, field));
     lists.into_iter().flatten().filter(|container| {
@@ -259,6 +268,48 @@ mod tests {
         // One agent alone in its Pod meets no other.
         let alone = with("env", json!([{"name": "ROS_DISTRO", "value": "humble"}]));
         assert!(notes(&[pods("sensors", alone, &json!([]))]).is_empty());
+    }
+
+    /// An agent that runs first is an init container.
+    #[test]
+    fn agents_are_found_wherever_the_pod_has_them() {
+        let agent = json!({"name": "agent-1", "envFrom": [{"secretRef": {"name": "key"}}]});
+        let template = json!({"spec": {"initContainers": [agent], "containers": [{"name": "evaluator-1"}]}});
+        let found = notes(&[TrackPods {
+            track: "test".to_owned(),
+            template,
+        }]);
+        let starts = ["Agents can read Secret key", "Unbounded: agents of the track test"];
+        assert_eq!(found.len(), starts.len(), "{found:?}");
+        assert!(
+            found.iter().zip(starts).all(|(note, start)| note.starts_with(start)),
+            "{found:?}"
+        );
+    }
+
+    #[test]
+    fn settings_of_agents_are_named_where_none_runs() {
+        let spec = |mode: &str, agent: &Value, own: &Value| -> LeaderboardSpec {
+            let spec = json!({
+                "evaluation": {"container": {"mode": mode, "image": "e", "command": ["/e"]}}, "agent": agent,
+                "tracks": [{"name": "t", "container": {"score": {"metric": "m"}}, "agent": own}],
+                "storage": {"s3": {"bucket": "bucket"}},
+            });
+            serde_json::from_value(spec).unwrap()
+        };
+        let (none, command, resources) = (json!({}), json!({"command": ["/a"]}), json!({"resources": {}}));
+        for (mode, agent, own, has_note) in [
+            ("Predictions", &none, &Value::Null, false),
+            ("Predictions", &command, &Value::Null, true),
+            ("Predictions", &none, &resources, true),
+            ("Batch", &command, &resources, false),
+        ] {
+            assert_eq!(
+                unused(&spec(mode, agent, own)).is_some(),
+                has_note,
+                "{mode} {agent} {own}"
+            );
+        }
     }
 
     #[test]

@@ -3,7 +3,8 @@
 //! Pure, and on JSON, so that Pod fields newer than this client survive. Called by `job` (lay) and by the check of a
 //! Leaderboard (validate). The rules, for people too: objects are merged deep; lists by `name`, volumeMounts by
 //! `mountPath`; variables are replaced whole, tolerations added, all other lists replaced; `null` removes;
-//! the names of the two roles stand for the containers of every worker, `agent-2` for one, whichever comes first in the list.
+//! the names of the two roles stand for the containers of every worker, `agent-2` for one, whichever comes first in the list. They do so
+//! among the init containers for an agent that runs first; what a host adds there comes before it.
 
 #[cfg(test)]
 mod kind_tests;
@@ -12,8 +13,7 @@ mod rules;
 mod tests;
 
 use leaderboard_api::LeaderboardSpec;
-use leaderboard_evaluation::Evaluation;
-use leaderboard_protocol::files::{Host, Side};
+use leaderboard_protocol::files::{Host, Member, Side};
 use serde_json::{Map, Value};
 
 pub use rules::{OverlayError, validate, validate_overlay};
@@ -22,9 +22,9 @@ pub use rules::{OverlayError, validate, validate_overlay};
 const ALIASES: [&str; 3] = [Host::Simulator.name(), Host::Evaluator.name(), Side::Agent.name()];
 
 /// Lays a Leaderboard's overlay over a template. One that the rules refuse is not applied at all, so that nothing gets around them.
-pub(super) fn lay(template: &mut Value, spec: &LeaderboardSpec, kind: &dyn Evaluation) {
+pub(super) fn lay(template: &mut Value, spec: &LeaderboardSpec) {
     let overlay = spec.pod_overrides.as_ref();
-    if let Some(overlay) = overlay.filter(|pod| validate_overlay(pod, kind).is_ok()) {
+    if let Some(overlay) = overlay.filter(|pod| validate_overlay(pod, spec).is_ok()) {
         apply(template, overlay);
     }
 }
@@ -60,6 +60,7 @@ fn merge_lists(field: &str, base: &mut Vec<Value>, overlay: &[Value]) {
             base.extend(added);
         }
         "containers" => merge_containers(base, overlay),
+        "initContainers" => merge_init_containers(base, overlay),
         "volumeMounts" => merge_by("mountPath", base, overlay, apply),
         // Merged deep, a variable could end up with both a value and a source.
         "env" => merge_by("name", base, overlay, |known, item| *known = without_nulls(item)),
@@ -77,17 +78,33 @@ fn merge_by(key: &str, base: &mut Vec<Value>, overlay: &[Value], join: impl Fn(&
     }
 }
 
+/// As among the containers for an agent that runs first, and by name for all others.
+fn merge_init_containers(base: &mut Vec<Value>, overlay: &[Value]) {
+    let is_of_worker = |item: &Value| ALIASES.contains(&name(item)) || Member::parse(name(item)).is_some();
+    let (of_workers, others): (Vec<Value>, Vec<Value>) = overlay.iter().cloned().partition(is_of_worker);
+    merge_containers(base, &of_workers);
+    let known = base.len();
+    merge_by("name", base, &others, apply);
+    // In every Pod a host's own ones start before the agents.
+    let first = base.iter().take(known).position(is_of_worker).unwrap_or(known);
+    let added = base.len().saturating_sub(known);
+    if let Some(tail) = base.get_mut(first..) {
+        tail.rotate_right(added);
+    }
+}
+
+fn name(item: &Value) -> &str {
+    item["name"].as_str().unwrap_or_default()
+}
+
 /// Aliases go first, so that what is shown of one container wins over what is shown of all. A pair that this track does
 /// not have is passed over: the overlay is the same for all tracks.
 fn merge_containers(base: &mut [Value], overlay: &[Value]) {
-    let name = |item: &Value| item["name"].as_str().unwrap_or_default().to_owned();
-    let (aliases, single): (Vec<&Value>, Vec<&Value>) =
-        overlay.iter().partition(|item| ALIASES.contains(&name(item).as_str()));
+    let (aliases, single): (Vec<&Value>, Vec<&Value>) = overlay.iter().partition(|item| ALIASES.contains(&name(item)));
     for item in aliases.into_iter().chain(single) {
-        let addressed = name(item);
         for known in base.iter_mut() {
-            let own = name(known);
-            if addresses(&addressed, &own) {
+            let own = name(known).to_owned();
+            if addresses(name(item), &own) {
                 apply(known, item);
                 known["name"] = own.into();
             }

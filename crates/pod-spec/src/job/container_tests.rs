@@ -24,11 +24,34 @@ fn is_own(container: &Value) -> bool {
 
 /// `kubectl leaderboard logs --of start` shows them in the order of this list.
 #[test]
-fn the_init_containers_are_those_that_have_names_in_that_order() {
-    let job = Case::new("V1", json!({})).json();
-    let init = job["spec"]["template"]["spec"]["initContainers"].as_array().unwrap();
-    let found: Vec<&str> = init.iter().filter_map(|container| container["name"].as_str()).collect();
-    assert_eq!(found, names::INIT_CONTAINERS);
+fn the_init_containers_have_names_and_start_in_that_order() {
+    let data = json!({"image": {"reference": "d"}});
+    let case = |mode: &str| Case::container(json!({"mode": mode, "dataset": data, "labels": data}), &json!({}));
+    let with_data = ["workspace", "dataset", "labels", "logcopy"];
+    for (case, expected, first) in [
+        (
+            Case::new("V1", json!({})),
+            ["workspace", "contents", "logcopy"].as_slice(),
+            [].as_slice(),
+        ),
+        (Case::container(json!({}), &json!({})), &["workspace", "logcopy"], &[]),
+        (case("Interactive"), &with_data, &[]),
+        (case("Batch"), &with_data, &["agent-1", "collect"]),
+        (case("Predictions"), &with_data, &[]),
+    ] {
+        let job = case.json();
+        let init = job["spec"]["template"]["spec"]["initContainers"].as_array().unwrap();
+        let found: Vec<&str> = init
+            .iter()
+            .map(|container| container["name"].as_str().unwrap())
+            .collect();
+        assert_eq!(found, [expected, first].concat());
+        let mut all = names::INIT_CONTAINERS.into_iter();
+        assert!(
+            expected.iter().all(|name| all.any(|known| known == *name)),
+            "{expected:?}"
+        );
+    }
 }
 
 #[test]
@@ -242,7 +265,7 @@ fn secrets_are_named_and_never_written() {
 #[test]
 fn a_hostile_image_name_cannot_ask_kubernetes_for_a_secret() {
     let mut case = Case::new("V2", json!({"podIdentity": {"secretName": "writer"}}));
-    case.plan.image = "x/$(AWS_SECRET_ACCESS_KEY)$$(AWS_SECRET_ACCESS_KEY)".into();
+    case.plan.image = Some("x/$(AWS_SECRET_ACCESS_KEY)$$(AWS_SECRET_ACCESS_KEY)".into());
     let job = case.json();
     let written = value(container(&job, "logcopy"), "LEADERBOARD_RUN").unwrap();
     let handed_on = super::command_tests::kubernetes_expand(written, &|name| Some(format!("<{name}>")));

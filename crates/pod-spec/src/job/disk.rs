@@ -6,7 +6,9 @@
 
 use serde_json::{Value, json};
 
+use super::gpu::member;
 use leaderboard_api::names;
+use leaderboard_protocol::files::Side;
 
 const DISK: &str = "ephemeral-storage";
 /// Request and limit of an agent. The layers of its image do not count.
@@ -19,14 +21,14 @@ const VOLUMES_REQUEST: &str = "1Gi";
 /// Fills in what is missing. `volumes` is the limit of all volumes in bytes.
 ///
 /// A container whose host names a disk stays as it is, with nothing added. A request alone is the choice to have no limit. Then the
-/// other containers get no limit either, since the sum would limit the whole Pod.
+/// other containers get no limit either, since the sum would limit the whole Pod. An agent that is an init container counts as those beside
+/// the hosts' do: Kubernetes takes the larger of its limit and their sum.
 pub(super) fn fill(pod: &mut Value, volumes: u64) {
-    let mut nothing = Vec::new();
-    let workers = pod["containers"].as_array_mut().unwrap_or(&mut nothing);
+    let (mut workers, others): (Vec<_>, Vec<_>) = containers(pod).partition(|container| member(container).is_some());
     let is_unlimited = |container: &Value| names_disk(container, "requests") && !names_disk(container, "limits");
-    let unlimited = workers.iter().any(is_unlimited);
+    let unlimited = workers.iter().any(|container| is_unlimited(container));
     for container in workers.iter_mut().filter(|container| !is_settled(container)) {
-        let is_agent = container["name"].as_str().is_some_and(names::is_agent_container);
+        let is_agent = member(container).is_some_and(|member| member.side == Side::Agent);
         let [request, limit] = if is_agent { AGENT } else { HOST };
         set(container, "requests", request);
         if !unlimited {
@@ -34,14 +36,24 @@ pub(super) fn fill(pod: &mut Value, volumes: u64) {
         }
     }
     let limited = workers.iter().any(|container| names_disk(container, "limits"));
-    let init = pod["initContainers"].as_array_mut().into_iter().flatten();
-    for logcopy in init.filter(|container| container["name"] == names::CONTAINER_LOGCOPY && !is_settled(container)) {
+    let is_logcopy = |container: &Value| container["name"] == names::CONTAINER_LOGCOPY;
+    for logcopy in others
+        .into_iter()
+        .filter(|found| is_logcopy(found) && !is_settled(found))
+    {
         set(logcopy, "requests", VOLUMES_REQUEST);
         // Alone it would be the limit of the whole Pod.
         if limited {
             set(logcopy, "limits", &volumes.to_string());
         }
     }
+}
+
+/// All containers of a Pod.
+fn containers(pod: &mut Value) -> impl Iterator<Item = &mut Value> {
+    let fields = pod.as_object_mut().into_iter().flatten();
+    let lists = fields.filter(|(field, _)| ["initContainers", "containers"].contains(&field.as_str()));
+    lists.filter_map(|(_, list)| list.as_array_mut()).flatten()
 }
 
 fn is_settled(container: &Value) -> bool {

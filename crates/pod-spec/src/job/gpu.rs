@@ -14,7 +14,7 @@ use serde_json::{Value, json};
 use super::failed_nodes::{HOSTNAME, REQUIRED};
 use super::{JobInput, variable};
 use crate::gpu_claims::{source, template_name};
-use leaderboard_api::{GpuSource, LeaderboardSpec, names};
+use leaderboard_api::{Agents, GpuSource, LeaderboardSpec, names};
 use leaderboard_protocol::files::{Member, Pair, Side};
 use leaderboard_protocol::graphics::{INDEX, Needs};
 
@@ -43,9 +43,11 @@ pub(super) fn variables(source: GpuSource<'_>, member: Member) -> Vec<EnvVar> {
         .collect()
 }
 
-/// Requests and limits of a container of a worker: the host's own, and its GPU.
+/// Requests and limits of a container of a worker: the host's own, and its GPU. What an agent requests that runs first is free again for
+/// the hosts' containers, so that it requests as they do.
 pub(super) fn resources(
     source: GpuSource<'_>,
+    agents: Agents,
     member: Member,
     hosts: Option<ResourceRequirements>,
 ) -> Option<ResourceRequirements> {
@@ -54,12 +56,13 @@ pub(super) fn resources(
         limits.insert(resource.to_owned(), Quantity("1".into()));
         Some(resources)
     };
-    match (source, member.side) {
-        (GpuSource::None, _) | (GpuSource::NodeIndex(_), Side::Agent) => hosts,
-        (GpuSource::PerContainer(resource), _) | (GpuSource::NodeIndex(resource), Side::Host(_)) => {
+    match source {
+        GpuSource::None => hosts,
+        GpuSource::NodeIndex(_) if agents == Agents::Beside && member.side == Side::Agent => hosts,
+        GpuSource::PerContainer(resource) | GpuSource::NodeIndex(resource) => {
             is_requested(hosts.unwrap_or_default(), resource)
         }
-        (GpuSource::Claim(_), _) => {
+        GpuSource::Claim(_) => {
             let mut resources = hosts.unwrap_or_default();
             resources.claims.get_or_insert_with(Vec::new).push(ResourceClaim {
                 name: claim_name(member.pair),
@@ -90,10 +93,17 @@ fn claim_name(worker: Pair) -> String {
 }
 
 /// Flags of the runner: what it checks before it starts its command, which is nothing where the operator gives no GPU. By its index the
-/// agent has one only if the node's runtime obeys the variable, and else it would be charged for the lack of it: it reports to its host.
-pub(super) fn flags(source: GpuSource<'_>, side: Side, draws: Option<Needs>) -> impl Iterator<Item = String> {
+/// agent beside its host has one only if the node's runtime obeys the variable, and else it would be charged for the lack of it: it reports
+/// to its host.
+pub(super) fn flags(
+    source: GpuSource<'_>,
+    agents: Agents,
+    side: Side,
+    draws: Option<Needs>,
+) -> impl Iterator<Item = String> {
     let own = draws.filter(|_| source != GpuSource::None);
-    let of_agent = is_by_index(source).then(|| match side {
+    let reports = is_by_index(source) && agents == Agents::Beside;
+    let of_agent = reports.then(|| match side {
         Side::Host(_) => "--agent-gpu=true".to_owned(),
         Side::Agent => "--report-gpu=true".to_owned(),
     });
@@ -142,13 +152,19 @@ pub(super) fn is_gpu(resource: &str, source: GpuSource<'_>) -> bool {
 /// Why it is not clear which container of a finished template is meant to have which GPU. A resource that a container of a worker names
 /// is its own alone: without `gpu` the other one would have none, and with a claim the worker would take two.
 pub fn unclear(spec: &LeaderboardSpec, template: &Value) -> Option<String> {
-    let source = source(spec);
-    let worker = leaderboard_evaluation::of(spec).words().worker;
-    let containers = template["spec"]["containers"].as_array()?;
-    let mut of_workers = containers.iter().filter(|container| member(container).is_some());
+    let (source, kind) = (source(spec), leaderboard_evaluation::of(spec));
+    let worker = kind.words().worker;
+    let lists = ["initContainers", "containers"].map(|list| template["spec"][list].as_array());
+    let mut of_workers = lists
+        .into_iter()
+        .flatten()
+        .flatten()
+        .filter(|found| member(found).is_some());
     let (container, resource) =
         of_workers.find_map(|container| Some((container["name"].as_str()?, *requested(container, source).first()?)))?;
     match (&spec.gpu, source) {
+        // There is no other one.
+        (None, _) if kind.agents() == Agents::Absent => None,
         (None, _) => Some(format!(
             "{container} requests {resource} and the Leaderboard has no field gpu, so it is not known what the other container of the \
              {worker} is to have. Set gpu.resourceName: {resource} and remove it from resources; or set gpu.mode: None, and only the \

@@ -1,32 +1,35 @@
 //! How many GPUs a Pod takes from its node. Pure: read off what the host requests, as the scheduler does.
 
-use leaderboard_protocol::files::Pair;
+use leaderboard_protocol::files::Member;
 use serde_json::{Value, json};
 
-use super::{gpu, workers};
+use super::{gpu, members, workers};
 use crate::gpu_claims::source;
 use crate::overlay as pod_overlay;
 use leaderboard_api::{GpuSource, LeaderboardSpec, RunPlan, Track};
 
-/// GPUs that the Pod of a plan requests or claims; shares of GPUs and MIG slices count as one each.
+/// GPUs that the Pod of a plan requests or claims; shares of GPUs and MIG slices count as one each. Those of an agent that runs first are free
+/// again for the other containers.
 pub fn gpus(spec: &LeaderboardSpec, track: Option<&Track>, plan: &RunPlan) -> i64 {
-    let (source, kind) = (source(spec), leaderboard_evaluation::of_plan(plan));
-    let of_worker = |worker: Pair| {
-        [worker.host(kind.host()), worker.agent()].map(|member| {
-            let hosts = spec.given(track, workers::part(member.side));
-            let resources = gpu::resources(source, member, hosts.and_then(|hosts| hosts.resources));
-            json!({"name": member.to_string(), "resources": resources})
-        })
+    let source = source(spec);
+    let of_member = |member: Member| {
+        let hosts = spec.given(track, workers::part(member.side));
+        let resources = gpu::resources(source, plan.agents(), member, hosts.and_then(|hosts| hosts.resources));
+        json!({"name": member.to_string(), "resources": resources})
     };
-    let containers: Vec<Value> = Pair::first(plan.workers()).flat_map(of_worker).collect();
-    let mut template = json!({"spec": {"containers": containers}});
-    pod_overlay::lay(&mut template, spec, kind);
-    let containers = template.pointer("/spec/containers").and_then(Value::as_array);
-    let each = containers
-        .into_iter()
-        .flatten()
-        .map(|container| requested(&container["resources"], source));
-    each.fold(claimed(source, plan), i64::saturating_add)
+    let (first, beside): (Vec<Member>, Vec<Member>) =
+        members::members(plan).partition(|member| members::is_first(plan, *member));
+    let [first, beside] = [first, beside].map(|list| list.into_iter().map(of_member).collect::<Vec<Value>>());
+    let mut template = json!({"spec": {"initContainers": first, "containers": beside}});
+    pod_overlay::lay(&mut template, spec);
+    let sum = |list: &str| {
+        let containers = template["spec"][list].as_array().into_iter().flatten();
+        let of_workers = containers.filter(|container| gpu::member(container).is_some());
+        let each = of_workers.map(|container| requested(&container["resources"], source));
+        each.fold(0, i64::saturating_add)
+    };
+    let requested = sum("initContainers").max(sum("containers"));
+    requested.saturating_add(claimed(source, plan))
 }
 
 /// One device for each worker.
@@ -71,7 +74,7 @@ mod tests {
         spec["evaluation"]["carla"]["simulator"]["image"] = json!("simulator:1");
         let spec: LeaderboardSpec = serde_json::from_value(spec).unwrap();
         let track = spec.tracks[0].clone();
-        let plan = effective::plan(&spec, &track, "77".parse().unwrap(), "a:1".into(), false).unwrap();
+        let plan = effective::plan(&spec, &track, "77".parse().unwrap(), Some("a:1".into()), false).unwrap();
         gpus(&spec, Some(&track), &plan)
     }
 
@@ -166,6 +169,36 @@ mod tests {
             let case = Case::container(container, &more);
             let spec = &case.leaderboard.spec;
             assert_eq!(gpus(spec, spec.tracks.first(), &case.plan), expected, "{more}");
+        }
+    }
+
+    /// One of three evaluators, of an agent that ends before them, and of no agent.
+    #[test]
+    fn gpus_of_an_agent_that_runs_first_are_free_again() {
+        let four = json!({"limits": {"nvidia.com/gpu": "4"}});
+        for (mode, fields, expected) in [
+            ("Batch", json!({"gpu": {"resourceName": "nvidia.com/gpu"}}), 3),
+            (
+                "Batch",
+                json!({"gpu": {"mode": "NodeIndex", "resourceName": "nvidia.com/gpu"}}),
+                3,
+            ),
+            (
+                "Batch",
+                json!({"gpu": {"mode": "Claim", "claim": {"deviceClassName": "gpu.nvidia.com"}}}),
+                3,
+            ),
+            (
+                "Batch",
+                json!({"podOverrides": {"spec": {"initContainers": [{"name": "agent", "resources": four}]}}}),
+                4,
+            ),
+            ("Predictions", json!({"gpu": {"resourceName": "nvidia.com/gpu"}}), 3),
+            ("Predictions", json!({"agent": {"resources": one()}}), 0),
+        ] {
+            let case = Case::container(json!({"mode": mode, "workers": 3}), &fields);
+            let spec = &case.leaderboard.spec;
+            assert_eq!(gpus(spec, spec.tracks.first(), &case.plan), expected, "{mode} {fields}");
         }
     }
 

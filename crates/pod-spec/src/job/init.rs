@@ -1,6 +1,6 @@
-//! The containers that start before the workers: `contents` of the host, and our own `workspace` and `logcopy`. Pure.
+//! The init containers but for an agent's: `contents` and the data of the host, and our own `workspace`, `logcopy` and `collect`. Pure.
 //!
-//! Only our own two ever get an identity towards AWS.
+//! Only `workspace` and `logcopy` ever get an identity towards AWS.
 
 use k8s_openapi::api::core::v1::{
     Container, EnvVar, EnvVarSource, ObjectFieldSelector, SecretKeySelector, SecurityContext,
@@ -12,6 +12,7 @@ use crate::layout::CONTENTS_LOG_FOLDER;
 use leaderboard_api::{Part, names};
 use leaderboard_contract::keys::CONTENTS_LOG;
 use leaderboard_contract::run::{ENV_CHECKSUMS, ENV_POD_UID, ENV_ROLE_ARN, ENV_RUN, RUNNER, TOOLS};
+use leaderboard_evaluation::workload::literal;
 
 /// Copying prints little; what floods must not fill the disk. In bytes.
 const CONTENTS_LOG_LIMIT: u64 = 16 << 20;
@@ -61,6 +62,29 @@ fn contents_env(input: &JobInput<'_>, hosts: &[EnvVar]) -> Vec<EnvVar> {
     ours.into_iter().filter(is_free).chain(hosts.iter().cloned()).collect()
 }
 
+/// Copy the dataset and the labels out of their images, which need no shell.
+pub(super) fn data(input: &JobInput<'_>) -> Vec<Container> {
+    let all = input.kind().data(input.spec()).into_iter();
+    let containers = all.filter_map(|data| {
+        let image = data.source.image()?;
+        Some(Container {
+            name: data.volume.name.into(),
+            image: Some(image.reference.clone()),
+            command: Some(vec![
+                format!("{TOOLS}/{RUNNER}"),
+                "copy".into(),
+                format!("--from={}", literal(&image.path)),
+                format!("--to={}", data.volume.written),
+            ]),
+            resources: Some(resources(["50m", "64Mi"], "512Mi")),
+            security_context: Some(confined()),
+            volume_mounts: Some(volumes::of_data(data.volume)),
+            ..Container::default()
+        })
+    });
+    containers.collect()
+}
+
 /// Prepares the volumes and restores what an earlier attempt stored.
 pub(super) fn workspace(input: &JobInput<'_>) -> Container {
     Container {
@@ -77,6 +101,16 @@ pub(super) fn logcopy(input: &JobInput<'_>) -> Container {
         volume_mounts: Some(volumes::of_logcopy(input)),
         resources: Some(resources(["100m", "128Mi"], "1Gi")),
         ..own(input, names::CONTAINER_LOGCOPY)
+    }
+}
+
+/// Copies what an agent has left, for the evaluators. It reads a stranger's files, so that it has no identity.
+pub(super) fn collect(input: &JobInput<'_>) -> Container {
+    Container {
+        env: Some(vec![run_variable(input)]),
+        volume_mounts: Some(volumes::of_collect()),
+        resources: Some(resources(["50m", "64Mi"], "512Mi")),
+        ..own(input, names::CONTAINER_COLLECT)
     }
 }
 
@@ -99,10 +133,14 @@ fn own(input: &JobInput<'_>, name: &str) -> Container {
     }
 }
 
-fn own_env(input: &JobInput<'_>) -> Vec<EnvVar> {
+fn run_variable(input: &JobInput<'_>) -> EnvVar {
     let run = serde_json::to_string(&run_document(input)).unwrap_or_default();
+    variable(ENV_RUN, &run)
+}
+
+fn own_env(input: &JobInput<'_>) -> Vec<EnvVar> {
     let mut env = vec![
-        variable(ENV_RUN, &run),
+        run_variable(input),
         EnvVar {
             name: ENV_POD_UID.into(),
             value_from: Some(EnvVarSource {

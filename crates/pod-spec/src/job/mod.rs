@@ -25,6 +25,8 @@ mod gpu_tests;
 #[cfg(test)]
 mod hardening_tests;
 #[cfg(test)]
+mod mode_tests;
+#[cfg(test)]
 mod tests;
 
 use std::collections::BTreeMap;
@@ -45,7 +47,7 @@ use crate::owner::owner_reference;
 pub use gpu_count::gpus;
 use leaderboard_api::{
     Attempt, Deadlines, Enforcement, FailedNode, GpuSource, JobNumber, Leaderboard, LeaderboardSpec, PolicySource,
-    Reason, RunPlan, Submission, Track, Verify, conditions, effective, names,
+    Reason, RunPlan, Submission, SubmittedFile, Track, Verify, conditions, effective, names,
 };
 use leaderboard_contract::run::{Isolation, Run, SCHEMA};
 use leaderboard_evaluation::Evaluation;
@@ -57,7 +59,7 @@ const GRACE_SECONDS: i64 = 600;
 const LOST_NODE_SECONDS: i64 = 60;
 /// Seconds that the Pod's `activeDeadlineSeconds` allows beyond the sum of the other deadlines.
 const NET_SECONDS: i64 = 1800;
-/// Restarts beyond those of the workers that do not end the Job: `contents`, `workspace` and `logcopy` count too.
+/// Restarts beyond those of the workers that do not end the Job: those of our own init containers and of the host's count too.
 const SPARE_RESTARTS: i32 = 20;
 /// A policy that a Pod has found not to be enforced is taken for such so long; after that each Pod waits its full time again.
 const KNOWN_OPEN_FOR: Duration = Duration::from_hours(1);
@@ -84,6 +86,8 @@ pub struct JobInput<'a> {
     pub plan: &'a RunPlan,
     /// Which Job it is.
     pub number: JobNumber,
+    /// The submitted file, of a run of the mode Predictions.
+    pub input: Option<&'a SubmittedFile>,
     pub own: &'a OwnImage,
     /// Nodes that have failed earlier Jobs of the attempt.
     pub failed_nodes: &'a [FailedNode],
@@ -137,7 +141,7 @@ pub fn build_object(input: &JobInput<'_>) -> DynamicObject {
     let workloads = members::workloads(input);
     let mut spec = serde_json::to_value(ours(input, &workloads)).unwrap_or_default();
     let template = &mut spec["template"];
-    pod_overlay::lay(template, input.spec(), input.kind());
+    pod_overlay::lay(template, input.spec());
     settle(template, input, &workloads);
     skip_strangers(template);
     DynamicObject {
@@ -164,6 +168,7 @@ fn run_document(input: &JobInput<'_>) -> Run {
             .unwrap_or_default(),
         attempt: input.number.attempt,
         plan: input.plan.clone(),
+        input: input.input.cloned(),
         // Other kinds of evaluation have nothing to recompute.
         verify: spec.evaluation.carla().map_or(Verify::Disabled, |carla| carla.verify),
         period_seconds: unsigned(spec.sync_period_seconds),
@@ -244,9 +249,8 @@ fn labels(input: &JobInput<'_>) -> BTreeMap<String, String> {
 /// A net only: the controller counts the crashes of each worker itself. This limit is one budget over all containers, and
 /// at it the Pod is deleted with its statuses.
 fn backoff_limit(input: &JobInput<'_>) -> i32 {
-    let workers = i32::try_from(input.workers()).unwrap_or(i32::MAX);
-    workers
-        .saturating_mul(2)
+    let members = i32::try_from(members::members(input.plan).count()).unwrap_or(i32::MAX);
+    members
         .saturating_mul(input.spec().retries.per_worker.saturating_add(1))
         .saturating_add(SPARE_RESTARTS)
 }
@@ -289,14 +293,16 @@ fn generation(input: &JobInput<'_>) -> i64 {
 fn pod(input: &JobInput<'_>, workloads: &[Workload]) -> PodSpec {
     let identity = input.spec().pod_identity.as_ref();
     // `workspace` is first, since it makes the folders and the runner that the others have.
-    let init = [
-        Some(init::workspace(input)),
-        init::contents(input),
-        Some(init::logcopy(input)),
-    ];
+    let init = [Some(init::workspace(input)), init::contents(input)]
+        .into_iter()
+        .flatten();
+    let init = init.chain(init::data(input)).chain([init::logcopy(input)]);
+    // The kubelet's own order keeps an agent that runs first from what follows it.
+    let first = workers::first(input, workloads).into_iter();
+    let first = first.flat_map(|agent| [agent, init::collect(input)]);
     PodSpec {
         restart_policy: Some("OnFailure".into()),
-        init_containers: Some(init.into_iter().flatten().collect()),
+        init_containers: Some(init.chain(first).collect()),
         containers: workers::all(input, workloads),
         volumes: Some(volumes::all(input, workloads)),
         active_deadline_seconds: active_deadline(&input.deadlines()),
@@ -354,7 +360,7 @@ fn settle(template: &mut Value, input: &JobInput<'_>, workloads: &[Workload]) {
     disk::fill(pod, volumes::disk_limit(input));
 }
 
-/// Names every container but our own two for EKS, those of the overlay too.
+/// Names every container but those two that have an identity for EKS, those of the overlay too.
 fn skip_strangers(template: &mut Value) {
     let strangers: Vec<&str> = ["/spec/initContainers", "/spec/containers"]
         .into_iter()

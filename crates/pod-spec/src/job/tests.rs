@@ -6,7 +6,7 @@ use std::path::PathBuf;
 use serde_json::{Value, json};
 
 use super::*;
-use leaderboard_api::{FailedNode, JobNumber, effective};
+use leaderboard_api::{Agents, FailedNode, JobNumber, effective};
 
 pub(super) const OPERATOR_IMAGE: &str = "registry.example/leaderboard-operator:1";
 
@@ -16,6 +16,7 @@ pub(super) struct Case {
     pub(super) leaderboard: Leaderboard,
     pub(super) plan: RunPlan,
     pub(super) number: JobNumber,
+    pub(super) file: Option<SubmittedFile>,
     pub(super) own: OwnImage,
     pub(super) failed_nodes: Vec<FailedNode>,
 }
@@ -80,7 +81,12 @@ impl Case {
             "spec": {"leaderboardName": "carla", "evalai": {"challenge": 1, "phase": 2, "submission": 4711}},
         }))
         .unwrap();
-        let image = "registry.example/team@sha256:0a1b".to_owned();
+        let takes_files = leaderboard_evaluation::of(&leaderboard.spec).agents() == Agents::Absent;
+        let image = (!takes_files).then(|| "registry.example/team@sha256:0a1b".to_owned());
+        let file = takes_files.then(|| SubmittedFile {
+            sha256: "0a1b".repeat(16),
+            size: 12_345,
+        });
         let plan = effective::plan(
             &leaderboard.spec,
             &leaderboard.spec.tracks[0],
@@ -94,6 +100,7 @@ impl Case {
             leaderboard,
             plan,
             number: JobNumber::first(Attempt(1)),
+            file,
             own: OwnImage {
                 image: OPERATOR_IMAGE.into(),
                 ..OwnImage::default()
@@ -108,6 +115,7 @@ impl Case {
             leaderboard: &self.leaderboard,
             plan: &self.plan,
             number: self.number,
+            input: self.file.as_ref(),
             own: &self.own,
             failed_nodes: &self.failed_nodes,
             now: "2026-11-01T12:00:00Z".parse().unwrap(),
@@ -205,10 +213,39 @@ fn the_job_of_two_evaluators_with_ports_and_gpus_is_as_committed() {
 }
 
 #[test]
+fn the_job_of_an_agent_that_leaves_files_for_two_evaluators_is_as_committed() {
+    let container = json!({
+        "mode": "Batch", "workers": 2, "shmSize": "256Mi", "answerSeconds": 60,
+        "dataset": {"image": {"reference": "registry.example/dataset:1"}},
+        "labels": {"persistentVolumeClaim": {"claimName": "labels"}},
+        "input": {"maxBytes": "10Mi"},
+    });
+    let more = json!({
+        "podIdentity": role(),
+        "gpu": {"resourceName": "nvidia.com/gpu"},
+        "tracks": [{"name": "test", "phase": 2, "container": {"score": {"metric": "accuracy"}}}],
+        "agent": {"command": ["/agent", "--to", "$(SUBMISSION_PATH)"], "shmSize": "1Gi"},
+    });
+    golden("batch-2.json", &Case::container(container, &more));
+}
+
+#[test]
+fn the_job_of_a_submitted_file_is_as_committed() {
+    let container = json!({"mode": "Predictions", "labels": {"image": {"reference": "registry.example/labels:1"}}});
+    golden("predictions-1.json", &Case::container(container, &json!({"agent": {}})));
+}
+
+#[test]
 fn the_job_has_no_field_that_kubernetes_does_not_know() {
+    let data = json!({"image": {"reference": "d"}});
     for case in [
         Case::new("V2", json!({"podIdentity": role()})),
         Case::container(json!({"port": 9000}), &json!({})),
+        Case::container(json!({"mode": "Batch", "dataset": data}), &json!({})),
+        Case::container(
+            json!({"mode": "Predictions", "labels": {"persistentVolumeClaim": {"claimName": "c"}}}),
+            &json!({}),
+        ),
     ] {
         let json = case.json();
         let typed: Job = serde_json::from_value(json.clone()).unwrap();

@@ -2,7 +2,8 @@
 
 use k8s_openapi::api::core::v1::{
     DownwardAPIVolumeFile, DownwardAPIVolumeSource, EmptyDirVolumeSource, HostPathVolumeSource, ObjectFieldSelector,
-    ProjectedVolumeSource, ServiceAccountTokenProjection, Volume, VolumeMount, VolumeProjection,
+    PersistentVolumeClaimVolumeSource, ProjectedVolumeSource, ServiceAccountTokenProjection, Volume, VolumeMount,
+    VolumeProjection,
 };
 use k8s_openapi::apimachinery::pkg::api::resource::Quantity;
 
@@ -10,11 +11,11 @@ use super::{JobInput, members};
 use crate::layout::{
     CONTENTS_LOG_FOLDER, IDENTITY_VOLUME, LOGS_VOLUME, PODINFO_VOLUME, SHM, SHM_VOLUME, STATUS, TOOLS_VOLUME,
 };
-use leaderboard_api::names;
+use leaderboard_api::{Agents, DataSource, names};
 use leaderboard_contract::run::{
     IDENTITY, IDENTITY_TOKEN_FILE, LOGS, NAME_FILES, PODINFO, STATUS_FOLDER, STOP_FILE, TOOLS,
 };
-use leaderboard_evaluation::workload::{Mount, Role, Workload};
+use leaderboard_evaluation::workload::{ContentsVolume, Data, Mount, Role, Workload};
 use leaderboard_protocol::files::Member;
 
 const AUDIENCE: &str = "sts.amazonaws.com";
@@ -22,29 +23,46 @@ const TOKEN_SECONDS: i64 = 3600;
 /// Room in `logs` beyond what the limits on uploads and logs add up to: filling it up evicts the Pod with 1 s of grace,
 /// so those limits must be met first.
 const LOGS_MARGIN: u64 = 1 << 30;
-/// Most bytes of the volumes of the private contents, which have no limit of their own.
+/// Most bytes of the volumes of the private contents, and of each volume that an image fills. They have no limit of their own.
 const CONTENTS_BYTES: u64 = 10 << 30;
 
 /// Every volume of the Pod.
 pub(super) fn all(input: &JobInput<'_>, workloads: &[Workload]) -> Vec<Volume> {
-    let contents = input
-        .kind()
-        .reserved()
+    let (kind, spec) = (input.kind(), input.spec());
+    let contents = kind
+        .reserved(spec)
         .volumes
         .iter()
         .map(|volume| empty(volume.name, None));
+    let data = kind.data(spec).into_iter().map(|data| with_data(&data));
     let own = [
         empty(LOGS_VOLUME, Some(Quantity(logs_limit(input).to_string()))),
         empty(TOOLS_VOLUME, Some(Quantity("64Mi".into()))),
         podinfo(),
     ];
-    let identity = input.spec().has_role().then(identity);
-    let shared = members::members(input).filter_map(|member| {
+    let identity = spec.has_role().then(identity);
+    let shared = members::members(input.plan).filter_map(|member| {
         let size = members::role(workloads, member)?.shm?;
         Some(memory(member, size))
     });
-    let all = contents.chain(own).chain(identity);
+    let all = contents.chain(data).chain(own).chain(identity);
     all.chain(of_node(workloads)).chain(shared).collect()
+}
+
+/// A volume that an init container fills, or a claim of the host's.
+fn with_data(data: &Data<'_>) -> Volume {
+    let claim = match data.source {
+        DataSource::Image(_) => return empty(data.volume.name, None),
+        DataSource::PersistentVolumeClaim(claim) => claim,
+    };
+    Volume {
+        name: data.volume.name.into(),
+        persistent_volume_claim: Some(PersistentVolumeClaimVolumeSource {
+            claim_name: claim.claim_name.clone(),
+            read_only: Some(true),
+        }),
+        ..Volume::default()
+    }
 }
 
 /// Folders of the node that a worker's containers mount, which are the same for all workers.
@@ -63,7 +81,7 @@ fn of_node(workloads: &[Workload]) -> Vec<Volume> {
             }),
             ..Volume::default()
         }),
-        Mount::Own { .. } | Mount::Contents(_) => None,
+        Mount::Own { .. } | Mount::Read { .. } | Mount::Contents(_) => None,
     });
     volumes.collect()
 }
@@ -82,22 +100,24 @@ fn memory(member: Member, size: u64) -> Volume {
 
 /// Most bytes of the `logs` volume.
 fn logs_limit(input: &JobInput<'_>) -> u64 {
-    let workers = u64::try_from(input.workers()).unwrap_or(u64::MAX);
-    let agent_logs = workers.saturating_mul(input.spec().agent.log_size_limit.bytes());
-    input
-        .plan
-        .storage
-        .s3
-        .size_limit
-        .bytes()
-        .saturating_add(agent_logs)
-        .saturating_add(LOGS_MARGIN)
+    let agents = u64::try_from(members::agents(input.plan)).unwrap_or(u64::MAX);
+    let agent_logs = agents.saturating_mul(input.spec().agent.log_size_limit.bytes());
+    let bounds = input.plan.container().and_then(|own| own.input.as_ref());
+    // What an agent leaves is copied for the evaluators.
+    let copies = if input.plan.agents() == Agents::First { 2 } else { 1 };
+    let submitted = bounds.map_or(0, |bounds| bounds.max_bytes.bytes().saturating_mul(copies));
+    [agent_logs, submitted, LOGS_MARGIN]
+        .into_iter()
+        .fold(input.plan.storage.s3.size_limit.bytes(), u64::saturating_add)
 }
 
 /// Most bytes that the volumes on the node's disk hold together.
 pub(super) fn disk_limit(input: &JobInput<'_>) -> u64 {
-    let has_contents = !input.kind().reserved().volumes.is_empty();
-    logs_limit(input).saturating_add(if has_contents { CONTENTS_BYTES } else { 0 })
+    let (kind, spec) = (input.kind(), input.spec());
+    let contents = u64::from(!kind.reserved(spec).volumes.is_empty());
+    let filled = kind.data(spec).into_iter().filter(|data| data.source.image().is_some());
+    let filled = filled.fold(contents, |count, _| count.saturating_add(1));
+    logs_limit(input).saturating_add(filled.saturating_mul(CONTENTS_BYTES))
 }
 
 fn empty(name: &str, size_limit: Option<Quantity>) -> Volume {
@@ -152,17 +172,21 @@ fn identity() -> Volume {
 
 /// Where `contents` writes, and the runner that keeps what it prints.
 pub(super) fn of_contents(input: &JobInput<'_>) -> Vec<VolumeMount> {
-    let written = input
-        .kind()
-        .reserved()
-        .volumes
-        .iter()
-        .map(|volume| mount(volume.name, volume.written));
+    let reserved = input.kind().reserved(input.spec());
+    let written = reserved.volumes.iter().map(|volume| mount(volume.name, volume.written));
     let own = [
         read_only(mount(TOOLS_VOLUME, TOOLS)),
         mount_part(LOGS_VOLUME, "contents".into(), CONTENTS_LOG_FOLDER),
     ];
     written.chain(own).collect()
+}
+
+/// Mounts of a container that copies data out of its image: the volume, and the runner that copies.
+pub(super) fn of_data(volume: ContentsVolume) -> Vec<VolumeMount> {
+    vec![
+        read_only(mount(TOOLS_VOLUME, TOOLS)),
+        mount(volume.name, volume.written),
+    ]
 }
 
 /// Mounts of `workspace`, which prepares the volumes.
@@ -175,6 +199,11 @@ pub(super) fn of_workspace(input: &JobInput<'_>) -> Vec<VolumeMount> {
 pub(super) fn of_logcopy(input: &JobInput<'_>) -> Vec<VolumeMount> {
     let own = [mount(LOGS_VOLUME, LOGS), read_only(mount(PODINFO_VOLUME, PODINFO))];
     own.into_iter().chain(token(input)).collect()
+}
+
+/// Mounts of `collect`, which needs no identity.
+pub(super) fn of_collect() -> Vec<VolumeMount> {
+    vec![mount(LOGS_VOLUME, LOGS)]
 }
 
 /// Mounts of a worker's container: the runner, the status files, its own volumes, and its shared memory.
@@ -194,6 +223,7 @@ pub(super) fn of_member(member: Member, role: &Role) -> Vec<VolumeMount> {
 fn mounted(wanted: &Mount) -> VolumeMount {
     match wanted {
         Mount::Own { folder, path } => mount_part(LOGS_VOLUME, folder.clone(), path),
+        Mount::Read { folder, path } => read_only(mount_part(LOGS_VOLUME, (*folder).to_owned(), path)),
         Mount::Contents(volume) => read_only(mount(volume.name, volume.read)),
         Mount::OfNode { volume, path } => read_only(mount(volume, path)),
     }

@@ -1,9 +1,9 @@
-//! The two containers of each worker: strangers' images behind our runner. Pure.
+//! The containers of the workers: strangers' images behind our runner. Pure.
 
 use k8s_openapi::api::core::v1::{Container, EnvVar};
 use serde_json::Value;
 
-use super::members::{members, role};
+use super::members::{is_first, members, role};
 use super::security::context;
 use super::{JobInput, gpu, variable, volumes};
 use crate::gpu_claims::source;
@@ -13,14 +13,22 @@ use leaderboard_contract::run::{RUNNER, TOOLS};
 use leaderboard_evaluation::workload::{Role, Workload};
 use leaderboard_protocol::files::{Member, Side};
 
+/// The containers that run side by side.
 pub(super) fn all(input: &JobInput<'_>, workloads: &[Workload]) -> Vec<Container> {
-    members(input)
+    members(input.plan)
+        .filter(|member| !is_first(input.plan, *member))
         .filter_map(|member| container(input, member, role(workloads, member)?))
         .collect()
 }
 
+/// The agent that ends before they start, if there is one.
+pub(super) fn first(input: &JobInput<'_>, workloads: &[Workload]) -> Option<Container> {
+    let member = members(input.plan).find(|member| is_first(input.plan, *member))?;
+    container(input, member, role(workloads, member)?)
+}
+
 fn container(input: &JobInput<'_>, member: Member, role: &Role) -> Option<Container> {
-    let (gpus, name) = (source(input.spec()), member.to_string());
+    let (gpus, agents, name) = (source(input.spec()), input.plan.agents(), member.to_string());
     let hosts = input.spec().given(input.track(), part(member.side))?;
     let env = role.env.iter().map(|(name, value)| variable(name, value));
     let env = env.chain(gpu::variables(gpus, member)).collect();
@@ -28,14 +36,14 @@ fn container(input: &JobInput<'_>, member: Member, role: &Role) -> Option<Contai
         .flags
         .iter()
         .cloned()
-        .chain(gpu::flags(gpus, member.side, role.draws));
+        .chain(gpu::flags(gpus, agents, member.side, role.draws));
     Some(Container {
         image: Some(role.image.clone()),
         // Kubernetes asks for `latest` anew before each container: a worker, or a restart, could get another image.
         image_pull_policy: (member.side == Side::Agent).then(|| "IfNotPresent".into()),
         command: Some(behind_runner(member, flags, &role.command)),
-        env: Some(merged(env, hosts.env, input.kind().reserved().env)),
-        resources: gpu::resources(gpus, member, hosts.resources),
+        env: Some(merged(env, hosts.env, &input.kind().reserved(input.spec()).env)),
+        resources: gpu::resources(gpus, agents, member, hosts.resources),
         security_context: Some(context(hosts.security)),
         volume_mounts: Some(volumes::of_member(member, role)),
         name,

@@ -7,11 +7,10 @@ use serde_json::{Map, Value};
 
 use super::without_nulls;
 use crate::layout::{ANNOTATION_SKIP_CONTAINERS, is_own_volume, protected_mounts};
-use leaderboard_api::{LeaderboardSpec, Part, names};
+use leaderboard_api::{Agents, DataSource, LeaderboardSpec, Part, names};
 use leaderboard_contract::run::{ENV_POD_UID, ENV_ROLE_ARN, ENV_RUN};
-use leaderboard_evaluation::Evaluation;
-use leaderboard_evaluation::workload::Reserved;
-use leaderboard_protocol::files::{Member, Side};
+use leaderboard_evaluation::workload::{Data, Reserved};
+use leaderboard_protocol::files::{Host, Member, Side};
 
 /// Why a Leaderboard's `podOverrides` cannot be used. `path` is below `spec` of the Leaderboard.
 #[derive(thiserror::Error, Debug, PartialEq, Eq)]
@@ -43,6 +42,45 @@ pub enum OverlayError {
 type Checked = Result<(), OverlayError>;
 /// An item of a list with its path.
 type Named<'a> = (String, &'a Map<String, Value>);
+
+/// The Pods of a Leaderboard, as far as an overlay can meet them.
+struct Pods<'a> {
+    host: Host,
+    agents: Agents,
+    reserved: Reserved,
+    data: Vec<Data<'a>>,
+}
+
+impl<'a> Pods<'a> {
+    fn of(spec: &'a LeaderboardSpec) -> Self {
+        let kind = leaderboard_evaluation::of(spec);
+        Self {
+            host: kind.host(),
+            agents: kind.agents(),
+            reserved: kind.reserved(spec),
+            data: kind.data(spec),
+        }
+    }
+
+    /// True for a volume that nobody but the operator mounts.
+    fn is_own_volume(&self, name: &str) -> bool {
+        is_own_volume(name) || self.data.iter().any(|data| data.volume.name == name)
+    }
+
+    /// True for a claim with data, which a volume of another name would give to any container.
+    fn is_own_claim(&self, claim: &Value) -> bool {
+        self.data.iter().any(|data| match data.source {
+            DataSource::Image(_) => false,
+            DataSource::PersistentVolumeClaim(own) => *claim == own.claim_name,
+        })
+    }
+
+    /// True for the init container that fills a volume with data.
+    fn fills(&self, name: &str) -> bool {
+        let mut of_images = self.data.iter().filter(|data| data.source.image().is_some());
+        of_images.any(|data| data.volume.name == name)
+    }
+}
 
 const STATUS_IS_READ: &str = "the controller reads how each container ended there";
 const RUN_BY_US: &str = "the operator runs it and knows how";
@@ -106,20 +144,20 @@ const OWN_ENV: [&str; 6] = [
 
 /// Checks all of a Leaderboard that goes into its Pods: `podOverrides`, and the variables of its containers.
 pub fn validate(spec: &LeaderboardSpec) -> Checked {
-    let kind = leaderboard_evaluation::of(spec);
+    let reserved = leaderboard_evaluation::of(spec).reserved(spec);
     for hosts in [Part::Host, Part::Agent]
         .into_iter()
         .filter_map(|part| spec.given(None, part))
     {
         let names = hosts.env.iter().map(|variable| variable.name.as_str());
-        fixed_names(&format!("{}.env", hosts.path), names, &kind.reserved())?;
+        fixed_names(&format!("{}.env", hosts.path), names, &reserved)?;
     }
     let overlay = spec.pod_overrides.as_ref();
-    overlay.map_or(Ok(()), |pod| validate_overlay(pod, kind))
+    overlay.map_or(Ok(()), |pod| validate_overlay(pod, spec))
 }
 
 /// Checks a Leaderboard's `podOverrides`. The API server's answer to a dry run of the Job then judges what is left.
-pub fn validate_overlay(pod: &Value, kind: &dyn Evaluation) -> Checked {
+pub fn validate_overlay(pod: &Value, leaderboard: &LeaderboardSpec) -> Checked {
     let template = object(pod, "podOverrides")?;
     only(
         template,
@@ -131,7 +169,7 @@ pub fn validate_overlay(pod: &Value, kind: &dyn Evaluation) -> Checked {
         metadata(object(value, "podOverrides.metadata")?)?;
     }
     if let Some(value) = template.get("spec") {
-        spec(object(value, "podOverrides.spec")?, kind)?;
+        spec(object(value, "podOverrides.spec")?, &Pods::of(leaderboard))?;
     }
     let typed: Result<PodTemplateSpec, _> = serde_json::from_value(without_nulls(pod));
     typed.map(|_| ()).map_err(|error| OverlayError::Template {
@@ -163,26 +201,30 @@ fn metadata(metadata: &Map<String, Value>) -> Checked {
     Ok(())
 }
 
-fn spec(spec: &Map<String, Value>, kind: &dyn Evaluation) -> Checked {
+fn spec(spec: &Map<String, Value>, pods: &Pods<'_>) -> Checked {
     fields(spec, "podOverrides.spec", &POD_FIELDS)?;
     if let Some(value) = spec.get("volumes") {
-        volumes(value, &kind.reserved())?;
+        volumes(value, pods)?;
     }
     for (field, init) in [("initContainers", true), ("containers", false)] {
         let Some(value) = spec.get(field) else { continue };
         for (path, container) in named(value, &format!("podOverrides.spec.{field}"))? {
-            check_container(&path, container, init, kind)?;
+            check_container(&path, container, init, pods)?;
         }
     }
     Ok(())
 }
 
-fn volumes(value: &Value, reserved: &Reserved) -> Checked {
+fn volumes(value: &Value, pods: &Pods<'_>) -> Checked {
     for (path, volume) in named(value, "podOverrides.spec.volumes")? {
         if let Some(name) = volume["name"].as_str()
-            && (is_own_volume(name) || reserved.volumes.iter().any(|known| known.name == name))
+            && (pods.is_own_volume(name) || pods.reserved.volumes.iter().any(|known| known.name == name))
         {
             return protected(path, "the operator fills this volume; give yours another name");
+        }
+        let claim = volume.get("persistentVolumeClaim");
+        if claim.is_some_and(|claim| pods.is_own_claim(&claim["claimName"])) {
+            return protected(path, "the operator mounts this claim where evaluation.container says");
         }
         let sources = volume
             .get("projected")
@@ -200,29 +242,32 @@ fn volumes(value: &Value, reserved: &Reserved) -> Checked {
 /// Whose container an entry of the overlay speaks of.
 #[derive(Clone, Copy, PartialEq, Eq)]
 enum Whose {
-    /// `workspace`, `logcopy`.
+    /// `workspace`, `logcopy`, `collect`.
     Own,
     /// `contents`.
     Contents,
+    /// `dataset`, `labels`.
+    Data,
     /// The host's or the agent's of one worker or all.
     Worker,
+    /// The agent that ends before the hosts' containers start.
+    First,
     /// An init container of the host's.
     Added,
-    /// One that only another kind of evaluation has.
-    OfAnotherKind,
+    /// One that only Pods of other Leaderboards have.
+    OfOthers,
 }
 
-fn check_container(path: &str, container: &Map<String, Value>, init: bool, kind: &dyn Evaluation) -> Checked {
-    let (name, reserved) = (container["name"].as_str().unwrap_or_default(), &kind.reserved());
-    let whose = whose(name, kind);
+fn check_container(path: &str, container: &Map<String, Value>, init: bool, pods: &Pods<'_>) -> Checked {
+    let whose = whose(container["name"].as_str().unwrap_or_default(), pods);
     match (whose, init) {
-        (Whose::OfAnotherKind, _) => {
-            return protected(
-                path.into(),
-                "only Pods of another kind of evaluation have it; take another name",
-            );
+        (Whose::OfOthers, _) => {
+            let why = "no Pod of this Leaderboard has it, and the name is the operator's; take another name";
+            return protected(path.into(), why);
         }
-        (Whose::Own | Whose::Contents, false) => return protected(path.into(), "it is an init container"),
+        (Whose::Own | Whose::Contents | Whose::Data | Whose::First, false) => {
+            return protected(path.into(), "it is an init container");
+        }
         (Whose::Worker, true) => return protected(path.into(), "it belongs to containers"),
         (Whose::Added, false) => {
             let why = "a further container would keep the Pod from ending; add it to initContainers with restartPolicy Always";
@@ -230,7 +275,7 @@ fn check_container(path: &str, container: &Map<String, Value>, init: bool, kind:
         }
         _ => {}
     }
-    mounts(path, container, reserved)?;
+    mounts(path, container, pods)?;
     if whose == Whose::Added {
         return Ok(());
     }
@@ -240,19 +285,31 @@ fn check_container(path: &str, container: &Map<String, Value>, init: bool, kind:
         path,
         &[("restartPolicy", RUN_BY_US), ("restartPolicyRules", RUN_BY_US)],
     )?;
-    env(path, container, whose, reserved)
+    if whose == Whose::Data {
+        fields(container, path, &[("volumeMounts", RUN_BY_US)])?;
+    }
+    env(path, container, whose, &pods.reserved)
 }
 
-fn whose(name: &str, kind: &dyn Evaluation) -> Whose {
-    let sides = [Side::Host(kind.host()), Side::Agent];
-    let is_alias = sides.iter().any(|side| side.name() == name);
-    match (name, Member::parse(name)) {
+fn whose(name: &str, pods: &Pods<'_>) -> Whose {
+    let mut sides = [Side::Host(pods.host), Side::Agent].into_iter();
+    let alias = sides.find(|side| side.name() == name);
+    match (name, Member::parse(name).map(|member| member.side).or(alias)) {
         (names::CONTAINER_WORKSPACE | names::CONTAINER_LOGCOPY, _) => Whose::Own,
-        (names::CONTAINER_CONTENTS, _) if kind.reserved().volumes.is_empty() => Whose::OfAnotherKind,
-        (names::CONTAINER_CONTENTS, _) => Whose::Contents,
-        (_, Some(member)) if sides.contains(&member.side) => Whose::Worker,
-        (_, Some(_)) => Whose::OfAnotherKind,
-        (_, None) if is_alias => Whose::Worker,
+        (names::CONTAINER_COLLECT, _) if pods.agents == Agents::First => Whose::Own,
+        (names::CONTAINER_CONTENTS, _) if !pods.reserved.volumes.is_empty() => Whose::Contents,
+        (names::CONTAINER_DATASET | names::CONTAINER_LABELS, _) if pods.fills(name) => Whose::Data,
+        (
+            names::CONTAINER_COLLECT | names::CONTAINER_CONTENTS | names::CONTAINER_DATASET | names::CONTAINER_LABELS,
+            _,
+        ) => Whose::OfOthers,
+        (_, Some(Side::Agent)) => match pods.agents {
+            Agents::Beside => Whose::Worker,
+            Agents::First => Whose::First,
+            Agents::Absent => Whose::OfOthers,
+        },
+        (_, Some(Side::Host(host))) if host == pods.host => Whose::Worker,
+        (_, Some(Side::Host(_))) => Whose::OfOthers,
         (_, None) => Whose::Added,
     }
 }
@@ -272,8 +329,8 @@ fn env(path: &str, container: &Map<String, Value>, whose: Whose, reserved: &Rese
             ),
             None => Ok(()),
         },
-        Whose::Worker => fixed_names(&path, names, reserved),
-        Whose::Contents | Whose::Added | Whose::OfAnotherKind => Ok(()),
+        Whose::Worker | Whose::First => fixed_names(&path, names, reserved),
+        Whose::Contents | Whose::Data | Whose::Added | Whose::OfOthers => Ok(()),
     }
 }
 
@@ -287,7 +344,7 @@ fn fixed_names<'a>(path: &str, mut names: impl Iterator<Item = &'a str>, reserve
     }
 }
 
-fn mounts(path: &str, container: &Map<String, Value>, reserved: &Reserved) -> Checked {
+fn mounts(path: &str, container: &Map<String, Value>, pods: &Pods<'_>) -> Checked {
     let path = format!("{path}.volumeMounts");
     let Some(value) = container.get("volumeMounts") else {
         return Ok(());
@@ -301,15 +358,15 @@ fn mounts(path: &str, container: &Map<String, Value>, reserved: &Reserved) -> Ch
                 expected: "a path",
             });
         };
-        if let Some(ours) = protected_mounts(reserved).find(|ours| below(target, ours)) {
+        if let Some(ours) = protected_mounts(&pods.reserved).find(|ours| below(target, ours)) {
             return protected(path, format!("the operator mounts {ours}"));
         }
         let volume = mount.get("name").and_then(Value::as_str).unwrap_or_default();
         let read_only = mount.get("readOnly") == Some(&Value::Bool(true));
-        if is_own_volume(volume) {
+        if pods.is_own_volume(volume) {
             return protected(path, format!("volume {volume} is mounted by the operator alone"));
         }
-        if !read_only && reserved.volumes.iter().any(|known| known.name == volume) {
+        if !read_only && pods.reserved.volumes.iter().any(|known| known.name == volume) {
             return protected(
                 path,
                 format!("volume {volume} holds the contents; mount it with readOnly true"),
