@@ -29,6 +29,16 @@ class Images(unittest.TestCase):
         self.assertLessEqual(agent, told)
         self.assertIn(f"--version {release.version(REPOSITORY)}", page)
 
+    def test_the_first_submission_is_for_a_track_of_the_game(self) -> None:
+        wanted = (REPOSITORY / quickstart.GAME).read_text()
+        board, track = (re.search(rf"^  {key}: (\S+)$", wanted, re.MULTILINE)[1] for key in ("leaderboardName", "track"))
+        parts = (REPOSITORY / quickstart.MANIFEST).read_text().split("\n---\n")
+        [game] = [part for part in parts if f"\nkind: Leaderboard\nmetadata:\n  name: {board}\n" in part]
+        self.assertIn(f"- {{name: {track}, ", game)
+        # As the page promises it: what local/games/README.md works out is of this seed and so many games.
+        for name, value in (("GAMES", '"8"'), ("SEED", "window")):
+            self.assertIn(f"{{name: {name}, value: {value}}}", game)
+
     def test_the_dockerfile_runs_each_of_them_as_the_lab_does(self) -> None:
         stages = dict(STAGE.findall((LOCAL / "quickstart" / "Dockerfile").read_text()))
         self.assertEqual(stages.keys() - {"build"}, {name.partition(":")[0].partition("/")[2] for name in self.made})
