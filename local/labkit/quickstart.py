@@ -1,4 +1,4 @@
-"""Owns the images that examples/quickstart.yaml and its first submission name, made by the lab in place of those that a release publishes: same names, same tag.
+"""Owns the images that examples/quickstart.yaml and its first submission name, made by the lab: same names and tag as a release has.
 
 Called by `lab test` for the cluster's tests. What a release publishes is made by local/quickstart/Dockerfile.
 """

@@ -31,7 +31,8 @@ class Images(unittest.TestCase):
 
     def test_the_first_submission_is_for_a_track_of_the_game(self) -> None:
         wanted = (REPOSITORY / quickstart.GAME).read_text()
-        board, track = (re.search(rf"^  {key}: (\S+)$", wanted, re.MULTILINE)[1] for key in ("leaderboardName", "track"))
+        named = dict(re.findall(r"^  (\w+): (\S+)$", wanted, re.MULTILINE))
+        board, track = named["leaderboardName"], named["track"]
         parts = (REPOSITORY / quickstart.MANIFEST).read_text().split("\n---\n")
         [game] = [part for part in parts if f"\nkind: Leaderboard\nmetadata:\n  name: {board}\n" in part]
         self.assertIn(f"- {{name: {track}, ", game)
