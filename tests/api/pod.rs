@@ -7,6 +7,7 @@ mod cloudwatch;
 mod endpoints;
 mod evaluators;
 mod hostile;
+mod input;
 mod limits;
 mod measure;
 mod preparing;

@@ -5,7 +5,7 @@ use tokio::sync::watch;
 use super::*;
 use crate::support::throttle::Throttle;
 use leaderboard_aws::logs::Miss;
-use leaderboard_contract::keys::{CONTENTS_LOG, WORKSPACE_LOG};
+use leaderboard_contract::keys::{COLLECT_LOG, CONTENTS_LOG, WORKSPACE_LOG};
 use leaderboard_contract::report::Logs;
 
 /// A Pod whose logs go to a group of its own, and the group's name.
@@ -186,13 +186,15 @@ async fn what_is_stored_and_was_refused_until_a_restart_is_sent_after_it() {
 }
 
 #[tokio::test]
-async fn workspace_and_contents_have_streams_of_their_own() {
+async fn the_containers_before_the_evaluators_have_streams_of_their_own() {
     let (pod, group) = pod_with_logs().await;
     let logs = pod.aws.logs(None, None);
     pod.append(WORKSPACE_LOG, b"{\"message\":\"restored what was stored\"}\n");
     pod.append(CONTENTS_LOG, b"copied 20 routes\n");
+    pod.append(COLLECT_LOG, b"copied 2 files\n");
     shipper(&pod, ship::STREAM_A_DAY).pass(true).await.unwrap();
     assert_eq!(all(&logs, &group, "77/contents").await, ["copied 20 routes"]);
+    assert_eq!(all(&logs, &group, "77/collect").await, ["copied 2 files"]);
     let sent = all(&logs, &group, "77/workspace").await;
     assert_eq!(sent, ["{\"message\":\"restored what was stored\"}"]);
 }
