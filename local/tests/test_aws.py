@@ -151,7 +151,7 @@ class Policies(unittest.TestCase):
     def test_the_calls_of_each_program_are_found(self) -> None:
         # Some that are certain, so that a scan that finds nothing is no success.
         for program, calls in (
-            ("controller", {"get_object", "put_object", "list_objects_v2", "update_item"}),
+            ("controller", {"get_object", "put_object", "list_objects_v2", "upload_part", "update_item"}),
             ("bridge", {"receive_message", "send_message"}),
             ("submission-worker", {"upload_part_copy", "delete_object", "put_log_events"}),
         ):
@@ -175,17 +175,18 @@ class Policies(unittest.TestCase):
                     self.assertRegex(resource, r"^arn:aws:[a-z0-9]+:.*[a-z0-9>]", f"{file.name}: {action}")
             self.assertNotIn('"*"', [a for a, _ in awscalls.actions(file)])
 
-    def test_the_controller_writes_two_objects_of_a_run(self) -> None:
-        files = ("crates/contract/src/report.rs", "crates/api/src/names.rs")
+    def test_the_controller_writes_two_objects_of_a_run_and_its_submitted_file(self) -> None:
+        files = ("crates/contract/src/report.rs", "crates/contract/src/keys.rs", "crates/api/src/names.rs")
         keys = "".join((REPOSITORY / name).read_text() for name in files)
-        wanted = set(re.findall(r'(?:OWNER_KEY|FAILURE_LOG_KEY): &str = "(.+)"', keys))
-        self.assertEqual(len(wanted), 2)
-        put = [
-            resources
-            for action, resources in awscalls.actions(POLICIES / "controller.json")
-            if action == "s3:PutObject"
-        ]
-        self.assertEqual({resource.split("/", 2)[2] for resource in put[0]}, wanted)
+        own = set(re.findall(r'(?:OWNER_KEY|FAILURE_LOG_KEY): &str = "(.+)"', keys))
+        submitted = set(re.findall(r'INPUT: &str = "(.+)"', keys))
+        self.assertEqual((len(own), submitted), (2, {"input/"}))
+        allowed: dict[str, set[str]] = {}
+        for action, resources in awscalls.actions(POLICIES / "controller.json"):
+            allowed.setdefault(action, set()).update(resource.partition("/*/")[2] for resource in resources)
+        parts = {f"{folder}*" for folder in submitted}
+        self.assertEqual(allowed["s3:PutObject"], own | parts)
+        self.assertEqual(allowed["s3:AbortMultipartUpload"], parts)
 
     def test_a_session_of_a_pod_has_the_rights_of_its_role(self) -> None:
         code = awscalls.TESTS.sub("", (REPOSITORY / "crates/pod/src/identity.rs").read_text())

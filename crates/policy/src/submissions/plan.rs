@@ -26,7 +26,7 @@ pub struct Plan {
 pub enum SlotUse {
     /// The Job is about to be created, or exists.
     Holds,
-    /// It stands in line for one, and for nothing else.
+    /// It stands in line for one, and for nothing else; or it has one, and its file is being copied.
     Waits,
     /// It waits for something else, or has come to its end: a later attempt stands in line like anyone.
     Leaves,
