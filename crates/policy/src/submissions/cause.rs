@@ -23,7 +23,7 @@ const NOT_ISOLATED: &str = "The Pod was not shown to be isolated from the networ
      container workspace.";
 
 const NO_INPUT: &str = "The submitted file is not in the bucket.";
-const BAD_INPUT: &str = "The files that the agent has left cannot be taken.";
+const BAD_INPUT: &str = "The files that the agent has left cannot be taken; have it write regular files within the bounds, and submit again.";
 
 /// A container that does not start.
 pub(super) struct Trouble {
@@ -226,7 +226,7 @@ pub(super) fn failure_of(found: &Trouble, pod: &PodView, seconds: i64) -> Failur
             "The submitted image is of a kind that cannot be run.",
             "Build the image with a present version of its tool, and submit again.",
         ),
-        Cause::Input => participant(found.reason, message, &for_both("Correct this, and submit again.")),
+        Cause::Input => failure::input_refused(message),
         Cause::Registry | Cause::Node | Cause::Host => match found.reason {
             Reason::NotIsolated | Reason::InputMissing => infrastructure(found.reason, message),
             Reason::Preparing => infrastructure(Reason::StartDeadline, &tried),

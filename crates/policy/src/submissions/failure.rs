@@ -63,6 +63,15 @@ pub(super) fn image_invalid(what: &str) -> Failure {
     charged(Reason::ImageInvalid, what)
 }
 
+/// The files that an agent has left cannot be taken. `what` says what the participant does, too.
+pub(super) fn input_refused(what: &str) -> Failure {
+    let next = Steps {
+        hosts: "Look at agent/agent1/leaderboard.log of the results.".to_owned(),
+        participant: "The challenge's hosts have the agent's log.".to_owned(),
+    };
+    participant(Reason::InputInvalid, what, &next)
+}
+
 pub(super) fn job_deleted() -> Failure {
     infrastructure(Reason::JobDeleted, "The Job was deleted repeatedly by somebody else.")
 }

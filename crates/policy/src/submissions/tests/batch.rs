@@ -180,13 +180,14 @@ fn collect_fails(reason: &str, why: &str) -> World {
 
 #[test]
 fn files_that_cannot_be_taken_end_the_run_at_once_at_the_participants_cost() {
-    let mut world = collect_fails("InputRefused", "answers.csv is a symbolic link: leave regular files.");
+    let why = "answers.csv in /submission can't be taken: it is a link; have the agent write regular files, and submit again.";
+    let mut world = collect_fails("InputRefused", why);
     let failure = is_stopped(&mut world, Participant, Reason::InputInvalid);
-    let expected = "answers.csv is a symbolic link: leave regular files. Correct this, and submit again.";
-    assert_eq!(
-        (failure.message.as_str(), failure.participant_message),
-        (expected, None)
-    );
+    let expected = [
+        format!("{why} Look at agent/agent1/leaderboard.log of the results."),
+        format!("{why} The challenge's hosts have the agent's log."),
+    ];
+    assert_eq!([failure.message, failure.participant_message.unwrap()], expected);
     assert_eq!(annotated(&world.pass()), Some(Stop::Retries));
     world.complete();
     let plan = world.pass_to(Failed, Reason::InputInvalid);
