@@ -159,16 +159,15 @@ fn agent_first(containers: Vec<ContainerView>, later: &[&str]) -> PodView {
     pod(starts(first.into_iter().chain(containers).collect(), later))
 }
 
-#[test]
-fn after_an_agent_that_runs_first_the_evaluators_have_the_deadlines_of_a_start_from_its_end() {
+type Stage = (&'static str, PodView, Option<i64>, &'static [&'static str], i64);
+
+/// The stages of such a Pod, each with the containers that wait for an image, and by when it has to be further.
+fn stages_of_agent_first() -> [Stage; 6] {
     const EVALUATORS: [&str; 2] = ["evaluator-1", "evaluator-2"];
     let agent = || ran("agent-1", 2000, 9000);
-    let after_collect = |later: &[ContainerView], waits: &[&str]| {
-        let first = [agent(), ran("collect", 9010, 9020)];
-        agent_first(first.into_iter().chain(later.iter().cloned()).collect(), waits)
-    };
-    let failing = waits("evaluator-1", "ErrImagePull");
-    for (what, pod, stalled, names, second) in [
+    let collect = || ran("collect", 9010, 9020);
+    let failing = || waits("evaluator-1", "ErrImagePull");
+    [
         (
             "its image is pulled",
             agent_first(vec![], &["agent-1", "collect", "evaluator-1", "evaluator-2"]),
@@ -192,26 +191,31 @@ fn after_an_agent_that_runs_first_the_evaluators_have_the_deadlines_of_a_start_f
         ),
         (
             "the images of the evaluators are pulled",
-            after_collect(&[], &EVALUATORS),
+            agent_first(vec![agent(), collect()], &EVALUATORS),
             None,
             &EVALUATORS,
             9000 + 5400,
         ),
         (
             "one cannot be pulled",
-            after_collect(std::slice::from_ref(&failing), &["evaluator-2"]),
+            agent_first(vec![agent(), collect(), failing()], &["evaluator-2"]),
             Some(9100),
             &["evaluator-2"],
             9100 + 1800,
         ),
         (
             "causes take turns",
-            after_collect(std::slice::from_ref(&failing), &["evaluator-2"]),
+            agent_first(vec![agent(), collect(), failing()], &["evaluator-2"]),
             Some(80_000),
             &["evaluator-2"],
             9000 + 5400 + 1800,
         ),
-    ] {
+    ]
+}
+
+#[test]
+fn after_an_agent_that_runs_first_the_evaluators_have_the_deadlines_of_a_start_from_its_end() {
+    for (what, pod, stalled, names, second) in stages_of_agent_first() {
         assert_eq!(waiting(&pod, Agents::First), names, "{what}");
         let found = limit(&pod, Agents::First, &deadlines(), stalled.map(at)).unwrap();
         assert_eq!(found.at, at(second), "{what}");
