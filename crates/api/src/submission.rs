@@ -72,7 +72,7 @@ pub struct SubmissionSpec {
     #[schemars(length(min = 1, max = 512), regex(pattern = r"^[a-z0-9][!-~]*$"))]
     pub image: Option<String>,
     /// The participant's file, for a Leaderboard of the mode Predictions. It lies in the bucket, below the run's prefix at `input/file`;
-    /// `kubectl leaderboard submit --file` puts it there.
+    /// `submit --file` of the plugin puts it there.
     #[serde(default, skip_serializing_if = "Option::is_none")]
     pub input: Option<SubmittedFile>,
     /// Identity of the submission in EvalAI.
