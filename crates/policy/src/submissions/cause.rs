@@ -23,7 +23,8 @@ const NOT_ISOLATED: &str = "The Pod was not shown to be isolated from the networ
      container workspace.";
 
 const NO_INPUT: &str = "The submitted file is not in the bucket.";
-const BAD_INPUT: &str = "The files that the agent has left cannot be taken; have it write regular files within the bounds, and submit again.";
+const BAD_INPUT: &str = "The files that the agent has left cannot be taken; have it write regular files within the bounds, and submit \
+     again.";
 
 /// A container that does not start.
 pub(super) struct Trouble {
