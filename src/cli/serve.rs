@@ -80,7 +80,7 @@ pub(super) fn logcopy(options: &InPod) -> ExitCode {
 pub(super) fn collect(options: &InPod) -> ExitCode {
     let places = Places::below(&options.root);
     ownlog::start(&places.logs, leaderboard_contract::keys::COLLECT_LOG);
-    start_logged("collect", THREADS, || async {
+    start_logged("collect", THREADS_IN_POD, || async {
         let run = places::run().map_err(|e| e.to_string())?;
         let stop = on_signals().map_err(|e| e.to_string())?;
         tokio::select! {

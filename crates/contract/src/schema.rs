@@ -1,8 +1,8 @@
 //! Tests of the documents between the controller and its Pods, against the files of `golden/`: a run lasts days, and an upgrade of the
 //! operator does not wait for it.
 //!
-//! `report`, `run`, the verdict of `workspace`, the list of `collect` and the owner's mark carry a number each. A field that an older reader can do without
-//! changes no number. Anything else does; the number before is then read too, and keeps its file.
+//! `report`, `run`, the verdict of `workspace`, the list of `collect` and the owner's mark carry a number each. A field that an older
+//! reader can do without changes no number. Anything else does; the number before is then read too, and keeps its file.
 
 use serde::Serialize;
 use serde_json::Value;

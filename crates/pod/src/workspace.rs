@@ -303,7 +303,7 @@ fn folders(setting: &Setting) -> Result<Arc<Tree>, WorkspaceError> {
 mod tests {
     use super::*;
     use crate::isolation::Blocked;
-    use leaderboard_api::{EvaluationMode, PlannedEvaluation};
+    use leaderboard_api::EvaluationMode;
     use leaderboard_contract::report::RefusedResults;
     use leaderboard_contract::verdict::{NotAVerdict, VERDICT_BYTES};
     use leaderboard_evaluation::fixtures;
@@ -370,12 +370,8 @@ mod tests {
     /// The volume of a run of evaluators, with its folders.
     fn prepared(mode: EvaluationMode) -> (tempfile::TempDir, Arc<Tree>) {
         let root = tempfile::tempdir().unwrap();
-        let mut run = fixtures::container_run();
-        if let PlannedEvaluation::Container(plan) = &mut run.plan.evaluation {
-            plan.mode = mode;
-        }
         let setting = Setting {
-            run,
+            run: fixtures::run_of_mode(mode),
             pod_uid: "pod-1".to_owned(),
             api_server: None,
             role_arn: None,

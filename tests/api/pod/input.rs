@@ -1,9 +1,9 @@
 //! What the evaluators read: it is stored whole, brought back whole, and otherwise not at all.
 
-use leaderboard_api::{EvaluationMode, InputBounds, SubmittedFile};
+use leaderboard_api::{EvaluationMode, SubmittedFile};
 use leaderboard_contract::collected::Collected;
 use leaderboard_contract::keys::{COLLECTED, INPUT_FILE};
-use leaderboard_evaluation::fixtures::{container_run, result};
+use leaderboard_evaluation::fixtures::{result, run_of_mode};
 use leaderboard_pod::collect;
 
 use super::*;
@@ -16,11 +16,7 @@ const SUBMITTED: &[u8] = b"id,label\n1,cat\n";
 async fn pod_of(mode: EvaluationMode) -> Pod {
     let bucket = server().await.bucket().await;
     let mut run = run(&bucket);
-    run.plan.evaluation = container_run().plan.evaluation;
-    if let PlannedEvaluation::Container(plan) = &mut run.plan.evaluation {
-        plan.mode = mode;
-        plan.input = mode.has_input().then(InputBounds::default);
-    }
+    run.plan.evaluation = run_of_mode(mode).plan.evaluation;
     if mode == EvaluationMode::Predictions {
         let digest = Object::new(SUBMITTED).digest;
         run.input = Some(SubmittedFile {

@@ -41,9 +41,8 @@ impl Pod {
             fs::create_dir_all(places.logs.join(made)).unwrap();
         }
         fs::create_dir(folder.path().join("dev")).unwrap();
-        let mut run = fixtures::container_run();
+        let mut run = fixtures::run_of_mode(EvaluationMode::Batch);
         if let PlannedEvaluation::Container(plan) = &mut run.plan.evaluation {
-            plan.mode = EvaluationMode::Batch;
             let bounds = json!({"maxBytes": bytes.to_string(), "maxFiles": files});
             plan.input = serde_json::from_value(bounds).unwrap();
         }

@@ -1,5 +1,5 @@
-//! Which files there are to store: those of the workers' folders, as far as they are looked at, what the evaluators read once it is listed, and
-//! the known logs in any case. Reads names and stamps only.
+//! Which files there are to store: those of the workers' folders, as far as they are looked at, what the evaluators read once it is
+//! listed, and the known logs in any case. Reads names and stamps only.
 
 use std::collections::BTreeMap;
 use std::collections::hash_map::DefaultHasher;

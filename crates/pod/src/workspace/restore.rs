@@ -18,7 +18,7 @@ use crate::upload::quota::{LEAST, Quota};
 use crate::upload::{Memory, Stored, fingerprint};
 use leaderboard_api::names::FAILURE_LOG_KEY;
 use leaderboard_aws::archive::{Archive, Listed};
-use leaderboard_contract::keys::{EVALAI, EVALUATORS, MERGED, REFUSED, checkpoint_path};
+use leaderboard_contract::keys::{EVALAI, EVALUATORS, MERGED, REFUSED, SUBMISSION_FOLDER, checkpoint_path};
 use leaderboard_contract::report::{OWNER_KEY, REPORT_KEY};
 use leaderboard_contract::run::{Run, STATUS_FOLDER};
 use leaderboard_evaluation::{Results, of_plan};
@@ -204,8 +204,9 @@ fn evaluator_of(key: &str) -> Option<Pair> {
 
 /// True if a key is one that the run goes on with.
 fn is_restored(key: &str, pairs: usize) -> bool {
-    // Logcopy makes its files from the checkpoints again, and evidence is for people.
-    let unread = [&format!("{STATUS_FOLDER}/"), "logcopy/.", EVALAI, REFUSED];
+    // Logcopy makes its files from the checkpoints again, evidence is for people, and an agent alone leaves files.
+    let (statuses, left) = (format!("{STATUS_FOLDER}/"), format!("{SUBMISSION_FOLDER}/"));
+    let unread = [statuses.as_str(), left.as_str(), "logcopy/.", EVALAI, REFUSED];
     key != MERGED && !unread.iter().any(|folder| key.starts_with(folder)) && !is_foreign_agent(key, pairs)
 }
 
@@ -324,6 +325,7 @@ mod tests {
             listed("logcopy/refused/agent/agent1/agent_results.json", 5),
             listed("logcopy/.stored.json", 5),
             listed("logcopy/logcopy.log", 40),
+            listed("submission/forged.csv", 5),
         ];
         let chosen = choose(objects, &Quota::new(MIB, 2, Host::Simulator), 2);
         let expected = [
