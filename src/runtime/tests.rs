@@ -18,7 +18,7 @@ use leaderboard_pod_spec::job::OwnImage;
 use leaderboard_policy::allowed::Allowed;
 
 /// All that runs in a leader without Leaderboards, in the order of names.
-const TASKS: [&str; 29] = [
+const TASKS: [&str; 30] = [
     "ask buckets",
     "ask dead-letter queues",
     "ask log groups",
@@ -32,6 +32,7 @@ const TASKS: [&str; 29] = [
     "fences",
     "gauges",
     "inbox",
+    "inputs",
     "lease",
     "nodes",
     "policies",
