@@ -75,6 +75,8 @@ fn judge(field: &str, claim: &str, seen: &ObservedClaim, problems: &mut Problems
 
 #[cfg(test)]
 mod tests {
+    use http::{Request, Response, StatusCode};
+    use kube::client::Body;
     use serde_json::{Value, json};
 
     use super::*;
@@ -152,5 +154,33 @@ mod tests {
             of(json!({"spec": spec, "status": {"phase": "Pending"}})),
             ["ReadWriteOnce"]
         );
+    }
+    #[tokio::test]
+    async fn a_claim_is_read_in_the_namespace_of_its_leaderboard_and_one_that_may_not_be_read_goes_unchecked() {
+        let claim = json!({"metadata": {"name": "l"}, "spec": {"accessModes": ["ReadWriteOnce"]}});
+        let refusal = |code: u16| json!({"kind": "Status", "status": "Failure", "message": "no", "code": code});
+        for (code, answer, is_refused, notes) in [
+            (200, claim, false, 1),
+            (404, refusal(404), true, 0),
+            (403, refusal(403), false, 0),
+        ] {
+            let (service, mut server) = tower_test::mock::pair::<Request<Body>, Response<Body>>();
+            let client = Client::new(service, "default");
+            let mut board = board(&json!({"labels": {"persistentVolumeClaim": {"claimName": "l"}}}));
+            board.metadata.namespace = Some("ns".into());
+            let serve = async {
+                let (request, send) = server.next_request().await.unwrap();
+                assert_eq!(request.uri().path(), "/api/v1/namespaces/ns/persistentvolumeclaims/l");
+                let mut response = Response::new(Body::from(answer.to_string().into_bytes()));
+                *response.status_mut() = StatusCode::from_u16(code).unwrap();
+                send.send_response(response);
+            };
+            let (found, ()) = tokio::join!(look(&client, &board), serve);
+            assert_eq!(
+                (found.refused.is_some(), found.notes.len()),
+                (is_refused, notes),
+                "{code}"
+            );
+        }
     }
 }

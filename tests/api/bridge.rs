@@ -18,6 +18,7 @@ use kube::{Client, ResourceExt};
 use serde_json::{Value, json};
 use tokio::sync::watch;
 
+use super::objects::merge;
 use crate::support::{apiserver, ministack};
 use leaderboard_api::{Attempt, Ingested, Leaderboard, Submission, names};
 use leaderboard_aws::clients::Aws;
@@ -227,11 +228,16 @@ impl World {
     }
 
     /// A Leaderboard of challenge 1 with this phase, and its queue.
-    async fn leaderboard(&self, name: &str, phase: i64, mut queue: Value) {
+    async fn leaderboard(&self, name: &str, phase: i64, queue: Value) {
+        self.leaderboard_with(name, phase, queue, &json!({})).await;
+    }
+
+    /// The same with more of its spec.
+    async fn leaderboard_with(&self, name: &str, phase: i64, mut queue: Value, more: &Value) {
         if queue["endpoint"].is_null() {
             queue["endpoint"] = json!(self.stand_in.endpoint);
         }
-        let leaderboard = serde_json::from_value(json!({
+        let mut leaderboard = json!({
             "apiVersion": "leaderboard.carla.org/v1alpha1",
             "kind": "Leaderboard",
             "metadata": {"name": name},
@@ -248,7 +254,9 @@ impl World {
                 "storage": {"s3": {"bucket": "results"}},
                 "queue": {"sqs": queue}
             }
-        }));
+        });
+        merge(&mut leaderboard, &json!({ "spec": more }));
+        let leaderboard = serde_json::from_value(leaderboard);
         // As a person writes it: the API server fills in the rest.
         let kind = ApiResource::erase::<Leaderboard>(&());
         let api: Api<DynamicObject> = Api::namespaced_with(self.client.clone(), &self.namespace, &kind);

@@ -6,6 +6,7 @@ mod access;
 mod cancels;
 mod ends;
 mod faults;
+mod inputs;
 mod load;
 mod sweep;
 

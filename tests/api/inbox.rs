@@ -17,6 +17,8 @@ use serde_json::{Value, json};
 use tokio::time::timeout;
 
 use super::bridge::LIMIT;
+use super::objects::merge;
+use super::rule_cases::container::by_container;
 use super::world::{HOST, World};
 
 /// The queue of all of the stand-in's challenges.
@@ -26,6 +28,16 @@ impl World {
     async fn leaderboard_with_inbox(&self, queue: &str) {
         let more = json!({"queue": {"evalai": {"name": queue, "unknownAfterSeconds": 0}}});
         self.leaderboard_with("lb", 1, "Hosts", &more).await;
+    }
+
+    /// A Leaderboard with an evaluation by a container in this mode, which reads the same queue.
+    async fn leaderboard_in_mode(&self, name: &str, phase: i64, mode: &str) {
+        let spec = by_container(&json!({
+            "evaluation": {"container": {"mode": mode}},
+            "tracks": [{"name": "test", "phase": phase, "container": {"score": {"metric": "Driving score"}}}],
+            "queue": {"evalai": {"name": QUEUE, "unknownAfterSeconds": 0}},
+        }));
+        self.leaderboard_with(name, phase, "Hosts", &spec).await;
     }
 
     async fn post(&self, path: &str, body: &Value) -> Value {
@@ -38,7 +50,13 @@ impl World {
 
     /// Team a pushes, and EvalAI sends the message.
     async fn push_and_send(&self) -> u64 {
-        let body = json!({"team": "team-a", "phase": 1, "image": "r/team-a:1"});
+        self.push_to(1, &json!({"image": "r/team-a:1"})).await
+    }
+
+    /// Team a pushes this to a phase, and EvalAI sends the message.
+    async fn push_to(&self, phase: u64, what: &Value) -> u64 {
+        let mut body = json!({"team": "team-a", "phase": phase});
+        merge(&mut body, what);
         let pushed = self.post("/_stand-in/submit", &body).await;
         pushed["submission"].as_u64().unwrap()
     }
@@ -57,6 +75,16 @@ impl World {
             queue_down,
             ..Knobs::default()
         });
+    }
+
+    /// Waits until the operator drives a Leaderboard.
+    async fn driven(&self, name: &str) {
+        let is_driven = |found: Option<&Leaderboard>| {
+            let status = found.and_then(|board| board.status.as_ref());
+            status.is_some_and(|status| status.operator.is_some())
+        };
+        let driven = timeout(LIMIT, Box::pin(await_condition(self.api(), name, is_driven))).await;
+        driven.expect("the operator drives it").unwrap();
     }
 
     /// Waits until so many messages are left in the queue.
@@ -216,4 +244,50 @@ async fn a_queue_that_evalai_does_not_know_is_named() {
         "{message}"
     );
     assert!(message.contains("check queue.evalai.name"), "{message}");
+}
+
+#[tokio::test(flavor = "multi_thread", worker_threads = 2)]
+async fn a_file_of_predictions_becomes_a_submission_without_an_image() {
+    let world = World::new().await;
+    world.evalai.with_state(|state| {
+        let challenge = &mut state.seed.challenges[0];
+        (challenge.is_docker_based, challenge.remote_evaluation) = (false, false);
+    });
+    let _controller = world.controller();
+    world.leaderboard_in_mode("lb", 1, "Predictions").await;
+    let message = world.ready("True", Reason::Ready).await;
+    assert!(
+        message.contains("remote_evaluation: false in EvalAI") && message.contains("set it to true there"),
+        "{message}"
+    );
+    let pk = world.push_to(1, &json!({"content": "id,label\n1,cat\n"})).await;
+    let made = world.made(pk).await;
+    assert_eq!((made.spec.image, made.spec.input), (None, None));
+    assert_eq!(made.spec.evalai.map(|evalai| evalai.phase), Some(1));
+    world.left(0).await;
+}
+
+#[tokio::test(flavor = "multi_thread", worker_threads = 2)]
+async fn a_static_code_upload_runs_in_batch_and_is_dropped_where_another_mode_serves_its_phase() {
+    let world = World::new().await;
+    world.evalai.with_state(|state| {
+        state.seed.challenges[0].is_static_dataset_code_upload = true;
+    });
+    let _controller = world.controller();
+    world.leaderboard_in_mode("lb", 1, "Batch").await;
+    world.leaderboard_in_mode("other", 2, "Interactive").await;
+    world.driven("other").await;
+    let pk = world.push_and_send().await;
+    let made = world.made(pk).await;
+    assert_eq!(made.spec.image.as_deref(), Some("r/team-a:1"));
+    let dropped = world.push_to(2, &json!({"image": "r/team-a:1"})).await;
+    let note = world.event("MessageDropped").await;
+    assert!(
+        note.contains("the Leaderboard other has the mode Interactive"),
+        "{note}"
+    );
+    world.left(0).await;
+    let name = names::submission(i64::try_from(dropped).unwrap());
+    let found: Option<Submission> = world.api().get_opt(&name).await.unwrap();
+    assert!(found.is_none());
 }

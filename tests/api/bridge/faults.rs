@@ -1,6 +1,7 @@
 //! Messages that cannot be used, and queues that cannot be read.
 
 use super::*;
+use crate::api::rule_cases::container::by_container;
 
 #[tokio::test]
 async fn what_cannot_be_used_becomes_a_dead_letter_with_its_reason() {
@@ -29,6 +30,49 @@ async fn what_cannot_be_used_becomes_a_dead_letter_with_its_reason() {
     );
     world.stand_in.drained(&url).await;
     eventually("no message is left to be old", async || bridge.oldest(&url).is_none()).await;
+    bridge.stop().await;
+}
+
+#[tokio::test]
+async fn a_static_code_upload_becomes_a_submission_in_batch_and_a_dead_letter_elsewhere() {
+    let world = World::new("bridge-static").await;
+    let (url, dead) = (world.stand_in.queue("q").await, world.stand_in.queue("dead").await);
+    let queue = json!({"url": url, "deadLetterURL": dead});
+    let in_mode = |mode: &str, phase: i64| {
+        by_container(&json!({
+            "evaluation": {"container": {"mode": mode}},
+            "tracks": [{"name": "test", "phase": phase, "container": {"score": {"metric": "accuracy"}}}],
+        }))
+    };
+    for (name, phase, mode) in [("batch", 2, "Batch"), ("interactive", 3, "Interactive")] {
+        let spec = in_mode(mode, phase);
+        world.leaderboard_with(name, phase, queue.clone(), &spec).await;
+    }
+    world.leaderboard("carla", 4, queue).await;
+    let bridge = world.bridge();
+    let upload = |phase: i64, submission: i64| {
+        let mut message: Value = serde_json::from_str(&body(phase, submission)).unwrap();
+        message["is_static_dataset_code_upload_submission"] = json!(true);
+        message.to_string()
+    };
+    let bodies = [upload(3, 8), upload(4, 9)];
+    for body in [&upload(2, 7), &bodies[0], &bodies[1]] {
+        world.stand_in.send(&url, body).await;
+    }
+    let made = world.submission("submission-7", |_| true).await;
+    assert_eq!(made.spec.image.as_deref(), Some("registry.example/a:1"));
+    let letters = world.stand_in.dead_letters(&dead, 2).await;
+    for (body, named) in bodies.iter().zip([
+        "the Leaderboard interactive has the mode Interactive",
+        "the Leaderboard carla has evaluation.carla",
+    ]) {
+        let (_, attributes) = letters.iter().find(|(text, _)| text == body).unwrap();
+        assert_eq!(attributes["reason"], "Malformed");
+        assert!(attributes["detail"].contains(named), "{attributes:?}");
+    }
+    world.stand_in.drained(&url).await;
+    let made = world.submissions().list(&ListParams::default()).await.unwrap();
+    assert_eq!(made.items.len(), 1);
     bridge.stop().await;
 }
 
