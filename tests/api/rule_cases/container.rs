@@ -29,6 +29,11 @@ fn tracks(more: &Value) -> Value {
     json!({"tracks": [track(more)]})
 }
 
+fn merged(mut of: Value, more: &Value) -> Value {
+    merge(&mut of, more);
+    of
+}
+
 fn container(more: &Value) -> Value {
     json!({"evaluation": {"container": more}})
 }
@@ -76,10 +81,7 @@ fn modes() -> Vec<Case> {
         container(&all)
     };
     let (dataset, none) = (json!({"dataset": {"image": {"reference": "data:1"}}}), json!({}));
-    let for_agent = |mut of: Value| {
-        merge(&mut of, &json!({"datasetForAgent": true}));
-        of
-    };
+    let for_agent = |of: &Value| merged(of.clone(), &json!({"datasetForAgent": true}));
     let score = |split: usize, metric: usize| {
         tracks(&json!({"container": {"score": {"split": "s".repeat(split), "metric": "m".repeat(metric)}}}))
     };
@@ -103,13 +105,13 @@ fn modes() -> Vec<Case> {
         ),
         case(
             "datasetForAgent needs a dataset",
-            &container(&for_agent(dataset.clone())),
-            &container(&for_agent(none.clone())),
+            &container(&for_agent(&dataset)),
+            &container(&for_agent(&none)),
         ),
         case(
             "datasetForAgent needs a dataset",
             &mode("Predictions", &dataset),
-            &mode("Predictions", &for_agent(dataset.clone())),
+            &mode("Predictions", &for_agent(&dataset)),
         ),
         case("split and metric have at most 63", &score(31, 32), &score(32, 32)),
     ]
@@ -129,6 +131,11 @@ fn gpus() -> Vec<Case> {
             &tracks(&json!({"container": {"evaluator": requests("limits")}})),
         ),
         case("container.resources names nvidia.com/gpu", &none, &json!({"gpu": null})),
+        case(
+            "container.resources names nvidia.com/gpu",
+            &container(&merged(requests("limits"), &json!({"mode": "Predictions"}))),
+            &container(&json!({"mode": "Batch"})),
+        ),
     ]
 }
 

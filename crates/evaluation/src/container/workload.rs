@@ -19,12 +19,12 @@ const SUBMISSION: &str = "/submission";
 const SHM: &str = "/dev/shm";
 const DATASET: ContentsVolume = ContentsVolume {
     name: names::CONTAINER_DATASET,
-    written: "/data",
+    written: "/leaderboard-data",
     read: "/dataset",
 };
 const LABELS: ContentsVolume = ContentsVolume {
     name: names::CONTAINER_LABELS,
-    written: "/data",
+    written: "/leaderboard-data",
     read: "/labels",
 };
 const ADDRESS: &str = "EVALUATOR_ADDRESS";
