@@ -111,7 +111,7 @@ fn each_container_mounts_its_own_and_no_more() {
                 "workspace" => vec!["logs+ /logs".into(), "tools+ /leaderboard-tools".into()],
                 "logcopy" => vec!["logs+ /logs".into(), "podinfo /podinfo".into()],
                 "collect" => vec!["logs+ /logs".into()],
-                "dataset" => vec!["dataset+ /data".into()],
+                "dataset" => vec!["dataset+ /leaderboard-data".into()],
                 _ => vec![status.into(), own(name)],
             };
             if ["workspace", "logcopy"].contains(&name) {
