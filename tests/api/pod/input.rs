@@ -88,6 +88,25 @@ async fn what_an_agent_has_left_is_stored_and_a_replaced_pod_has_it_without_the_
     assert_eq!(etag(&next, "input/a.csv").await, before, "it is not sent again");
 }
 
+/// A Pod that is lost once an agent's files are stored, and some of each evaluator.
+async fn lost() -> Pod {
+    let lost = pod_of(EvaluationMode::Batch).await;
+    lost.prepare().await.unwrap();
+    for (key, bytes) in [
+        (COLLECTED, list(&FILES)),
+        ("input/a.csv", FILES[0].1.to_vec()),
+        ("input/frames/1.json", FILES[1].1.to_vec()),
+        ("input/../x", b"x".to_vec()),
+        ("x", b"x".to_vec()),
+        ("evaluators/1/result.json", result(1, 2, 0.5).into_bytes()),
+        ("evaluators/2/console.log", b"a line\n".to_vec()),
+        ("agent/agent1/leaderboard.log", b"a line\n".to_vec()),
+    ] {
+        lost.archive.put(key, bytes).await.unwrap();
+    }
+    lost
+}
+
 #[tokio::test]
 async fn without_every_file_as_it_was_the_agent_and_the_evaluators_run_anew() {
     let hostile = |path: &str| list(&[FILES[0], FILES[1], (path, b"x")]);
@@ -104,25 +123,7 @@ async fn without_every_file_as_it_was_the_agent_and_the_evaluators_run_anew() {
         ("no list at all", COLLECTED, Some(b"{".to_vec())),
     ];
     for (what, key, bytes) in table {
-        let lost = pod_of(EvaluationMode::Batch).await;
-        lost.prepare().await.unwrap();
-        let of_evaluators = result(1, 2, 0.5).into_bytes();
-        for (path, bytes) in FILES {
-            lost.archive
-                .put(&format!("input/{path}"), bytes.to_vec())
-                .await
-                .unwrap();
-        }
-        for (key, bytes) in [
-            (COLLECTED, list(&FILES)),
-            ("input/../x", b"x".to_vec()),
-            ("x", b"x".to_vec()),
-            ("evaluators/1/result.json", of_evaluators),
-            ("evaluators/2/console.log", b"a line\n".to_vec()),
-            ("agent/agent1/leaderboard.log", b"a line\n".to_vec()),
-        ] {
-            lost.archive.put(key, bytes).await.unwrap();
-        }
+        let lost = lost().await;
         match bytes {
             Some(bytes) => drop(lost.archive.put(key, bytes).await.unwrap()),
             None => lost.archive.delete(&[key.to_owned()]).await.unwrap(),

@@ -53,13 +53,14 @@ pub(super) async fn submitted(run: &Run, archive: &Archive, tree: &Arc<Tree>) ->
     }
 }
 
-/// Takes what evaluators read out of the stored objects, and brings it in the mode Batch. Returns what is stored of it.
+/// Takes what evaluators read out of the stored objects, and brings it in the mode Batch. Returns the other objects, and what is stored of
+/// it.
 pub(super) async fn take(
     run: &Run,
     archive: &Archive,
     tree: &Arc<Tree>,
-    objects: &mut Vec<Listed>,
-) -> Result<BTreeMap<String, Stored>, WorkspaceError> {
+    mut objects: Vec<Listed>,
+) -> Result<(Vec<Listed>, BTreeMap<String, Stored>), WorkspaceError> {
     let input: Vec<Listed> = objects.extract_if(.., |object| is_input(&object.key)).collect();
     let mut stored: BTreeMap<String, Stored> = unknown(input.iter()).collect();
     if run.plan.agents() == Agents::First {
@@ -71,7 +72,7 @@ pub(super) async fn take(
             remove(archive, others).await?;
         }
     }
-    Ok(stored)
+    Ok((objects, stored))
 }
 
 /// Brings the files that `collect` of an earlier Pod has copied, if each of them is stored; the agent is done then. `None` if not, and

@@ -55,10 +55,8 @@ pub async fn restore(
     if !listing.complete {
         tracing::warn!("the prefix holds more than {MAX_OBJECTS} objects; the rest is not restored");
     }
-    let mut objects = listing.objects;
-    let input = input::take(run, archive, tree, &mut objects).await?;
-    let limit = run.plan.storage.s3.size_limit.bytes();
-    let workers = run.plan.workers();
+    let (objects, input) = input::take(run, archive, tree, listing.objects).await?;
+    let (limit, workers) = (run.plan.storage.s3.size_limit.bytes(), run.plan.workers());
     let quota = Quota::new(limit, workers, of_plan(&run.plan).host());
     let chosen = choose(objects, &quota, workers);
     let others = chosen.unknown();
@@ -84,8 +82,7 @@ pub async fn restore(
         left_out: chosen.left_out,
     };
     // An object that is not restored stays stored all the same, and counts.
-    memory.stored.extend(others);
-    memory.stored.extend(input);
+    memory.stored.extend(others.into_iter().chain(input));
     memory.save(tree).map_err(|error| volume("logcopy", error))?;
     if restored.left_out > 0 {
         tracing::warn!(
