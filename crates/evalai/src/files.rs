@@ -53,7 +53,6 @@ enum Unfound {
 }
 
 /// Reads uploaded files.
-#[derive(Clone)]
 pub(super) struct Files {
     transport: Arc<dyn Transport>,
     timeouts: Timeouts,

@@ -155,8 +155,9 @@ async fn submit(asked: Submit) -> Result<String, Failure> {
         let read = std::fs::read_to_string(&path);
         read.map_err(|error| Failure::Start(format!("cannot read {path}: {error}; choose another --content")))
     });
+    let content = content.transpose()?;
     let body = serde_json::json!({
-        "team": asked.team, "phase": asked.phase, "image": asked.image, "content": content.transpose()?,
+        "team": asked.team, "phase": asked.phase, "image": asked.image, "content": content,
         "file": asked.file, "method_name": asked.name,
     });
     let client = Client::new(&asked.server.server, &asked.server.token);
