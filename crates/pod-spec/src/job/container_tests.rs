@@ -28,7 +28,7 @@ fn the_init_containers_have_names_and_start_in_that_order() {
     let data = json!({"image": {"reference": "d"}});
     let case = |mode: &str| Case::container(json!({"mode": mode, "dataset": data, "labels": data}), &json!({}));
     let with_data = ["workspace", "dataset", "labels", "logcopy"];
-    for (case, expected, first) in [
+    for (case, expected, first) in vec![
         (
             Case::new("V1", json!({})),
             ["workspace", "contents", "logcopy"].as_slice(),

@@ -238,7 +238,7 @@ fn the_job_of_a_submitted_file_is_as_committed() {
 #[test]
 fn the_job_has_no_field_that_kubernetes_does_not_know() {
     let data = json!({"image": {"reference": "d"}});
-    for case in [
+    for case in vec![
         Case::new("V2", json!({"podIdentity": role()})),
         Case::container(json!({"port": 9000}), &json!({})),
         Case::container(json!({"mode": "Batch", "dataset": data}), &json!({})),

@@ -45,7 +45,7 @@ fn containers_are_addressed_where_the_pods_of_their_leaderboard_have_them() {
         "it belongs to containers",
     );
     let plain = |mode: &str| of_mode(&json!({"mode": mode}), &json!([]));
-    for (spec, names, in_containers, in_init) in [
+    for (spec, names, in_containers, in_init) in vec![
         (
             carla(),
             ["simulator", "simulator-2", "agent", "agent-1"].as_slice(),

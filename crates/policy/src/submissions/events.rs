@@ -8,9 +8,10 @@ use leaderboard_api::conditions;
 use leaderboard_api::{Agents, Reason, ReasonName, State, SubmissionStatus};
 
 /// Reasons that Kubernetes' own events, the event `Started` and the status show anyway.
-const WITHOUT_EVENT: [Reason; 4] = [
+const WITHOUT_EVENT: [Reason; 5] = [
     Reason::Preparing,
     Reason::AskingEvalAI,
+    Reason::FetchingInput,
     Reason::Running,
     Reason::Resumed,
 ];

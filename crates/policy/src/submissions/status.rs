@@ -226,6 +226,10 @@ impl<'a> PlanBuilder<'a> {
     /// The status of a new attempt, with what was pinned and what earlier attempts reached.
     fn start_status(&mut self, wanted: Attempt) {
         let old = std::mem::take(&mut self.status);
+        let is_lost = old
+            .failure
+            .as_ref()
+            .is_some_and(|failure| failure.reason == Reason::InputMissing);
         // Objects that Pods from before a restore have stored belong to earlier attempts.
         let submission_uid = self.submission().metadata.uid.clone();
         let next = |plan: RunPlan| RunPlan {
@@ -240,7 +244,8 @@ impl<'a> PlanBuilder<'a> {
             track: old.track,
             plan: old.plan.map(next),
             image: old.image,
-            input: old.input,
+            // One that the bucket has lost is fetched anew.
+            input: old.input.filter(|_| !is_lost),
             progress: old.progress,
             score: old.score.map(Score::so_far),
             metrics: old.metrics,
