@@ -6,6 +6,7 @@ Called by `lab image` and by `lab up` (the pause image).
 import os
 import platform
 import subprocess
+import sys
 import sysconfig
 import tempfile
 import urllib.error
@@ -161,6 +162,9 @@ def file_entries(settings: Settings, item: FileSpec, search: Search, image: str)
             item.to, 0o644 if item.mode is None else item.mode, item.value.encode(), uid=item.uid, gid=item.gid
         )
         return
+    if item.kind == "made":
+        yield from made(settings, item, image)
+        return
     source = locate(settings, item, search, image)
     if source.is_dir():
         yield from folder_entries(source, item)
@@ -173,6 +177,18 @@ def file_entries(settings: Settings, item: FileSpec, search: Search, image: str)
         raise LabError(f"{image}: {source} needs shared libraries: add libs = true to its entry, or build it static")
     mode = item.mode if item.mode is not None else 0o755 if os.access(source, os.X_OK) else 0o644
     yield layer.Entry(item.to, mode, content, uid=item.uid, gid=item.gid)
+
+
+def made(settings: Settings, item: FileSpec, image: str) -> Iterator[layer.Entry]:
+    """What a Python program of the repository writes into the folder that is its only argument, or a part of that."""
+    program, _, part = item.value.partition(" ")
+    with tempfile.TemporaryDirectory(prefix="leaderboard-made-") as folder:
+        argv = [sys.executable, str(settings.repository / program), folder]
+        done = subprocess.run(argv, capture_output=True, text=True, check=False)
+        written = Path(folder) / part
+        if done.returncode != 0 or not written.is_dir():
+            raise LabError(f"{image}: {program} writes no folder {part!r} ({done.stderr.strip()[-300:]})")
+        yield from folder_entries(written, item)
 
 
 def locate(settings: Settings, item: FileSpec, search: Search, image: str) -> Path:

@@ -9,14 +9,14 @@ from typing import Any
 
 from .errors import LabError
 
-SOURCES = ("bin", "host", "python", "repo", "text")
+SOURCES = ("bin", "host", "made", "python", "repo", "text")
 REPOSITORY = re.compile(r"[a-z0-9]+(?:[._/-][a-z0-9]+)*")
 TAG = re.compile(r"[A-Za-z0-9_][A-Za-z0-9_.-]{0,127}")
 
 
 @dataclass(frozen=True)
 class FileSpec:
-    """One entry of `files`: `kind` is bin, host, python, repo or text; `value` is what follows the colon."""
+    """One entry of `files`: `kind` is one of SOURCES; `value` is what follows the colon."""
 
     kind: str
     value: str
@@ -174,8 +174,8 @@ def parse_file(table: object, place: str) -> FileSpec:
         raise LabError(f"{place}: from must begin with one of {', '.join(f'{source}:' for source in SOURCES)}")
     if kind == "host" and not value.startswith("/"):
         raise LabError(f"{place}: host: takes an absolute path, not {value!r}")
-    if kind == "repo" and (value.startswith("/") or ".." in PurePosixPath(value).parts):
-        raise LabError(f"{place}: repo: takes a path inside the repository, not {value!r}")
+    if kind in ("made", "repo") and (value.startswith("/") or ".." in PurePosixPath(value).parts):
+        raise LabError(f"{place}: {kind}: takes a path inside the repository, not {value!r}")
     spec = FileSpec(
         kind,
         value,

@@ -14,6 +14,7 @@ files = [
   {from = "host:/bin/bash", to = "/bin/bash", libs = true},
   {from = "repo:local/challenge/contents", to = "/workspace", uid = 1000, gid = 1000},
   {from = "text:export A=1: yes", to = "/root/.bashrc"},
+  {from = "made:examples/data.py labels", to = "/labels"},
 ]
 symlinks = [{to = "/bin/sh", target = "/bin/bash"}]
 dirs = [{path = "/tmp", mode = "1777"}, {path = "/root"}]
@@ -44,6 +45,7 @@ class Taken(unittest.TestCase):
                 FileSpec("host", "/bin/bash", "/bin/bash", None, True, 0, 0),
                 FileSpec("repo", "local/challenge/contents", "/workspace", None, False, 1000, 1000),
                 FileSpec("text", "export A=1: yes", "/root/.bashrc", None, False, 0, 0),
+                FileSpec("made", "examples/data.py labels", "/labels", None, False, 0, 0),
             ),
         )
         self.assertEqual(first.symlinks, (LinkSpec("/bin/sh", "/bin/bash"),))
