@@ -124,6 +124,7 @@ async fn try_templates(client: &Client, settings: &Settings, leaderboard: &Leade
     let classes = priority::look(client, &asked).await;
     let data = data_claims::look(client, leaderboard).await;
     let notes = notes(&pods).into_iter().chain(pod_notes::unnamed(&pods, hosts));
+    let notes = notes.chain(pod_notes::unused(&leaderboard.spec));
     TriedPods {
         refused: refused.or(classes.refused).or(data.refused),
         notes: notes.chain(classes.notes).chain(data.notes).collect(),

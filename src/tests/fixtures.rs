@@ -272,7 +272,7 @@ pub fn with_job(name: &str, board: &Leaderboard) -> (Submission, Job) {
     submission.metadata.generation = Some(1);
     submission.metadata.creation_timestamp = Some(now.clone());
     submission.metadata.finalizers = Some(vec![names::FINALIZER_SUBMISSION.into()]);
-    let (track, image) = (&board.spec.tracks[0], "agent:1".to_owned());
+    let (track, image) = (&board.spec.tracks[0], Some("agent:1".to_owned()));
     let plan = effective::plan(&board.spec, track, name.parse().unwrap(), image, false).unwrap();
     let job_name = names::job(name, JobNumber::first(Attempt(1)));
     submission.status = Some(SubmissionStatus {

@@ -12,7 +12,7 @@ mod upload;
 
 use aws_sdk_s3::error::{ProvideErrorMetadata, SdkError};
 use aws_sdk_s3::primitives::ByteStream;
-use futures::stream::{self, StreamExt, TryStreamExt};
+use futures::{StreamExt, TryStreamExt};
 use hyper::body::Bytes;
 use tokio::io::AsyncWriteExt;
 
@@ -293,7 +293,7 @@ impl Archive {
     /// a checksum, which some stores refuse.
     pub async fn delete(&self, keys: &[String]) -> Result<(), ArchiveError> {
         let removals = keys.iter().map(|key| self.remove(key));
-        stream::iter(removals)
+        futures::stream::iter(removals)
             .buffer_unordered(DELETIONS_AT_ONCE)
             .try_collect()
             .await

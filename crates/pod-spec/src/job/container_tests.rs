@@ -24,6 +24,7 @@ fn is_own(container: &Value) -> bool {
 
 /// `kubectl leaderboard logs --of start` shows them in the order of this list.
 #[test]
+#[expect(clippy::useless_vec, reason = "an array of Leaderboards is too large for the stack")]
 fn the_init_containers_have_names_and_start_in_that_order() {
     let data = json!({"image": {"reference": "d"}});
     let case = |mode: &str| Case::container(json!({"mode": mode, "dataset": data, "labels": data}), &json!({}));

@@ -236,6 +236,7 @@ fn the_job_of_a_submitted_file_is_as_committed() {
 }
 
 #[test]
+#[expect(clippy::useless_vec, reason = "an array of Leaderboards is too large for the stack")]
 fn the_job_has_no_field_that_kubernetes_does_not_know() {
     let data = json!({"image": {"reference": "d"}});
     for case in vec![
