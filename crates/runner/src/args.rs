@@ -45,6 +45,7 @@ agent:      --work /tmp/agent      where leaderboard.log is written
             --idle-seconds 800     no output for so long ends the command
             --report-gpu false     true: looks for a GPU before anything else, and reports it to its host
             --alone                with --host evaluator: there is none beside it, and none is waited for or followed
+            --leaves DIR           with --alone: after exit code 0 of CMD all users can read the files below it
             --host simulator       evaluator: CMD is a plain program, without the options below
             --python-path A:B:C    put in front of the image's own PYTHONPATH
             --route-runs N         the pair's routes times repetitions: CMD is not started on a checkpoint that has all of them
@@ -134,7 +135,10 @@ pub enum Program {
         route_runs: Option<u32>,
     },
     /// An evaluator evaluates it.
-    Plain,
+    Plain {
+        /// Folder in which it leaves files for its evaluator, if it is alone.
+        leaves: Option<PathBuf>,
+    },
 }
 
 impl Job {
@@ -181,7 +185,7 @@ impl Job {
                 ..
             }
             | Role::Agent {
-                program: Program::Plain,
+                program: Program::Plain { .. },
                 ..
             } => Host::Evaluator,
         }
@@ -275,6 +279,14 @@ pub fn parse(arguments: impl IntoIterator<Item = OsString>) -> Result<Request, U
     if job.host() == Host::Evaluator {
         job.alone = options.optional(ALONE, "true or false")?.unwrap_or(false);
     }
+    if job.alone
+        && let Role::Agent {
+            program: Program::Plain { leaves },
+            ..
+        } = &mut job.role
+    {
+        *leaves = options.take("--leaves")?.map(PathBuf::from);
+    }
     options.finish()?;
     if job.command.is_empty() {
         return Err(UsageError::NoCommand);
@@ -364,7 +376,7 @@ fn program(options: &mut Options) -> Result<Program, UsageError> {
             python_path: options.take("--python-path")?.filter(|value| !value.is_empty()),
             route_runs: options.optional("--route-runs", "a number of routes")?,
         }),
-        Some(b"evaluator") => Ok(Program::Plain),
+        Some(b"evaluator") => Ok(Program::Plain { leaves: None }),
         Some(_) => Err(UsageError::Invalid {
             option: "--host",
             value: host.unwrap_or_default(),

@@ -33,7 +33,7 @@ impl Part {
             },
             Role::Agent { program, .. } => match program {
                 Program::Driver { .. } => Self::Driver,
-                Program::Plain => Self::Plain,
+                Program::Plain { .. } => Self::Plain,
             },
         }
     }

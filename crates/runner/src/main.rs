@@ -10,6 +10,7 @@ mod keep;
 mod keep_output;
 mod kernel;
 mod launch;
+mod left_files;
 mod memory;
 mod own_folder;
 mod report;

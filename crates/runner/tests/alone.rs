@@ -5,6 +5,7 @@
 mod support;
 
 use std::fs;
+use std::os::unix::fs::PermissionsExt;
 use std::time::{Duration, Instant};
 
 use leaderboard_protocol::files::{Mark, StatusFile};
@@ -44,6 +45,27 @@ fn an_agent_runs_once_to_its_end() {
     assert_eq!((again.code(), again.verdict().what), (0, What::Finished));
     assert_eq!(fs::read_to_string(pod.path("said")).unwrap(), "ran\n");
     assert_eq!(pod.files(AGENT), ["agent-1.done", "agent-1.start0"]);
+}
+
+#[test]
+fn all_users_can_read_what_an_agent_has_left_when_it_is_done() {
+    let pod = Pod::new();
+    let folder = pod.path("left");
+    fs::create_dir(&folder).unwrap();
+    let leaves = format!("--leaves={}", folder.display());
+    for (code, expected) in [(3, [0o700, 0o600]), (0, [0o755, 0o644])] {
+        let inner = folder.join(code.to_string());
+        let file = inner.join("answers");
+        let script = format!(
+            "umask 077; mkdir {}; echo a > {}; exit {code}",
+            inner.display(),
+            file.display()
+        );
+        let mut agent = agent(&pod, &script, &[&leaves]);
+        assert_eq!(agent.code() == 0, code == 0, "{}", agent.stderr());
+        let found = [&inner, &file].map(|path| fs::metadata(path).unwrap().permissions().mode() & 0o777);
+        assert_eq!(found, expected, "exit code {code}");
+    }
 }
 
 #[test]

@@ -164,6 +164,7 @@ impl Known<'_> {
             folder: SUBMISSION_FOLDER.to_owned(),
             path: SUBMISSION,
         });
+        let leaves = is_first.then(|| format!("--leaves={SUBMISSION}"));
         let mut env: Vec<_> = if is_first {
             self.of_run()
                 .chain([(SUBMISSION_PATH, SUBMISSION.to_owned())])
@@ -177,7 +178,12 @@ impl Known<'_> {
         let shared = shared.into_iter().map(|data| Mount::Contents(data.volume));
         Some(Role {
             image: self.asked.plan.image.clone()?,
-            flags: [host].into_iter().chain(self.alone()).chain(flags).collect(),
+            flags: [host]
+                .into_iter()
+                .chain(self.alone())
+                .chain(leaves)
+                .chain(flags)
+                .collect(),
             command: literals(&of_host(spec.command.as_deref(), spec.args.as_deref())?),
             env,
             mounts: [work].into_iter().chain(submission).chain(shared).collect(),
@@ -373,11 +379,9 @@ mod tests {
             });
             assert_eq!(found, expected, "{mode} {more}");
             assert_eq!(of_worker(2).is_some(), mode == "Interactive", "{mode}");
-            let alone = agent
-                .iter()
-                .flat_map(|agent| &agent.flags)
-                .any(|flag| flag == "--alone");
-            assert_eq!(alone, mode == "Batch");
+            let has = |flag: &str| agent.iter().flat_map(|agent| &agent.flags).any(|own| own == flag);
+            let found = [has("--alone"), has("--leaves=/submission")];
+            assert_eq!(found, [mode == "Batch"; 2], "{mode}");
         }
     }
 

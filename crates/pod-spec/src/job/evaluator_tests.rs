@@ -45,7 +45,7 @@ fn an_evaluator_and_its_agent_stand_behind_the_runner_with_their_own_words() {
     let (words, mut env) = started(container(&job, "agent-2"), &[]);
     let (agent, command) = behind_runner(&words, &mut env);
     let role = args::Role::Agent {
-        program: args::Program::Plain,
+        program: args::Program::Plain { leaves: None },
         work: "/tmp/agent".into(),
         idle: seconds(30),
         report_gpu: false,

@@ -120,7 +120,7 @@ fn an_evaluators_agent_is_a_plain_program() {
     let job = job("agent --pair 3 --status /s --host=evaluator --idle-seconds 3 -- a");
     assert_eq!((job.member(), job.peer()), (PAIR.agent(), PAIR.host(Host::Evaluator)));
     let expected = Role::Agent {
-        program: Program::Plain,
+        program: Program::Plain { leaves: None },
         work: WORK.into(),
         idle: Duration::from_secs(3),
         report_gpu: false,
@@ -199,6 +199,14 @@ fn each_mistake_is_named() {
             "--alone: \"2\" is not true or false",
         ),
         (
+            "agent --pair 1 --status /s --host evaluator --leaves /l -- a",
+            "unknown option --leaves",
+        ),
+        (
+            "evaluator --pair 1 --status /s --results /r --alone --leaves /l -- a",
+            "unknown option --leaves",
+        ),
+        (
             "agent --pair 1 --status /s --host evaluators -- a",
             "--host: \"evaluators\" is not simulator or evaluator",
         ),
@@ -254,6 +262,18 @@ fn an_evaluator_and_its_agent_may_be_alone() {
         ] {
             assert_eq!(job(&format!("{line} {option} -- a")).alone, alone, "{line} {option}");
         }
+    }
+}
+
+#[test]
+fn an_agent_that_is_alone_may_leave_files() {
+    let line = "agent --pair 1 --status /s --host evaluator --alone";
+    for (option, expected) in [("", None), ("--leaves=/l", Some("/l")), ("--leaves /l", Some("/l"))] {
+        let Role::Agent { program, .. } = job(&format!("{line} {option} -- a")).role else {
+            panic!("an agent's line");
+        };
+        let leaves = expected.map(PathBuf::from);
+        assert_eq!(program, Program::Plain { leaves }, "{option}");
     }
 }
 

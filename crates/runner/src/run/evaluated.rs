@@ -12,7 +12,7 @@ use super::Runner;
 use crate::decide::{Cause, Part};
 use crate::group::Status;
 use crate::result::{self, REFUSED, State};
-use crate::{checkpoint, report};
+use crate::{checkpoint, left_files, report};
 
 /// Time that an evaluator with a complete result has to end by itself: what it has printed last may still be in its own buffers.
 const LAST_WORDS: Duration = Duration::from_secs(5);
@@ -72,10 +72,19 @@ impl Runner {
                 let complete = matches!(&found, Ok(found) if found.complete || self.is_driven(found));
                 (complete, Some(report::of_checkpoint(&found)))
             }
-            _ => (
-                self.part == Part::Plain && self.status() == Some(Status::Exited(0)),
-                None,
-            ),
+            (
+                Role::Agent {
+                    program: Program::Plain { leaves },
+                    ..
+                },
+                _,
+            ) if self.status() == Some(Status::Exited(0)) => {
+                if let Some(folder) = leaves {
+                    left_files::make_readable(folder, left_files::ENTRIES);
+                }
+                (true, None)
+            }
+            _ => (false, None),
         }
     }
 
