@@ -50,6 +50,7 @@ mod cluster {
     mod gpus;
     mod helm;
     mod hostile_containers;
+    mod hostile_inputs;
     mod import;
     mod isolation;
     mod losses;
@@ -59,6 +60,7 @@ mod cluster {
     mod matrix_runs;
     mod matrix_stops;
     mod matrix_waits;
+    mod modes;
     mod names;
     mod probe_endings;
     mod probes;

@@ -30,6 +30,8 @@ pub(super) const GUESSES: &str = "8.25";
 const HELD_GUESSES: &str = "8.5";
 /// So many games are over then.
 const HELD: i32 = 4;
+/// Words of the other kind of evaluation.
+pub(super) const FOREIGN_WORDS: [&str; 5] = ["carla", "route", "simulat", "pair ", "driving"];
 /// What the evaluator of each worker keeps of its games at the end.
 const GAMES: [&str; 2] = ["[7, 9, 4, 10]", "[10, 10, 7, 9]"];
 
@@ -101,7 +103,8 @@ async fn a_message_becomes_the_exact_score_though_its_pod_is_deleted_half_way() 
         let submission = case.ends(scene, &name, LIMIT).await;
         case.evalai(evalai.submission(pk).status);
         assert_exact(&submission);
-        assert_published(scene, &evalai, pk).await;
+        let score = ("guesses", GUESSES);
+        assert_published(scene, &evalai, pk, &results(GUESSES), score, "8/8").await;
         assert_kept(scene, &pk.to_string()).await;
         assert_own_words(scene, &name, &pk.to_string()).await;
         assert_eq!(
@@ -149,11 +152,18 @@ fn assert_exact(submission: &Submission) {
     assert_eq!(found.value.parse(), Ok(1.0), "every number was found");
 }
 
-/// EvalAI's row, its leaderboard, its files, S3 and the table show the same.
-async fn assert_published(scene: &Scene, evalai: &Evalai, pk: u64) {
+/// EvalAI's row, its leaderboard, its files, S3 and the table show the same results, of which the first split has the score.
+pub(super) async fn assert_published(
+    scene: &Scene,
+    evalai: &Evalai,
+    pk: u64,
+    expected: &Value,
+    (label, score): (&str, &str),
+    progress: &str,
+) {
     let run = pk.to_string();
     let stored: Value = serde_json::from_str(&scene.cloud.text(&run, "evalai/results.json").await).unwrap();
-    assert_eq!(stored, results(GUESSES));
+    assert_eq!(&stored, expected);
     let row = evalai.submission(pk);
     assert_eq!(row.status, Status::Finished);
     let rows = evalai.rows(pk);
@@ -161,15 +171,15 @@ async fn assert_published(scene: &Scene, evalai: &Evalai, pk: u64) {
     assert_eq!(json!(rows[0].result), stored[0]["accuracies"]);
     let shown = evalai.leaderboard(FIRST_PHASE).await;
     assert_eq!(shown[0]["submission__id"], json!(pk));
-    assert_eq!(shown[0]["filtering_score"], stored[0]["accuracies"]["guesses"]);
+    assert_eq!(shown[0]["filtering_score"], stored[0]["accuracies"][label]);
     let text = scene.cloud.text(&run, "evalai/stdout.txt").await;
     assert_eq!(evalai.file(row.stdout_file.as_ref()), text);
     assert_eq!(evalai.file(row.stderr_file.as_ref()).trim(), "", "nothing went wrong");
     let row = scene.cloud.row(&scene.cloud.table).await;
     for (column, text) in [
-        ("guesses", GUESSES),
+        (label, score),
         ("submission_status", "FINISHED"),
-        ("progress", "8/8"),
+        ("progress", progress),
     ] {
         assert_eq!(row.get(column).map(String::as_str), Some(text), "{column} of {row:?}");
     }
@@ -205,6 +215,11 @@ async fn result(scene: &Scene, run: &str, worker: u16) -> Value {
 
 /// No person reads of another kind of evaluation.
 pub(super) async fn assert_own_words(scene: &Scene, name: &str, run: &str) {
+    assert_without(scene, name, run, &FOREIGN_WORDS).await;
+}
+
+/// No person reads one of these words.
+pub(super) async fn assert_without(scene: &Scene, name: &str, run: &str, words: &[&str]) {
     let submission = scene.api::<Submission>().get(name).await.unwrap();
     let status = submission.status.unwrap_or_default();
     let events = scene.events(name).await.into_iter().filter_map(|event| event.note);
@@ -213,7 +228,7 @@ pub(super) async fn assert_own_words(scene: &Scene, name: &str, run: &str) {
     texts.insert("stdout".to_owned(), scene.cloud.text(run, "evalai/stdout.txt").await);
     for (place, text) in texts {
         let lower = text.to_lowercase();
-        for word in ["carla", "route", "simulat", "pair ", "driving"] {
+        for word in words {
             assert!(!lower.contains(word), "{name}: {place} has the word {word}: {text}");
         }
     }
@@ -296,7 +311,7 @@ async fn evaluators_die(scene: &Scene) {
     case.close();
 }
 
-async fn one_job(case: &mut Case, scene: &Scene, name: &str) {
+pub(super) async fn one_job(case: &mut Case, scene: &Scene, name: &str) {
     let jobs = scene.jobs().await;
     let own = jobs.iter().filter(|job| job.starts_with(&format!("{name}-1"))).count();
     case.also(if own == 1 { "one Job" } else { "several Jobs" });

@@ -5,7 +5,7 @@ use std::time::Duration;
 
 use evalai_stand_in::faults::{Failure, Fault, When};
 use evalai_stand_in::log::Entry;
-use evalai_stand_in::model::{DatasetSplit, LeaderboardRow, Status, Submission};
+use evalai_stand_in::model::{DatasetSplit, LeaderboardRow, Phase, Status, Submission};
 use evalai_stand_in::sqs::SqsQueues;
 use evalai_stand_in::{Config, Handle, Knobs, Seed};
 use serde_json::{Value, json};
@@ -22,6 +22,8 @@ const PERSON: &str = "local-organizer-token";
 pub const PARTICIPANT: &str = "local-team-a-token";
 /// Id of the first phase that [`Evalai::start_wide`] adds.
 pub const FIRST_PHASE: u64 = 101;
+/// Between the parts of an upload; no uploaded file has it.
+const BOUNDARY: &str = "part-of-an-upload";
 /// A connection without a request for so long is idle.
 const IDLE_MS: u64 = 100;
 /// Requests a minute that EvalAI lets a token make.
@@ -82,17 +84,20 @@ impl Evalai {
     pub async fn start_for(scene: &Scene, split: &str, labels: &[&str]) -> Self {
         let mut seed = Self::wide_seed(1);
         let phase = seed.challenges[0].phases.last_mut().unwrap();
-        phase.is_partial_submission_evaluation_enabled = true;
-        let board = &mut phase.splits[0];
-        board.dataset_split = DatasetSplit {
-            id: FIRST_PHASE,
-            name: split.to_owned(),
-            codename: split.to_owned(),
-        };
-        board.is_leaderboard_order_descending = false;
-        board.schema.labels = labels.iter().map(|&label| label.to_owned()).collect();
-        labels[0].clone_into(&mut board.schema.default_order_by);
+        show(phase, split, labels);
+        phase.splits[0].is_leaderboard_order_descending = false;
         Self::serve(scene, seed, REQUESTS_PER_MINUTE).await
+    }
+
+    /// Starts one whose challenge 1 evaluates files: those that images leave, or uploaded ones. Its phase [`FIRST_PHASE`] has one split
+    /// `test` with the label `accuracy`. It serves everybody at once.
+    pub async fn start_for_files(scene: &Scene, of_images: bool) -> Self {
+        let mut seed = Self::wide_seed(1);
+        let challenge = &mut seed.challenges[0];
+        challenge.is_docker_based = of_images;
+        challenge.is_static_dataset_code_upload = of_images;
+        show(challenge.phases.last_mut().unwrap(), "test", &["accuracy"]);
+        Self::serve(scene, seed, 0).await
     }
 
     async fn serve(scene: &Scene, mut seed: Seed, throttle: usize) -> Self {
@@ -160,10 +165,7 @@ impl Evalai {
 
     async fn call_as(&self, token: &str, method: reqwest::Method, path: &str, body: &Value) -> Value {
         let request = self.http.request(method, format!("{}{path}", self.url));
-        let answer = request.bearer_auth(token).json(body).send().await.unwrap();
-        let (status, text) = (answer.status(), answer.text().await.unwrap());
-        assert!(status.is_success(), "{path}: {status} {text}");
-        serde_json::from_str(&text).unwrap()
+        answer(path, request.bearer_auth(token).json(body)).await
     }
 
     /// Team a pushes an image to a phase of challenge 1; hands back the submission's key.
@@ -171,6 +173,19 @@ impl Evalai {
         let body = json!({"team": "team-a", "phase": phase, "image": image});
         let answer = self.call(reqwest::Method::POST, "/_stand-in/submit", &body).await;
         answer["submission"].as_u64().unwrap()
+    }
+
+    /// Alice uploads a file to a phase of challenge 1, as its web page does; hands back the submission's key.
+    pub async fn upload(&self, content: &[u8], phase: u64) -> u64 {
+        let path = format!("/api/jobs/challenge/1/challenge_phase/{phase}/submission/");
+        let head = format!(
+            "--{BOUNDARY}\r\nContent-Disposition: form-data; name=\"input_file\"; filename=\"predictions.csv\"\r\n\r\n"
+        );
+        let end = format!("\r\n--{BOUNDARY}--\r\n");
+        let request = self.http.post(format!("{}{path}", self.url)).bearer_auth(PARTICIPANT);
+        let request = request.header("Content-Type", format!("multipart/form-data; boundary={BOUNDARY}"));
+        let request = request.body([head.as_bytes(), content, end.as_bytes()].concat());
+        answer(&path, request).await["id"].as_u64().unwrap()
     }
 
     /// Cancels as the web page does: no message is sent.
@@ -287,6 +302,27 @@ impl Evalai {
         let answered = timeout(limit, answered).await;
         answered.unwrap_or_else(|_| panic!("EvalAI still works on request {id} after {} s", limit.as_secs()));
     }
+}
+
+/// The phase shows partial results, and has one split with these labels, of which the first ranks.
+fn show(phase: &mut Phase, split: &str, labels: &[&str]) {
+    phase.is_partial_submission_evaluation_enabled = true;
+    let board = &mut phase.splits[0];
+    board.dataset_split = DatasetSplit {
+        id: FIRST_PHASE,
+        name: split.to_owned(),
+        codename: split.to_owned(),
+    };
+    board.schema.labels = labels.iter().map(|&label| label.to_owned()).collect();
+    labels[0].clone_into(&mut board.schema.default_order_by);
+}
+
+/// The answer to a request that succeeds.
+async fn answer(path: &str, request: reqwest::RequestBuilder) -> Value {
+    let answer = request.send().await.unwrap();
+    let (status, text) = (answer.status(), answer.text().await.unwrap());
+    assert!(status.is_success(), "{path}: {status} {text}");
+    serde_json::from_str(&text).unwrap()
 }
 
 fn is_update(entry: &Entry, method: &str, status: &str) -> bool {
