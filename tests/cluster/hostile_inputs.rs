@@ -317,8 +317,9 @@ async fn an_archive_bomb_reaches_no_program_of_the_operator() {
         let size = scene.cloud.keys(&pk.to_string()).await.get("input/file").copied();
         assert_eq!(size, status.input.map(|input| input.size));
         // The second byte of an archive.
-        let message = status.failure.unwrap().message;
-        assert!(message.contains("can't decode byte 0x8b in position 1"), "{message}");
+        let failure = status.failure.unwrap();
+        let says = "can't decode byte 0x8b in position 1";
+        assert!(failure.message.contains(says), "{}", failure.message);
         let pod = scene.api::<Pod>().get(&pod).await.unwrap();
         let has_crashed = containers(&pod).iter().any(|container| container.restart_count > 0);
         case.also(if has_crashed {
