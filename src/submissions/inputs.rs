@@ -28,7 +28,7 @@ pub fn start(aws: &Aws, hub: &Hub, tasks: &Tasks, wake: Wake) -> Asker<Input> {
         async move {
             let fetched = fetch(&aws, &hub, &asked).await;
             match &fetched {
-                Ok(fetched) => tracing::info!(?fetched, "the submitted file was asked for"),
+                Ok(fetched) => tracing::info!(%fetched, "the submitted file was asked for"),
                 Err(failure) => tracing::warn!(why = failure.why, "the submitted file was not copied"),
             }
             fetched

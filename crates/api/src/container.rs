@@ -166,10 +166,10 @@ pub struct DataClaim {
     validation = Rule::new("quantity(string(self.maxBytes)).compareTo(quantity('100Gi')) <= 0").message("evaluation.container.input.maxBytes must be 100Gi or less")
 )]
 pub struct InputBounds {
-    /// Most bytes of all files together.
+    /// Bytes of all files together, at most.
     #[serde(default = "defaults::max_bytes")]
     pub max_bytes: ByteQuantity,
-    /// Most files. A submission to Predictions is one.
+    /// Number of files, at most. A submission to Predictions is one.
     #[serde(default = "defaults::max_files")]
     #[schemars(range(min = 1, max = 10_000))]
     pub max_files: i32,

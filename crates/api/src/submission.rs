@@ -126,7 +126,7 @@ pub struct SubmittedFile {
     /// SHA-256 of its content, in hexadecimal digits.
     #[schemars(length(max = 64), regex(pattern = r"^[0-9a-f]{64}$"))]
     pub sha256: String,
-    /// Bytes that it has.
+    /// Number of its bytes.
     #[schemars(range(min = 0))]
     pub size: i64,
 }

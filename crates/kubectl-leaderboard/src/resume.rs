@@ -117,11 +117,11 @@ impl Resume {
 /// A table of the chosen submissions, with the class of each failure.
 pub fn lines(chosen: &[&Submission], frame: Frame) -> Vec<String> {
     let rows: Vec<Vec<String>> = chosen.iter().map(|one| row(one, frame.now)).collect();
-    let is_by_evaluator = |one: &&Submission| matches!(evaluation(one), Some(PlannedEvaluation::Container(_)));
-    let image = if chosen.iter().any(is_by_evaluator) {
-        "EVALUATOR"
-    } else {
+    let is_carlas = |one: &&Submission| matches!(evaluation(one), Some(PlannedEvaluation::Carla(_)));
+    let image = if chosen.iter().any(is_carlas) {
         "SIMULATOR"
+    } else {
+        "EVALUATOR"
     };
     let head = ["NAME", "TEAM", "REASON", "CLASS", "SINCE", "NODE", image];
     table(&head, &rows, frame.width)

@@ -27,7 +27,7 @@ pub struct Submit {
     #[arg(long)]
     pub file: Option<PathBuf>,
     /// Endpoint of the bucket, if it is not AWS's, that may get your AWS credentials.
-    #[arg(long, value_name = "URL", requires = "file")]
+    #[arg(long, value_name = "URL", requires = "file", conflicts_with = "image")]
     pub endpoint: Option<String>,
     /// Name of the submission [default: the Leaderboard's, and five letters].
     #[arg(long)]

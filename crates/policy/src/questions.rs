@@ -1,5 +1,6 @@
 //! Questions of `decide` to services outside the cluster.
 
+use std::fmt;
 use std::time::Duration;
 
 use crate::ask::{Ask, Failure, Service};
@@ -67,6 +68,17 @@ pub enum Fetched {
     TooLarge,
     /// EvalAI's address of it answered with this HTTP status, so many times in a row.
     Gone { status: u16, times: u32 },
+}
+
+/// For people.
+impl fmt::Display for Fetched {
+    fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
+        match self {
+            Self::Stored(file) => write!(f, "{} bytes are stored", file.size),
+            Self::TooLarge => f.write_str("it is too large"),
+            Self::Gone { status, times } => write!(f, "its address answered with {status}, {times} times"),
+        }
+    }
 }
 
 /// Times that an address is asked for a file which it does not have.

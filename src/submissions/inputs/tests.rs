@@ -32,12 +32,15 @@ fn key(name: &str) -> ObjectKey {
     }
 }
 
+/// Objects by their paths.
+type Objects = Vec<(String, Vec<u8>)>;
+
 /// EvalAI, its storage and a bucket.
 #[derive(Clone, Default)]
 struct Server {
     url: Arc<Mutex<String>>,
     /// The path and the content of each object that was stored.
-    stored: Arc<Mutex<Vec<(String, Vec<u8>)>>>,
+    stored: Arc<Mutex<Objects>>,
 }
 
 impl Server {

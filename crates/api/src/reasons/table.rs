@@ -193,9 +193,8 @@ reasons! {
         EvaluatorFailed,
             "An evaluator crashed, was not ready, or had no final result more often than `retries.perWorker` allows. Or it wrote a \
              `result.json` that cannot be used.",
-            "Look at the evaluator's log, and at `evaluators/<n>/result.json` or what is kept at \
-             `logcopy/refused/evaluators/<n>/result.json`; `kubectl leaderboard lint FILE` says what is wrong with it. Correct the \
-             evaluator's image, then resume the submission.",
+            "Look at the evaluator's log and at `evaluators/<n>/result.json`; `kubectl leaderboard lint FILE` says what is wrong with \
+             it. Correct the evaluator's image, then resume the submission.",
             log: "the log of evaluator `<n>`, `evaluators/<n>/console.log`";
         InputMissing,
             "The submitted file is not to be had: EvalAI does not serve it, or the bucket has none at `input/file` that is the one of \

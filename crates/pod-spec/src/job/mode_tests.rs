@@ -149,7 +149,7 @@ fn data_is_in_a_volume_that_an_image_fills_or_a_claim_that_nobody_writes() {
         }
         let copies = container(&job, "dataset");
         assert_eq!(copies["image"], "registry.example/dataset:1");
-        assert_eq!(copied(copies), ("/files".into(), "/data".into()), "{mode}");
+        assert_eq!(copied(copies), ("/files".into(), "/leaderboard-data".into()), "{mode}");
     }
     let without = Case::container(json!({}), &json!({})).json();
     let volumes = pod(&without)["volumes"].as_array().unwrap();
