@@ -1,6 +1,6 @@
 //! The file that a participant has uploaded to EvalAI, copied into the bucket of its run right before its Job.
 //!
-//! Whoever has its address may be able to read the file. So the address is taken from EvalAI's side for each copy, and is kept nowhere.
+//! Anyone who has its address may be able to read the file. So the address is taken from EvalAI's side for each copy, and is kept nowhere.
 
 use std::time::Duration;
 

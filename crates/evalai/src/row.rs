@@ -39,7 +39,7 @@ pub struct Row {
     pub jobs: Vec<String>,
 }
 
-/// Where an uploaded file is. It may be presigned, so that whoever has it can read the file: no `Debug` and no message shows it.
+/// Where an uploaded file is. It may be presigned, so that anyone who has it can read the file: no `Debug` and no message shows it.
 #[derive(Clone, PartialEq, Eq)]
 pub struct FileUrl(String);
 

@@ -29,7 +29,7 @@ impl World {
 }
 
 #[tokio::test]
-async fn a_file_is_read_as_it_was_uploaded_or_it_is_told_why_not() {
+async fn a_file_is_read_as_it_was_uploaded_or_an_error_says_why_not() {
     let mut world = World::new().await;
     let (pk, address) = world.submit_predictions().await;
     assert_eq!(world.content(&address).await, Ok(CONTENT.to_vec()));

@@ -342,8 +342,8 @@ reasons! {
     }
     Leaderboard {
         Ready,
-            "Submissions can run. A note names what is no obstacle: metrics that stay empty or rank in EvalAI alone, an expiring \
-             token, images that cannot be pulled, Secrets that participants can read, a challenge that EvalAI's own worker evaluates.",
+            "Submissions can run. A note names what is no obstacle, such as metrics that stay empty, an expiring token, images that cannot be \
+             pulled, or a challenge that EvalAI's own worker evaluates.",
             "Nothing, or what the note asks for.";
         Checking,
             "The operator asks bucket, table, queues and the place of EvalAI's token for the first time, and not all have answered yet.",
@@ -390,8 +390,8 @@ reasons! {
              `sqs:GetQueueAttributes`.",
             "As the message asks: create the queue, or correct `queue.sqs.deadLetterURL` or the controller's rights.";
         InvalidPod,
-            "The Pods cannot be made: the API server refuses them, `spec.podOverrides` sets what it may not, `resources` and `gpu` \
-             contradict each other, a PriorityClass is missing or preempts, or a claim of `dataset` or `labels` is missing.",
+            "The Pods cannot be made. The API server or `spec.podOverrides` is against them, `resources` and `gpu` contradict each other, or a \
+             PriorityClass or a claim is missing.",
             "Correct what the message names.";
         ClaimsNotServed,
             "`gpu.mode` is `Claim`, and the API server does not serve `resource.k8s.io/v1`, which Kubernetes has from 1.34 on. No Job is \

@@ -43,7 +43,7 @@ async fn whatever_is_at_the_address_is_the_file_however_large_it_is() {
 }
 
 #[tokio::test]
-async fn an_answer_that_has_no_file_is_told_apart_by_its_status() {
+async fn an_answer_without_a_file_is_judged_by_its_status() {
     let silent = |why: &str| InputError::Silent(why.to_owned());
     let of = |code: u16| format!("the address of the uploaded file answers {code}");
     for code in [400, 401, 403, 404, 410] {
