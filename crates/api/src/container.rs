@@ -83,7 +83,7 @@ pub struct ContainerEvaluation {
     /// Laid over the safe default field by field. To remove one of its fields, set it to null in podOverrides.
     #[serde(default, skip_serializing_if = "Option::is_none")]
     pub security_context: Option<SecurityContext>,
-    /// Number of workers, each with an evaluator and an agent of its own.
+    /// Number of workers, each with an evaluator of its own; in Interactive with an agent, too.
     #[serde(default = "defaults::workers")]
     #[schemars(range(min = 1, max = 16))]
     pub workers: i32,
@@ -257,7 +257,7 @@ impl ScoreMetric {
 pub struct ContainerPlan {
     /// Mode in which the evaluator and the participant's image meet.
     pub mode: EvaluationMode,
-    /// Number of workers, each with an evaluator and an agent of its own.
+    /// Number of workers, each with an evaluator of its own; in Interactive with an agent, too.
     pub workers: i32,
     /// Treatment of the results of several workers.
     pub merge: MergeMethod,
@@ -274,7 +274,7 @@ pub struct ContainerPlan {
 /// The numbers of what a track effectively runs.
 #[derive(Serialize, Deserialize, JsonSchema, Clone, Debug, Default, PartialEq, Eq)]
 pub struct ContainerShape {
-    /// Number of workers, each with an evaluator and an agent of its own.
+    /// Number of workers, each with an evaluator of its own; in Interactive with an agent, too.
     pub workers: i32,
 }
 

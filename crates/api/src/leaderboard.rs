@@ -139,7 +139,7 @@ pub struct LeaderboardSpec {
     /// No new submission starts while true; running ones go on.
     #[serde(default)]
     pub paused: bool,
-    /// A partial PodTemplateSpec laid over ours: objects deep, lists by name, `simulator` and `agent` address all pairs, null removes.
+    /// A partial PodTemplateSpec laid over ours: objects deep, lists by name, `simulator`, `evaluator` and `agent` address those of all workers, null removes.
     #[serde(default, skip_serializing_if = "Option::is_none")]
     #[schemars(schema_with = "super::leaderboard_parts::raw_object")]
     pub pod_overrides: Option<serde_json::Value>,

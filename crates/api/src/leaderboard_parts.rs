@@ -109,7 +109,7 @@ pub struct TrackDeadlines {
     #[serde(default, skip_serializing_if = "Option::is_none")]
     #[schemars(range(min = 1, max = 31_536_000))]
     pub start_seconds: Option<i64>,
-    /// Seconds of a run, from its first agent. A track can set another limit than the Leaderboard's, and cannot remove it.
+    /// Seconds of a run, from its first agent, or without agents from its first evaluator. A track can set another limit than the Leaderboard's, and cannot remove it.
     #[serde(default, skip_serializing_if = "Option::is_none")]
     #[schemars(range(min = 1, max = 31_536_000))]
     pub run_seconds: Option<i64>,
@@ -157,7 +157,7 @@ pub struct AgentContainer {
     /// Size of each agent's `/dev/shm`, in memory: `1Mi` to `1Ti`. What lies there counts to the agent's memory limit. Absent: 64 MiB, as the container runtime makes it.
     #[serde(default, skip_serializing_if = "Option::is_none")]
     pub shm_size: Option<ByteQuantity>,
-    /// Images that may be submitted, such as `registry.example/team-{team}/*`: `{team}` is the id of the submission's team, `*` one or more characters between two slashes. Default for EvalAI's submissions: `*.dkr.ecr.*.amazonaws.com/*-participant-team-{team}`. `[]`: any image. The images of contents and simulator are never among them.
+    /// Images that may be submitted, such as `registry.example/team-{team}/*`: `{team}` is the id of the submission's team, `*` one or more characters between two slashes. Default for EvalAI's submissions: `*.dkr.ecr.*.amazonaws.com/*-participant-team-{team}`. `[]`: any image. The host's own images are never among them.
     #[serde(default, skip_serializing_if = "Option::is_none")]
     #[schemars(length(max = 32))]
     #[x_kube(merge_strategy = ListMerge::Atomic)]
@@ -204,7 +204,7 @@ pub struct Deadlines {
     #[serde(default = "defaults::start_seconds")]
     #[schemars(range(min = 1, max = 31_536_000))]
     pub start_seconds: i64,
-    /// Seconds until a simulator must answer.
+    /// Seconds until a simulator or an evaluator must answer.
     #[serde(default = "defaults::ready_seconds")]
     #[schemars(range(min = 1, max = 31_536_000))]
     pub ready_seconds: i64,
@@ -212,7 +212,7 @@ pub struct Deadlines {
     #[serde(default = "defaults::idle_seconds")]
     #[schemars(range(min = 1, max = 31_536_000))]
     pub idle_seconds: i64,
-    /// Seconds of a run, from its first agent. Absent: no limit, so an agent that does not end keeps its nodes until a person cancels it.
+    /// Seconds of a run, from its first agent, or without agents from its first evaluator. Absent: no limit, so one that does not end keeps its nodes until a person cancels it.
     #[serde(default, skip_serializing_if = "Option::is_none")]
     #[schemars(range(min = 1, max = 31_536_000))]
     pub run_seconds: Option<i64>,
