@@ -106,7 +106,7 @@ fn modes() -> Vec<Case> {
         case(
             "datasetForAgent needs a dataset",
             &container(&for_agent(&dataset)),
-            &container(&for_agent(&none)),
+            &container(&for_agent(&json!({"dataset": null}))),
         ),
         case(
             "datasetForAgent needs a dataset",
