@@ -26,9 +26,9 @@ class Challenge(unittest.TestCase):
             (self.folder / name).mkdir()
         self.run_program(CLASSIFICATION / "data.py", str(self.folder))
 
-    def run_program(self, program: Path, *arguments: str, code: int = 0, **variables: str) -> str:
-        """What it prints, if it ends with this code."""
-        env = {
+    def run_program(self, program: Path, *arguments: str, code: int = 0, **variables: str | None) -> str:
+        """What it prints, if it ends with this code. A variable that is None is not set."""
+        env: dict[str, str | None] = {
             "PATH": os.environ["PATH"],
             "DATASET": str(self.folder / "dataset"),
             "SUBMISSION_PATH": str(self.folder / "submission"),
@@ -43,7 +43,8 @@ class Challenge(unittest.TestCase):
             **variables,
         }
         argv = [sys.executable, str(program), *arguments]
-        done = subprocess.run(argv, env=env, capture_output=True, text=True, timeout=SECONDS, check=False)
+        given = {name: value for name, value in env.items() if value is not None}
+        done = subprocess.run(argv, env=given, capture_output=True, text=True, timeout=SECONDS, check=False)
         self.assertEqual(done.returncode, code, done.stderr)
         return done.stdout + done.stderr
 
@@ -56,9 +57,10 @@ class Challenge(unittest.TestCase):
 
     def result(self) -> dict[str, object]:
         found: dict[str, object] = json.loads((self.folder / "results" / "result.json").read_text())
-        # What the operator asks of every result.
-        self.assertEqual((found["schema"], found["final"]), (1, True))
-        self.assertTrue(found.get("refused") or found["done"] == found["total"])
+        # What the operator asks of every result at the end, and what docs/evaluator-result.schema.json says of `final`.
+        is_refused = bool(found.get("refused"))
+        self.assertEqual((found["schema"], found["final"]), (1, not is_refused))
+        self.assertTrue(is_refused or found["done"] == found["total"])
         return found
 
 
@@ -84,26 +86,32 @@ class Classification(Challenge):
             self.assertEqual(self.evaluate(worker, len(RIGHT)), expected)
         self.assertEqual(self.evaluate()["splits"], [{"name": "test", "metrics": {"accuracy": ACCURACY}}])
 
-    def test_rows_that_are_missing_are_wrong_ones(self) -> None:
-        self.submit(b"id,category\n0,Lo\n1,Lo\nmore,Lo\n2,Sm\n")
-        self.assertEqual(self.evaluate()["splits"], [{"name": "test", "metrics": {"accuracy": 0.01}}])
-
-    def test_a_file_that_cannot_be_read_refuses_the_submission(self) -> None:
+    def test_a_file_that_is_no_list_of_all_ids_refuses_the_submission(self) -> None:
+        self.submit(None)
+        whole = (self.folder / "submission" / "predictions.csv").read_bytes()
         for content, word in (
-            (b"", ""),
+            (b"", "ValueError: it must have the 200 ids"),
             (b"name,class\na,b\n", "KeyError"),
             (b"id,category\n0,\xff\xfe\n", "UnicodeDecodeError"),
             (b'id,category\n0,"' + b"x" * 200_000 + b'"\n', "Error"),
+            (whole.rsplit(b"\r\n", 2)[0] + b"\r\n", "ValueError: it must have the 200 ids"),
+            (whole + b"more,Lo\r\n", "ValueError: it must have the 200 ids"),
+            (whole + b"0,Lo\r\n", "ValueError: it must have the 200 ids"),
         ):
-            with self.subTest(content[:20]):
+            with self.subTest(content[-20:]):
                 self.submit(content)
-                result = self.evaluate()
-                self.assertEqual("refused" in result, bool(word))
-                self.assertIn(word, str(result.get("refused", "")))
+                # Every worker refuses it, whatever rows are its own.
+                for worker in RIGHT:
+                    self.assertIn(word, str(self.evaluate(worker, len(RIGHT)).get("refused", "")))
         (self.folder / "submission" / "predictions.csv").unlink()
         self.assertIn("FileNotFoundError", str(self.evaluate()["refused"]))
         (self.folder / "submission" / "predictions.csv").mkdir()
         self.assertIn("IsADirectoryError", str(self.evaluate()["refused"]))
+
+    def test_a_file_of_a_spreadsheet_counts_as_any_other(self) -> None:
+        self.submit(None)
+        self.submit("\ufeff".encode() + (self.folder / "submission" / "predictions.csv").read_bytes())
+        self.assertEqual(self.evaluate()["splits"], [{"name": "test", "metrics": {"accuracy": ACCURACY}}])
 
     def test_labels_that_are_missing_are_the_hosts_fault(self) -> None:
         self.submit(None)
@@ -114,17 +122,15 @@ class Classification(Challenge):
 class Predictions(Challenge):
     """`shim.py` with the example's main.py, and with others that return or raise what hosts' scripts do."""
 
-    def evaluate(self, script: str | None = None, code: int = 0) -> str:
+    def evaluate(self, script: str | None = None, code: int = 0, file: str = "main.py", **variables: str | None) -> str:
         """What it prints. Without a script, main.py is the example's."""
         place = self.folder / "evaluator"
-        place.mkdir(exist_ok=True)
+        (place / file).parent.mkdir(parents=True, exist_ok=True)
         (place / "shim.py").write_text((PREDICTIONS / "shim.py").read_text())
-        (place / "main.py").write_text(script or (PREDICTIONS / "main.py").read_text())
-        return self.run_program(place / "shim.py", code=code)
+        (place / file).write_text(script or (PREDICTIONS / "main.py").read_text())
+        return self.run_program(place / "shim.py", code=code, **variables)
 
     def test_the_file_has_the_score_that_the_classification_gives_it(self) -> None:
-        self.submit(None, "file")
-        self.assertIn("Evaluating the phase test", self.evaluate())
         expected = {
             "schema": 1,
             "total": 1,
@@ -133,11 +139,17 @@ class Predictions(Challenge):
             "splits": [{"name": "test", "metrics": {"accuracy": ACCURACY}}],
             "message": json.dumps({"accuracy": ACCURACY}),
         }
-        self.assertEqual(self.result(), expected)
+        self.submit(None, "file")
+        of_a_spreadsheet = "\ufeff".encode() + (self.folder / "submission" / "file").read_bytes()
+        for content in (None, of_a_spreadsheet):
+            self.submit(content, "file")
+            self.assertIn("Evaluating the phase test", self.evaluate())
+            self.assertEqual(self.result(), expected)
 
     def test_a_wrong_file_is_refused_with_the_class_and_the_first_line(self) -> None:
         for content, refused in (
             (b"id,category\n0,Lo\n", "ValueError: the file must have the 200 ids of test.csv, each once"),
+            (b"category,id\nLo\n", "ValueError: the file must have the 200 ids of test.csv, each once"),
             (b"a,b\n0,Lo\n", "KeyError: 'id'"),
             (b"id,category\n0,\xff\n", "UnicodeDecodeError: 'utf-8' codec"),
         ):
@@ -197,6 +209,39 @@ class Predictions(Challenge):
             with self.subTest(returned):
                 self.evaluate(f"def evaluate(*_, **more): return {returned}", code=1)
 
+    def test_a_metric_that_is_no_finite_number_refuses_the_submission_by_its_name(self) -> None:
+        self.submit(b"", "file")
+        for number in ("float('nan')", "float('-inf')", "'nan'"):
+            with self.subTest(number):
+                result = f"[{{'a': {{'f1': 1, 'loss': {number}}}}}]"
+                self.evaluate(f"def evaluate(*_, **more): return {{'result': {result}}}")
+                found = self.result()
+                refused = "these metrics of the file are no finite numbers: loss"
+                self.assertEqual((found["refused"], found["splits"]), (refused, []))
+
+    def test_a_host_adds_classes_of_errors(self) -> None:
+        self.submit(b"", "file")
+        raising = "def evaluate(*_, **more): raise zipfile.BadZipFile('no archive')"
+        self.evaluate(f"import zipfile\n{raising}", code=1)
+        self.evaluate(f"import zipfile\nOF_THE_FILE = (zipfile.BadZipFile,)\n{raising}")
+        self.assertEqual(self.result()["refused"], "BadZipFile: no archive")
+
+    def test_what_is_missing_around_the_script_is_the_hosts_fault(self) -> None:
+        self.submit(None, "file")
+        for lacking in ("import none", "raise ValueError('at its import')", "def other(): pass"):
+            with self.subTest(lacking):
+                self.evaluate(lacking, code=1)
+        for name in ("ANNOTATIONS", "INPUT", "TRACK", "RESULTS"):
+            with self.subTest(name):
+                self.assertIn(f"KeyError: '{name}'", self.evaluate(code=1, **{name: None}))
+        self.assertFalse((self.folder / "results" / "result.json").exists())
+
+    def test_a_package_in_place_of_a_file_runs_by_its_name(self) -> None:
+        self.submit(None, "file")
+        self.evaluate(file="evaluation_script/main.py", code=1)
+        self.evaluate("from .main import evaluate", file="evaluation_script/__init__.py", SCRIPT="evaluation_script")
+        self.assertEqual(self.result()["splits"], [{"name": "test", "metrics": {"accuracy": ACCURACY}}])
+
     def test_the_script_gets_what_evalais_workers_give_it(self) -> None:
         self.submit(b"content", "file")
         script = """
@@ -223,6 +268,8 @@ class Folders(unittest.TestCase):
             stages = [line.split()[-1] for line in (folder / "Dockerfile").read_text().splitlines() if " AS " in line]
             made |= {f"REGISTRY/{folder.name}/{stage}:1" for stage in stages}
         for file in EXAMPLES.glob("*/leaderboard.yaml"):
+            # Where policies are enforced, nothing can be stored without it.
+            self.assertIn("\n  network: {egress: [", file.read_text())
             words = file.read_text().replace('"', " ").replace(",", " ").split()
             named = {word for word in words if word.startswith("REGISTRY/")}
             self.assertTrue(named, file)
