@@ -38,6 +38,7 @@ TOOLS = [
     "jq",
     "mkdir",
     "python3",
+    "rm",
     "sed",
     "sha256sum",
     "sh",
