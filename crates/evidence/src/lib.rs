@@ -122,11 +122,14 @@ pub struct Walk {
     pub left_out: usize,
     /// The first of them, whose path is a stranger's text.
     pub first: Option<(String, LeftOut)>,
+    /// True if their writer can have files among them. A link or a pipe holds no bytes.
+    pub hides: bool,
 }
 
 impl Walk {
     fn leave_out(&mut self, path: String, why: LeftOut) {
         self.left_out = self.left_out.saturating_add(1);
+        self.hides |= why != LeftOut::NotRegular && why.is_the_writers();
         self.first.get_or_insert((path, why));
     }
 }

@@ -71,7 +71,7 @@ fn a_flood_of_files_costs_no_more_than_the_limit() {
     }
     let walk = tree.walk("agent", 10);
     assert_eq!(walk.files.len(), 9);
-    assert!(walk.left_out > 0);
+    assert!(walk.left_out > 0 && walk.hides);
     assert_eq!(tree.walk("agent", 51).left_out, 0);
     assert_eq!(tree.walk("nothing", 10), Walk::default());
 }
@@ -117,22 +117,29 @@ fn the_first_entry_that_is_left_out_is_named_with_the_reason() {
     type Make = fn(&Path);
     let deep = |many: usize| vec!["d"; many].join("/");
     let too_deep = deep(MAX_DEPTH + 1);
-    let table: [(&str, Make, LeftOut); 5] = [
-        ("link", |at| symlink("/etc/passwd", at).unwrap(), LeftOut::NotRegular),
-        ("way", |at| symlink("/etc", at).unwrap(), LeftOut::NotRegular),
+    let table: [(&str, Make, LeftOut, bool); 5] = [
+        (
+            "link",
+            |at| symlink("/etc/passwd", at).unwrap(),
+            LeftOut::NotRegular,
+            false,
+        ),
+        ("way", |at| symlink("/etc", at).unwrap(), LeftOut::NotRegular, false),
         (
             "pipe",
             |at| nix::unistd::mkfifo(at, Mode::from_bits_truncate(0o666)).unwrap(),
             LeftOut::NotRegular,
+            false,
         ),
-        ("a\nb", |at| fs::write(at, "x").unwrap(), LeftOut::Name),
-        (&too_deep, |at| fs::create_dir_all(at).unwrap(), LeftOut::Deep),
+        ("a\nb", |at| fs::write(at, "x").unwrap(), LeftOut::Name, true),
+        (&too_deep, |at| fs::create_dir_all(at).unwrap(), LeftOut::Deep, true),
     ];
-    for (name, make, why) in table {
+    for (name, make, why, hides) in table {
         let (folder, tree) = tree();
         make(&folder.path().join("agent").join(name));
         let walk = tree.walk("agent", 100);
         assert_eq!((walk.left_out, walk.first), (1, Some((format!("agent/{name}"), why))));
+        assert_eq!(walk.hides, hides, "{name}");
     }
     let (folder, tree) = tree();
     fs::create_dir_all(folder.path().join("agent").join(deep(MAX_DEPTH))).unwrap();

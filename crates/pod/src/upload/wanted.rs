@@ -12,7 +12,7 @@ use leaderboard_contract::keys::{
     known_logs, results_path,
 };
 use leaderboard_evaluation::judge::Ending;
-use leaderboard_evidence::{Stamp, Tree};
+use leaderboard_evidence::{Stamp, Tree, Walk};
 use leaderboard_protocol::files::{Host, Pair};
 
 /// Entries read in one agent's folder, and in one evaluator's.
@@ -65,8 +65,9 @@ impl Files {
     pub fn find(tree: &Tree, pairs: usize, host: Host) -> Self {
         let mut found = Self::default();
         let each = ENTRIES.checked_div(pairs).unwrap_or(ENTRIES).min(WORKER_ENTRIES);
+        let mut hides = false;
         for pair in Pair::first(pairs) {
-            found.walk(tree, &agent_folder(pair), each);
+            hides |= found.walk(tree, &agent_folder(pair), each);
         }
         let hosts = match host {
             // All have one folder.
@@ -84,18 +85,27 @@ impl Files {
             .below(&[AGENTS, EVALUATORS])
             .for_each(|file| file.hash(&mut activity));
         found.activity = activity.finish();
-        let bytes = |folder| bytes_of(found.below(&[folder]));
-        // A file with holes counts whole: an agent that makes one speaks against itself alone.
-        let left = tree.walk(SUBMISSION_FOLDER, collect::ENTRIES);
-        let agents = bytes(AGENTS).saturating_add(bytes_of(left.files.iter()));
-        let is_most = agents > bytes(SIMULATORS).max(bytes(EVALUATORS));
-        found.agents_fill_disk = agents >= FILLING && is_most;
         // Without the list they are not all there. A submitted file has none: it is in the bucket.
         if let Ok(Some((_, stamp))) = tree.file(COLLECTED) {
+            // What is copied is within its bounds, for which the volume has room.
+            found.agents_fill_disk = found.is_mostly_agents(&Walk::default(), hides);
             found.walk(tree, INPUT.trim_end_matches('/'), collect::ENTRIES);
             found.files.insert(COLLECTED.to_owned(), stamp);
+        } else {
+            let left = tree.walk(SUBMISSION_FOLDER, collect::ENTRIES);
+            found.agents_fill_disk = found.is_mostly_agents(&left, hides);
         }
         found
+    }
+
+    /// True if the agents hold most of the volume, with what is left for `collect`, and enough to fill one. What they hide from a walk
+    /// counts as that much.
+    fn is_mostly_agents(&self, left: &Walk, hides: bool) -> bool {
+        let bytes = |folder| bytes_of(self.below(&[folder]));
+        // A file with holes counts whole: an agent that makes one speaks against itself alone.
+        let agents = bytes(AGENTS).saturating_add(bytes_of(left.files.iter()));
+        let is_most = agents > bytes(SIMULATORS).max(bytes(EVALUATORS));
+        hides || left.hides || (agents >= FILLING && is_most)
     }
 
     fn below<'a>(&'a self, folders: &'a [&str]) -> impl Iterator<Item = (&'a String, &'a Stamp)> {
@@ -103,10 +113,12 @@ impl Files {
         self.files.iter().filter(move |(path, _)| is_below(path))
     }
 
-    fn walk(&mut self, tree: &Tree, folder: &str, limit: usize) {
+    /// Returns whether files can be hidden there.
+    fn walk(&mut self, tree: &Tree, folder: &str, limit: usize) -> bool {
         let walk = tree.walk(folder, limit);
         self.files.extend(walk.files);
         self.left_out = self.left_out.saturating_add(walk.left_out);
+        walk.hides
     }
 
     /// Files to store, given why each worker's results are refused. Results are stored from memory, whole. Those that are
@@ -224,6 +236,25 @@ mod tests {
     }
 
     #[test]
+    fn what_an_agent_hides_from_a_walk_fills_the_volume() {
+        let deep = vec!["d"; 17].join("/");
+        for (path, fills) in [
+            (format!("agent/agent1/{deep}"), true),
+            (format!("submission/{deep}"), true),
+            ("agent/agent1/a\nb".to_owned(), true),
+            ("agent/agent1/d".to_owned(), false),
+            (format!("evaluators/1/{deep}"), false),
+        ] {
+            let dir = tempfile::tempdir().unwrap();
+            fs::create_dir_all(dir.path().join("agent/agent1")).unwrap();
+            std::os::unix::fs::symlink("/etc", dir.path().join("agent/agent1/link")).unwrap();
+            fs::create_dir_all(dir.path().join(&path)).unwrap();
+            let found = Files::find(&Tree::open(dir.path()).unwrap(), 1, Host::Evaluator);
+            assert_eq!(found.agents_fill_disk, fills, "{path:?}");
+        }
+    }
+
+    #[test]
     fn what_an_agent_leaves_fills_the_volume_as_its_own_and_is_stored_only_as_it_is_listed() {
         let dir = tempfile::tempdir().unwrap();
         for (path, size) in [("submission/a", FILLING), ("input/a", 5), ("evaluators/1/saved", 9)] {
@@ -243,6 +274,7 @@ mod tests {
         fs::create_dir(dir.path().join("logcopy")).unwrap();
         fs::write(dir.path().join(COLLECTED), "{}").unwrap();
         assert_eq!(keys(&found()), ["evaluators/1/saved", "input/a", COLLECTED]);
+        assert!(!found().agents_fill_disk, "what is copied is within its bounds");
         assert_eq!(found().activity, before.activity);
     }
 
