@@ -90,6 +90,7 @@ pub struct Quota {
     /// Allowance of the agents' own files together for a day, and of the other files of the host's containers.
     pub files_a_day: Spent,
     logs: BTreeSet<String>,
+    host: Host,
 }
 
 impl Quota {
@@ -109,6 +110,7 @@ impl Quota {
                 bytes: at_least(bytes.saturating_mul(4), 16),
             },
             logs: known_logs(pairs, host).collect(),
+            host,
         }
     }
 
@@ -124,7 +126,8 @@ impl Quota {
             || key
                 .strip_prefix(STATUS_FOLDER)
                 .is_some_and(|rest| rest.starts_with('/'))
-            || is_checkpoint(key)
+            // Beside an evaluator an agent has none, and any file of that name is its own.
+            || (self.host == Host::Simulator && is_checkpoint(key))
             || is_evaluators_result(key);
         let is_hosts = [SIMULATORS, EVALUATORS, "logcopy/"]
             .iter()
@@ -351,10 +354,14 @@ mod tests {
             ("evaluators/result.json", Kind::Host),
             ("logcopy/refused/evaluators/2/result.json", Kind::Host),
             ("agent/agent2/leaderboard.log", Kind::Log),
+            ("agent/agent1/agent_results.json", Kind::Agent),
             ("simulator/console-1.log", Kind::Host),
         ] {
             assert_eq!(quota.kind(key), kind, "{key}");
         }
+        let ledger = quota.ledger(std::iter::empty());
+        let of_agent = ledger.admit("agent/agent1/agent_results.json", None, 18 << 30);
+        assert_eq!(of_agent, Err(Limit::AgentBytes(50 * MIB)));
     }
 
     #[test]
