@@ -343,7 +343,7 @@ impl Rounds {
             let window = Window {
                 begin_until,
                 cut_at,
-                is_last: false,
+                ..Window::default()
             };
             return tokio::select! {
                 biased;
@@ -365,6 +365,7 @@ impl Rounds {
             begin_until: Some(until),
             cut_at: Some(until),
             is_last: true,
+            input_last: self.ending == Some(Ending::Complete),
         };
         let sent = self.uploader.sync(&files, window).await?;
         if sent.late > 0 {

@@ -12,7 +12,7 @@ use futures::StreamExt;
 
 use super::complaints::{Complaints, Why};
 use super::job::{Job, Outcome, Put};
-use super::quota::{Ledger, Quota, cost};
+use super::quota::{Kind, Ledger, Quota, cost};
 use super::wanted::Wanted;
 use super::{Decision, Memory, Stored, decide_upload};
 use crate::blocking;
@@ -46,6 +46,15 @@ pub struct Window {
     pub cut_at: Option<Instant>,
     /// There is no later time for what would wait: neither the day's allowance nor an earlier cut holds it back.
     pub is_last: bool,
+    /// Nobody reads any more what the evaluators have read: all else is sent before it.
+    pub input_last: bool,
+}
+
+impl Window {
+    /// Place of a kind in the order in which files are sent.
+    fn place(self, kind: Kind) -> (bool, Kind) {
+        (self.input_last && kind == Kind::Input, kind)
+    }
 }
 
 /// Stores the files of one run.
@@ -149,7 +158,7 @@ impl Uploader {
         let began = Instant::now();
         let mut sent = Sent::default();
         self.memory.sent.begin(today());
-        let (jobs, left_out) = self.due(files, window.is_last);
+        let (jobs, left_out) = self.due(files, window);
         sent.left_out = left_out.len();
         for (key, why) in &left_out {
             self.complaints.say(key, why);
@@ -265,13 +274,14 @@ impl Uploader {
     }
 
     /// The files that are due and fit, the known logs first, and what is to be shown of the others.
-    fn due(&self, files: &[Wanted], is_last: bool) -> (Vec<(Job, Bill)>, LeftOut) {
+    fn due(&self, files: &[Wanted], window: Window) -> (Vec<(Job, Bill)>, LeftOut) {
+        let is_last = window.is_last;
         let now = self.epoch.elapsed();
         let stored = self.memory.stored.iter();
         let stored = stored.map(|(key, stored)| (key.as_str(), stored.stamp.size));
         let (mut ledger, mut planned) = (self.quota.ledger(stored), self.memory.sent.clone());
         let mut files: Vec<&Wanted> = files.iter().collect();
-        files.sort_by_key(|file| self.quota.kind(&file.key));
+        files.sort_by_key(|file| window.place(self.quota.kind(&file.key)));
         let (mut jobs, mut left_out, mut keys) = (Vec::new(), Vec::new(), BTreeSet::new());
         for file in files {
             let key = file.key.as_str();
@@ -347,4 +357,26 @@ fn due(file: &Wanted, known: Option<&Stored>, ledger: &Ledger<'_>, now: Duration
     let decision = decide_upload(&stamp, known, now, file.haste);
     let cost = cost(decision, size);
     Ok((decision != Decision::Keep).then_some(Due { decision, stamp, cost }))
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn what_the_evaluators_have_read_is_sent_last_when_nobody_reads_it_any_more() {
+        use Kind::{Agent, Host, Input, Log, Result};
+        for (input_last, expected) in [
+            (false, [Result, Log, Input, Host, Agent]),
+            (true, [Result, Log, Host, Agent, Input]),
+        ] {
+            let window = Window {
+                input_last,
+                ..Window::default()
+            };
+            let mut kinds = [Agent, Input, Host, Log, Result];
+            kinds.sort_by_key(|kind| window.place(*kind));
+            assert_eq!(kinds, expected);
+        }
+    }
 }
