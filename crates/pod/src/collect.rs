@@ -218,7 +218,7 @@ fn find(tree: &Tree, bounds: &InputBounds) -> Result<BTreeMap<String, Stamp>, Co
 
 /// Copies all of them, and lists them then.
 fn copy_all(tree: &Tree, files: &BTreeMap<String, Stamp>) -> Result<Collected, CollectError> {
-    forget(tree)?;
+    forget(tree).map_err(|(path, error)| volume(path, error))?;
     let copied = files
         .iter()
         .map(|(path, stamp)| copy(tree, path, *stamp).map(|copied| (path.clone(), copied)));
@@ -229,13 +229,13 @@ fn copy_all(tree: &Tree, files: &BTreeMap<String, Stamp>) -> Result<Collected, C
 }
 
 /// Removes the list, and then the copies.
-fn forget(tree: &Tree) -> Result<(), CollectError> {
+pub(crate) fn forget(tree: &Tree) -> Result<(), (&'static str, TreeError)> {
     match tree.remove(COLLECTED) {
         Err(TreeError::Io(error)) if error.kind() == io::ErrorKind::NotFound => {}
-        removed => removed.map_err(|error| volume(COLLECTED, error))?,
+        removed => removed.map_err(|error| (COLLECTED, error))?,
     }
     let cleared = tree.clear(INPUT.trim_end_matches('/'));
-    cleared.map_err(|error| volume(INPUT, error))
+    cleared.map_err(|error| (INPUT, error))
 }
 
 /// Copies one file, which has to be the one with this stamp from its first byte to its last.

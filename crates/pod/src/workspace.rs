@@ -21,8 +21,8 @@ use super::logcopy::describe::describe;
 use super::name_files;
 use super::places::{Places, Setting};
 use leaderboard_api::names::FAILURE_LOG_KEY;
-use leaderboard_api::{Attempt, Enforcement};
-use leaderboard_aws::archive::{Archive, ArchiveError};
+use leaderboard_api::{Agents, Attempt, Enforcement};
+use leaderboard_aws::archive::{Archive, ArchiveError, Listed};
 use leaderboard_contract::keys::{INPUT, SUBMISSION_FOLDER, host_folder};
 use leaderboard_contract::report::{MAX_BYTES, OWNER_KEY, Owner, REPORT_KEY, Report};
 use leaderboard_contract::run::{Run, STATUS_FOLDER};
@@ -184,7 +184,9 @@ async fn take(setting: &Setting, archive: &Archive, tree: &Arc<Tree>) -> Result<
     let mut results = of_plan(&run.plan).results(run, Arc::clone(tree))?;
     let owner = Owner::new(setting.pod_uid.clone()).to_json();
     match claim(run, archive).await? {
-        Claim::Fresh => {
+        Claim::Fresh(of_nobody) => {
+            // Before the prefix has an owner: a Pod that goes on with it must not take them for this run's.
+            restore::remove(archive, of_nobody).await?;
             // Names the prefix's owner before anything else is in it, so that a Pod that is lost early can be replaced.
             let report = first_report(run, &setting.pod_uid, &mut *results);
             let bytes = serde_json::to_vec(&report).unwrap_or_default();
@@ -217,10 +219,10 @@ fn is_prepared(tree: &Tree, pod_uid: &str) -> bool {
 }
 
 /// Claim on the stored results.
-#[derive(Clone, Copy, Debug, PartialEq, Eq)]
+#[derive(Clone, Debug, PartialEq, Eq)]
 enum Claim {
-    /// There is nothing.
-    Fresh,
+    /// There is nothing, but for these files, which no agent of this run has left.
+    Fresh(Vec<Listed>),
     /// It is ours, or the run goes on with it.
     TakeUp,
 }
@@ -242,7 +244,9 @@ async fn claim(run: &Run, archive: &Archive) -> Result<Claim, WorkspaceError> {
     let there = archive.list("", most.saturating_add(1)).await?.objects;
     let is_ours = |key: &str| controllers.contains(&key) || (has_input && input::is_input(key));
     if there.len() <= most && there.iter().all(|object| is_ours(&object.key)) {
-        return Ok(Claim::Fresh);
+        // In the mode Predictions it is the submitted file.
+        let is_of_nobody = |object: &Listed| run.plan.agents() == Agents::First && input::is_input(&object.key);
+        return Ok(Claim::Fresh(there.into_iter().filter(is_of_nobody).collect()));
     }
     Err(WorkspaceError::PrefixInUse(place(run, "")))
 }

@@ -129,6 +129,10 @@ async fn without_every_file_as_it_was_the_agent_and_the_evaluators_run_anew() {
             None => lost.archive.delete(&[key.to_owned()]).await.unwrap(),
         }
         let next = lost.replaced("pod-2").await;
+        // An earlier try in this Pod has found all of it.
+        next.put(COLLECTED, &list(&FILES));
+        fs::create_dir(next.path(STATUS_FOLDER)).unwrap();
+        next.mark(Side::Agent, 1, Mark::Done);
         next.prepare().await.unwrap();
         assert!(!agent_is_done(&next), "{what}");
         assert_eq!(fs::read_dir(next.path("input")).unwrap().count(), 0, "{what}");
@@ -143,8 +147,9 @@ async fn without_every_file_as_it_was_the_agent_and_the_evaluators_run_anew() {
         }
         assert!(next.path("agent/agent1/leaderboard.log").exists(), "{what}");
         let keys = next.keys().await;
+        let gone = ["evaluators/", "input/", COLLECTED];
         assert!(
-            !keys.iter().any(|key| key.starts_with("evaluators/")),
+            !keys.iter().any(|key| gone.iter().any(|gone| key.starts_with(gone))),
             "{what}: {keys:?}"
         );
     }
@@ -231,5 +236,12 @@ async fn an_input_is_no_foreign_prefix_and_hides_none() {
             is_ours || matches!(prepared, Err(WorkspaceError::PrefixInUse(_))),
             "{key}"
         );
+        if is_ours && mode == EvaluationMode::Batch {
+            assert_eq!(
+                pod.keys().await,
+                [OWNER_KEY, REPORT_KEY],
+                "{key} is of no agent of this run"
+            );
+        }
     }
 }

@@ -11,7 +11,7 @@ use futures::{StreamExt, TryStreamExt};
 use super::restore::{AT_ONCE, download, is_evaluators, remove, unknown, volume};
 use super::{WorkspaceError, place};
 use crate::blocking;
-use crate::collect::{bounds, digest_of, usable};
+use crate::collect::{self, bounds, digest_of, usable};
 use crate::upload::Stored;
 use leaderboard_api::Agents;
 use leaderboard_aws::archive::{Archive, Listed};
@@ -53,8 +53,8 @@ pub(super) async fn submitted(run: &Run, archive: &Archive, tree: &Arc<Tree>) ->
     }
 }
 
-/// Takes what evaluators read out of the stored objects, and brings it in the mode Batch. Returns the other objects, and what is stored of
-/// it.
+/// Takes what evaluators read out of the stored objects, and brings it in the mode Batch, or removes it. Returns the other objects, and what
+/// is stored of it.
 pub(super) async fn take(
     run: &Run,
     archive: &Archive,
@@ -67,9 +67,10 @@ pub(super) async fn take(
         if let Some(brought) = collected(run, archive, tree, &input).await? {
             stored.extend(brought);
         } else {
-            // The agent runs anew. What the evaluators have made of its files before does not go with the files that it leaves now.
-            let others = objects.extract_if(.., |object| is_evaluators(&object.key)).collect();
-            remove(archive, others).await?;
+            // The agent runs anew. What it has left before does not go with the files that it leaves now, nor what the evaluators made of it.
+            let others = objects.extract_if(.., |object| is_evaluators(&object.key));
+            remove(archive, others.chain(input).collect()).await?;
+            stored.clear();
         }
     }
     Ok((objects, stored))
@@ -83,8 +84,7 @@ async fn collected(
     tree: &Arc<Tree>,
     stored: &[Listed],
 ) -> Result<Option<Vec<(String, Stored)>>, WorkspaceError> {
-    let folder = INPUT.trim_end_matches('/');
-    tree.clear(folder).map_err(|error| volume(folder, error))?;
+    forget(tree)?;
     let Some(wanted) = listed(run, archive, stored).await? else {
         return Ok(None);
     };
@@ -94,7 +94,7 @@ async fn collected(
     let fetched: Vec<Option<(String, Stored)>> = fetched.try_collect().await?;
     let Some(fetched) = fetched.into_iter().collect::<Option<Vec<_>>>() else {
         tracing::warn!("a stored file of the agent's is another one than {COLLECTED} names; the agent runs anew");
-        tree.clear(folder).map_err(|error| volume(folder, error))?;
+        forget(tree)?;
         return Ok(None);
     };
     tree.write(COLLECTED, &wanted.list.to_json())
@@ -153,6 +153,15 @@ async fn fetch(
     let found = found.map_err(TreeError::from).flatten();
     let is_it = found.map_err(|error| volume(&path, error))? == Some(file);
     Ok(stored.filter(|_| is_it))
+}
+
+/// Forgets on the volume what an earlier try has brought: that the agent is done, the list, and its files.
+fn forget(tree: &Tree) -> Result<(), WorkspaceError> {
+    for agent in Pair::first(1).map(Pair::agent) {
+        let folder = format!("{STATUS_FOLDER}/{agent}");
+        tree.clear(&folder).map_err(|error| volume(&folder, error))?;
+    }
+    collect::forget(tree).map_err(|(path, error)| volume(path, error))
 }
 
 /// Marks the one agent as done, so that it does not run again.
