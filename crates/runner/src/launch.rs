@@ -45,7 +45,7 @@ impl CannotLaunch {
 pub(crate) fn launch(job: &Job, round: u32) -> Result<(Group, Option<Tee>), CannotLaunch> {
     let started = match &job.role {
         Role::Host { log, .. } => {
-            let mut command = of_host(job, round)?;
+            let mut command = of_host(job)?;
             match log {
                 None => Group::spawn(command.stdin(no_input())).map(|group| (group, None)),
                 Some(log) => teed(command, log.clone(), job.log_limit),
@@ -75,7 +75,7 @@ pub(crate) fn launch(job: &Job, round: u32) -> Result<(Group, Option<Tee>), Cann
 
 /// The command of a host, on its own GPU and without the variables that it is not to have, such as the screen of its image. The words of
 /// a simulator stay as they are.
-fn of_host(job: &Job, round: u32) -> Result<Command, NoGraphics> {
+fn of_host(job: &Job) -> Result<Command, NoGraphics> {
     let (mut words, mut environment) = (job.command.clone(), Vec::new());
     let Role::Host { server, gpu, unset, .. } = &job.role else {
         return Ok(group::command(&words, &environment));
@@ -86,9 +86,9 @@ fn of_host(job: &Job, round: u32) -> Result<Command, NoGraphics> {
         environment.push((ADAPTER, adapter.to_string().into()));
     }
     if let Server::Evaluator { results, .. } = server {
-        // A Job that follows on a failed one in the same attempt has its files.
+        // A later attempt may begin without files: those of an evaluator go when its agent runs anew.
         let has_files = results.read_dir().is_ok_and(|mut files| files.next().is_some());
-        environment.push(("RESUME", resume(env::var_os("RESUME"), round, has_files)));
+        environment.push(("RESUME", one_or_empty(has_files)));
         words = expand_all(&words, &environment);
     }
     let mut command = group::command(&words, &environment);
@@ -128,9 +128,13 @@ fn no_input() -> Stdio {
     File::open("/dev/null").map_or_else(|_| Stdio::inherit(), Stdio::from)
 }
 
-/// `1` or empty: for the evaluator any text means yes.
+/// `RESUME` of an agent: yes from outside, after a crash, or with some of its routes in the checkpoint.
 fn resume(outside: Option<OsString>, round: u32, partial: bool) -> OsString {
-    let yes = outside.is_some_and(|value| value == "1") || round > 0 || partial;
+    one_or_empty(outside.is_some_and(|value| value == "1") || round > 0 || partial)
+}
+
+/// For the evaluator any text means yes.
+fn one_or_empty(yes: bool) -> OsString {
     if yes { "1".into() } else { OsString::new() }
 }
 

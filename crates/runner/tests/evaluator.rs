@@ -242,13 +242,22 @@ fn an_evaluator_that_crashes_after_its_agents_end_is_started_again_alone() {
 }
 
 #[test]
-fn an_evaluator_that_has_files_of_an_earlier_pod_resumes() {
-    let pod = Pod::new();
-    fs::write(pod.path("results/games.json"), "[]").unwrap();
-    let (mut evaluator, _agent) = (pod.evaluator(&patient(&pod), &[]), pod.plain("exec sleep 1000", &[]));
-    go(&pod);
-    is_stored(&pod, &mut evaluator);
-    assert_eq!(fs::read_to_string(pod.path("said")).unwrap(), "RESUME=[1]\n");
+fn an_evaluator_resumes_only_if_it_has_files_of_an_earlier_pod() {
+    for (from_outside, has_files, said) in [
+        ("", true, "RESUME=[1]\n"),
+        ("1", true, "RESUME=[1]\n"),
+        ("1", false, "RESUME=[]\n"),
+    ] {
+        let mut pod = Pod::new();
+        pod.environment.push(("RESUME".to_owned(), from_outside.to_owned()));
+        if has_files {
+            fs::write(pod.path("results/games.json"), "[]").unwrap();
+        }
+        let (mut evaluator, _agent) = (pod.evaluator(&patient(&pod), &[]), pod.plain("exec sleep 1000", &[]));
+        go(&pod);
+        is_stored(&pod, &mut evaluator);
+        assert_eq!(fs::read_to_string(pod.path("said")).unwrap(), said, "{from_outside:?}");
+    }
 }
 
 #[test]
