@@ -39,10 +39,11 @@ fn with_data(mode: &str) -> LeaderboardSpec {
 
 #[test]
 fn containers_are_addressed_where_the_pods_of_their_leaderboard_have_them() {
-    let (none, init, worker) = (
+    let (none, init, worker, further) = (
         "no Pod of this Leaderboard has it",
         "it is an init container",
         "it belongs to containers",
+        "a further container would keep the Pod from ending",
     );
     let plain = |mode: &str| of_mode(&json!({"mode": mode}), &json!([]));
     for (spec, names, in_containers, in_init) in vec![
@@ -52,12 +53,8 @@ fn containers_are_addressed_where_the_pods_of_their_leaderboard_have_them() {
             None,
             Some(worker),
         ),
-        (
-            carla(),
-            &["evaluator-1", "collect", "dataset", "labels"],
-            Some(none),
-            Some(none),
-        ),
+        (carla(), &["evaluator-1"], Some(none), Some(none)),
+        (carla(), &["collect", "dataset", "labels"], Some(further), None),
         (
             container(),
             &["evaluator", "evaluator-2", "agent", "agent-1"],

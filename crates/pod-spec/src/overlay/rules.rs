@@ -299,10 +299,13 @@ fn whose(name: &str, pods: &Pods<'_>) -> Whose {
         (names::CONTAINER_COLLECT, _) if pods.agents == Agents::First => Whose::Own,
         (names::CONTAINER_CONTENTS, _) if !pods.reserved.volumes.is_empty() => Whose::Contents,
         (names::CONTAINER_DATASET | names::CONTAINER_LABELS, _) if pods.fills(name) => Whose::Data,
-        (
-            names::CONTAINER_COLLECT | names::CONTAINER_CONTENTS | names::CONTAINER_DATASET | names::CONTAINER_LABELS,
-            _,
-        ) => Whose::OfOthers,
+        (names::CONTAINER_CONTENTS, _) => Whose::OfOthers,
+        // A Leaderboard of CARLA may have one of its own by such a name.
+        (names::CONTAINER_COLLECT | names::CONTAINER_DATASET | names::CONTAINER_LABELS, _)
+            if pods.host == Host::Evaluator =>
+        {
+            Whose::OfOthers
+        }
         (_, Some(Side::Agent)) => match pods.agents {
             Agents::Beside => Whose::Worker,
             Agents::First => Whose::First,
