@@ -7,7 +7,7 @@ use std::time::Duration;
 
 use bytes::Bytes;
 use futures::stream::{self, BoxStream, StreamExt, TryStreamExt};
-use http::header::{CONTENT_LENGTH, LOCATION};
+use http::header::{CONTENT_LENGTH, CONTENT_TYPE, LOCATION};
 use http::{Request, Response, StatusCode};
 use tokio::time::{Instant, timeout};
 use url::Url;
@@ -21,12 +21,14 @@ use super::types::{ImageAnswer, Key};
 const LARGEST_UPLOAD: usize = 64 << 10;
 /// How often a file may be somewhere else.
 const REDIRECTS: usize = 5;
+const PAGE: &str = "the address of the uploaded file answers with a page and not with the file";
 
 /// Where the uploaded file of a submission is. Its `Debug` does not show the address.
 #[derive(Clone, Debug)]
 pub struct InputAddress {
     pub(super) key: Key,
-    pub(super) url: FileUrl,
+    /// None: its row names no file.
+    pub(super) url: Option<FileUrl>,
 }
 
 /// The content of an uploaded file, in chunks as they come. It is whole if the stream ends without an error.
@@ -38,6 +40,9 @@ pub enum InputError {
     /// Its address gives it out no more, with this status: it was deleted, or a presigned address has expired.
     #[error("the address of the uploaded file answers {0}; check that EvalAI still serves the file")]
     Gone(u16),
+    /// Its submission's row names no file.
+    #[error("EvalAI's row of the submission names no file")]
+    NoFile,
     /// Its address leads to where no file is read from, or to no file.
     #[error("{0}")]
     Refused(String),
@@ -83,6 +88,7 @@ impl Files {
         })?;
         let answers = |code: u16| format!("the address of the uploaded file answers {code}");
         match response.status().as_u16() {
+            200 if is_page(url, &response) => Err(InputError::Refused(check_media_url(PAGE))),
             200 => Ok(chunks(response, self.timeouts.read)),
             code @ (400 | 401 | 403 | 404 | 410) => Err(InputError::Gone(code)),
             code @ (408 | 429 | 500..) => Err(InputError::Silent(answers(code))),
@@ -131,6 +137,15 @@ fn next(url: &Url, response: &Response<Body>) -> Option<Result<Url, Unfound>> {
     Some(next.ok_or_else(|| unfound("the uploaded file is redirected to no URL")))
 }
 
+/// True if a page of HTML stands in the place of a file with another name: a login page, or the start page of a web application.
+fn is_page(url: &FileUrl, response: &Response<Body>) -> bool {
+    let kind = response.headers().get(CONTENT_TYPE);
+    let kind = kind.and_then(|kind| kind.to_str().ok()).unwrap_or_default();
+    let path = Url::parse(url.as_str()).map(|url| url.path().to_ascii_lowercase());
+    let names_page = path.is_ok_and(|path| [".htm", ".html"].iter().any(|end| path.ends_with(end)));
+    kind.to_ascii_lowercase().starts_with("text/html") && !names_page
+}
+
 /// The chunks of a body, which has to be as long as its header says.
 fn chunks(response: Response<Body>, longest: Duration) -> InputStream {
     let length = response.headers().get(CONTENT_LENGTH);
@@ -165,8 +180,7 @@ async fn content(response: Response<Body>, end: Instant) -> Answer<ImageAnswer> 
         other => other.and_then(|(_, body)| {
             // No JSON begins so: a login page, or the start page of a web application, stands in the file's place.
             if body.trim_ascii_start().starts_with(b"<") {
-                let why = "the address of the uploaded file answers with a page and not with the file";
-                return refused(check_media_url(why));
+                return refused(check_media_url(PAGE));
             }
             let named = image(&body).map(ImageAnswer::Named);
             Answer::Done(named.unwrap_or_else(ImageAnswer::NotAnImage))

@@ -271,10 +271,10 @@ impl Hub {
         self.place(key)?.queue().view(key)
     }
 
-    /// Where the uploaded file of a submission is, as its row was last read; none while that is not known.
+    /// Where the uploaded file of a submission is, as its row was last read; none while that is not known, or outdated.
     pub fn input_address(&self, key: &Key) -> Option<InputAddress> {
-        let row = self.view(key)?.row?;
-        let (key, url) = (key.clone(), row.input_file.clone()?);
+        let row = self.place(key)?.queue().present_row(key)?;
+        let (key, url) = (key.clone(), row.input_file.clone());
         Some(InputAddress { key, url })
     }
 
@@ -282,8 +282,11 @@ impl Hub {
     pub async fn open_input(&self, address: &InputAddress) -> Result<InputStream, InputError> {
         let not_served = || InputError::Silent("EvalAI is not asked about the submission now".to_owned());
         let shared = self.place(&address.key).ok_or_else(not_served)?;
-        let opened = shared.files.open(&address.url).await;
-        if matches!(opened, Err(InputError::Gone(_))) {
+        let opened = match &address.url {
+            Some(url) => shared.files.open(url).await,
+            None => Err(InputError::NoFile),
+        };
+        if matches!(opened, Err(InputError::Gone(_) | InputError::NoFile)) {
             shared.queue().outdate(&address.key);
             shared.notify.notify_one();
         }

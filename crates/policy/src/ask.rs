@@ -169,6 +169,11 @@ impl Service {
         )
     }
 
+    /// EvalAI's server of this address.
+    pub fn evalai(server: &str) -> Self {
+        Self(format!("EvalAI at {server}"))
+    }
+
     /// The cluster's own.
     pub fn api_server() -> Self {
         Self("the API server".to_owned())

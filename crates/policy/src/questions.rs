@@ -50,6 +50,8 @@ impl Ask for Row {
 pub struct Input {
     /// An attempt asks anew: EvalAI may have another file since.
     pub attempt: Attempt,
+    /// EvalAI's server, in one spelling.
+    pub server: String,
     /// Names the prefix of the run.
     pub run_id: RunId,
     pub storage: S3Bucket,
@@ -66,8 +68,30 @@ pub enum Fetched {
     Stored(SubmittedFile),
     /// It has more bytes than it may have.
     TooLarge,
-    /// EvalAI's address of it answered with this HTTP status, so many times in a row.
-    Gone { status: u16, times: u32 },
+    /// EvalAI has not given it out, so many times in a row.
+    Missing { why: Absence, times: u32 },
+}
+
+/// Why a file is not to be had.
+#[derive(Clone, Copy, Debug, PartialEq, Eq)]
+pub enum Absence {
+    /// Its address answers with this HTTP status.
+    Status(u16),
+    /// EvalAI's row names no file.
+    NoFile,
+    /// The copy took longer than [`INPUT_LIMIT`].
+    Late,
+}
+
+/// For people.
+impl fmt::Display for Absence {
+    fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
+        match self {
+            Self::Status(status) => write!(f, "EvalAI's address of it answers {status}"),
+            Self::NoFile => f.write_str("EvalAI's row of the submission names no file"),
+            Self::Late => write!(f, "it could not be copied within {} min", INPUT_LIMIT.as_secs() / 60),
+        }
+    }
 }
 
 /// For people.
@@ -76,12 +100,14 @@ impl fmt::Display for Fetched {
         match self {
             Self::Stored(file) => write!(f, "{} bytes are stored", file.size),
             Self::TooLarge => f.write_str("it is too large"),
-            Self::Gone { status, times } => write!(f, "its address answered with {status}, {times} times"),
+            Self::Missing { why, times } => write!(f, "{why}, {times} times in a row"),
         }
     }
 }
 
-/// Times that an address is asked for a file which it does not have.
+/// Time that a copy may take.
+pub const INPUT_LIMIT: Duration = Duration::from_mins(30);
+/// Times that EvalAI is asked for a file which it does not give out.
 pub const INPUT_TRIES: u32 = 3;
 /// Time between two of them. In it EvalAI is asked for the address anew.
 const INPUT_PAUSE: Duration = Duration::from_mins(1);
@@ -91,19 +117,20 @@ const LONGEST_PAUSE: Duration = Duration::from_mins(5);
 
 impl Ask for Input {
     type Answer = Fetched;
-    /// Each has a part of a file in memory.
-    const AT_ONCE: usize = 2;
-    const AT_ONCE_OF_A_SERVICE: usize = 2;
+    /// Each has a part of a file in memory, of 11 MiB at most. The chart gives the controller 256 MiB.
+    const AT_ONCE: usize = 6;
+    const AT_ONCE_OF_A_SERVICE: usize = 4;
     /// The copy has a limit of its own, which is shorter: it gives an upload up that it has begun.
     const LONGEST: Duration = Duration::from_mins(50);
 
+    /// EvalAI may be slow for all of a copy's time. A request to the bucket has a limit of its own.
     fn service(&self) -> Service {
-        Service::bucket(&self.storage)
+        Service::evalai(&self.server)
     }
 
     fn again(&self, result: &Result<Fetched, Failure>, failures: u32, _waited: Duration) -> Option<Duration> {
         match result {
-            Ok(Fetched::Gone { times, .. }) => (*times < INPUT_TRIES).then_some(INPUT_PAUSE),
+            Ok(Fetched::Missing { times, .. }) => (*times < INPUT_TRIES).then_some(INPUT_PAUSE),
             Ok(Fetched::Stored(_) | Fetched::TooLarge) => None,
             Err(_) => {
                 let doubled = 1_u32 << failures.saturating_sub(1).min(5);
@@ -142,6 +169,7 @@ mod tests {
     fn a_file_is_fetched_once_and_what_failed_is_tried_again_later_each_time() {
         let question = Input {
             attempt: Attempt::FIRST,
+            server: "https://evalai.example".into(),
             run_id: "77".parse().unwrap(),
             storage: serde_json::from_value(serde_json::json!({"bucket": "results"})).unwrap(),
             submission: 77,
@@ -151,7 +179,8 @@ mod tests {
             sha256: "0".repeat(64),
             size: 3,
         });
-        let gone = |times| Ok(Fetched::Gone { status: 404, times });
+        let missing = |why, times| Ok(Fetched::Missing { why, times });
+        let gone = |times| missing(Absence::Status(404), times);
         let silent = || Err(Failure::silent("no"));
         for (result, failures, pause) in [
             (Ok(stored), 0, None),
@@ -159,6 +188,9 @@ mod tests {
             (gone(1), 0, Some(60)),
             (gone(2), 0, Some(60)),
             (gone(INPUT_TRIES), 0, None),
+            (missing(Absence::NoFile, 1), 0, Some(60)),
+            (missing(Absence::Late, 2), 0, Some(60)),
+            (missing(Absence::Late, INPUT_TRIES), 0, None),
             (silent(), 1, Some(10)),
             (silent(), 2, Some(20)),
             (silent(), 5, Some(160)),

@@ -1,6 +1,7 @@
 //! The copy of a file, from EvalAI's row to the bucket, against servers of the test's own.
 
 use std::sync::{Arc, Mutex};
+use std::time::Duration;
 
 use axum::body::to_bytes;
 use axum::extract::Request;
@@ -11,6 +12,7 @@ use serde_json::json;
 use tokio::sync::mpsc;
 
 use super::*;
+use crate::ask::state::State;
 use crate::fixtures;
 use leaderboard_api::{Attempt, SubmittedFile};
 use leaderboard_base::lock::lock;
@@ -115,6 +117,7 @@ impl Server {
 fn asked(endpoint: &str, limit: u64, last: Option<Result<Fetched, Failure>>) -> Asked<Input> {
     let question = Input {
         attempt: Attempt(1),
+        server: "https://evalai.example".into(),
         run_id: "77".parse().unwrap(),
         storage: serde_json::from_value(json!({"bucket": "results", "prefix": "v2/", "endpoint": endpoint})).unwrap(),
         submission: 77,
@@ -167,36 +170,65 @@ async fn a_file_goes_from_the_address_of_its_row_to_the_prefix_of_its_run() {
 }
 
 #[tokio::test(start_paused = true)]
-async fn a_file_that_never_ends_is_given_up() {
+async fn a_file_that_never_ends_is_given_up_also_where_the_bucket_is_slow() {
     let begun = Instant::now();
+    let end = begun + INPUT_LIMIT;
     let never: InputStream = stream::pending().boxed();
-    let next = until(never, begun + LIMIT).next().await;
-    assert!(matches!(next, Some(Err(InputError::Silent(_)))), "{next:?}");
-    assert!(begun.elapsed() >= LIMIT);
+    let late = Some(Err(Unread::Missing(Absence::Late)));
+    assert_eq!(until(never, end).next().await, late);
+    assert!(begun.elapsed() >= INPUT_LIMIT);
+    let ready: InputStream = stream::repeat_with(|| Ok(Bytes::from_static(b"x"))).boxed();
+    assert_eq!(until(ready, end).next().await, late);
     // The last part, its join and the abort have their own limits.
-    let left = Input::LONGEST.checked_sub(LIMIT);
+    let left = Input::LONGEST.checked_sub(INPUT_LIMIT);
     assert!(left.is_some_and(|left| left >= Duration::from_mins(15)), "{left:?}");
 }
 
 #[test]
-fn what_an_address_does_not_give_out_is_counted_until_another_answer() {
-    let gone = |times| Ok(Fetched::Gone { status: 404, times });
+fn files_of_one_server_leave_room_for_those_of_another_in_the_same_bucket() {
+    let (mut state, now) = (State::default(), Instant::now());
+    let mut want = |name: &str, server: &str, at| {
+        let question = Input {
+            server: server.into(),
+            ..asked("http://s3", 1, None).question
+        };
+        state.want(&key(name), question, LogSpan::default(), at);
+    };
+    for number in 0..9 {
+        want(&format!("submission-{number}"), "https://slow.example", now);
+    }
+    let later = now + Duration::from_millis(1);
+    want("other", "https://evalai.example", later);
+    let begun = std::iter::from_fn(|| state.next(later)).map(|work| work.asked.about.name);
+    let begun: Vec<String> = begun.collect();
+    assert!(begun.contains(&"other".to_owned()), "{begun:?}");
+    assert!(begun.len() > 2, "{begun:?}");
+}
+
+#[test]
+fn what_is_not_given_out_is_counted_until_another_answer() {
+    let missing = |why, times| Ok(Fetched::Missing { why, times });
+    let gone = |times| missing(Absence::Status(404), times);
+    let late = || Unread::Missing(Absence::Late);
     let silent = || Err(Failure::silent("no answer"));
     let refused = || {
         let why = "no URL".to_owned();
         Err(Failure { is_refused: true, why })
     };
     for (last, error, expected) in [
-        (None, InputError::Gone(404), gone(1)),
-        (Some(gone(1)), InputError::Gone(404), gone(2)),
-        (Some(gone(2)), InputError::Gone(404), gone(3)),
-        (Some(refused()), InputError::Gone(404), gone(1)),
-        (Some(gone(1)), InputError::Silent("no answer".into()), silent()),
-        (None, InputError::Refused("no URL".into()), refused()),
+        (None, InputError::Gone(404).into(), gone(1)),
+        (Some(gone(1)), InputError::Gone(404).into(), gone(2)),
+        (Some(gone(2)), InputError::Gone(404).into(), gone(3)),
+        (Some(refused()), InputError::Gone(404).into(), gone(1)),
+        (Some(gone(1)), InputError::NoFile.into(), missing(Absence::NoFile, 2)),
+        (Some(missing(Absence::Late, 2)), late(), missing(Absence::Late, 3)),
+        (Some(gone(1)), InputError::Silent("no answer".into()).into(), silent()),
+        (None, InputError::Refused("no URL".into()).into(), refused()),
     ] {
         assert_eq!(unread(error, &asked("http://s3", 1, last)), expected);
     }
     let mut later = asked("http://s3", 1, Some(gone(2)));
     later.question.attempt = Attempt(2);
-    assert_eq!(unread(InputError::Gone(404), &later), gone(1), "an attempt counts anew");
+    let error = InputError::Gone(404).into();
+    assert_eq!(unread(error, &later), gone(1), "an attempt counts anew");
 }

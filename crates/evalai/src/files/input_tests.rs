@@ -10,8 +10,15 @@ use crate::transport::memory::{begun, server, whole};
 const URL: &str = "https://storage.example/x.csv?X-Amz-Signature=5ec2e7";
 
 async fn opened(answers: impl Fn() -> Response<Body> + Send + Sync + 'static) -> Result<InputStream, InputError> {
+    opened_at(URL, answers).await
+}
+
+async fn opened_at(
+    url: &str,
+    answers: impl Fn() -> Response<Body> + Send + Sync + 'static,
+) -> Result<InputStream, InputError> {
     let server = server(move |_| future::ready(answers()).boxed());
-    Files::new(server, Timeouts::default()).open(&URL.into()).await
+    Files::new(server, Timeouts::default()).open(&url.into()).await
 }
 
 /// All of a file.
@@ -40,6 +47,34 @@ async fn whatever_is_at_the_address_is_the_file_however_large_it_is() {
     let expected = megabyte.repeat(5);
     let chunks = move || stream::iter(vec![Ok(megabyte.clone()); 5]).boxed();
     assert_eq!(read_whole(move || begun(200, "", chunks())).await, Ok(expected));
+}
+
+#[tokio::test]
+async fn a_page_in_the_place_of_a_file_is_refused_unless_a_page_was_uploaded() {
+    for (path, kind, is_refused) in [
+        ("x.csv?to=x.html", "text/html", true),
+        ("x.csv", "Text/HTML; charset=utf-8", true),
+        ("x", "text/html", true),
+        ("x.csv", "text/csv", false),
+        ("x.csv", "application/octet-stream", false),
+        ("x.html?X-Amz-Signature=5ec2e7", "text/html", false),
+        ("x.HTM", "text/html; charset=utf-8", false),
+    ] {
+        let answer = move || {
+            let mut answer = whole(200, "<html>Log in</html>");
+            answer
+                .headers_mut()
+                .insert(CONTENT_TYPE, HeaderValue::from_static(kind));
+            answer
+        };
+        let error = opened_at(&format!("https://storage.example/{path}"), answer)
+            .await
+            .err();
+        let why =
+            "the address of the uploaded file answers with a page and not with the file; check EvalAI's MEDIA_URL";
+        let refused = InputError::Refused(why.to_owned());
+        assert_eq!(error, is_refused.then_some(refused), "{path} {kind}");
+    }
 }
 
 #[tokio::test]
@@ -117,7 +152,7 @@ fn no_address_and_no_error_shows_what_lets_others_read_the_file() {
         name: "submission-7".into(),
         uid: "7".into(),
     };
-    let url = FileUrl::from(URL);
+    let url = Some(FileUrl::from(URL));
     let shown = format!("{:?}", InputAddress { key, url });
     assert!(shown.contains("submission-7") && !shown.contains("5ec2e7"), "{shown}");
     let gone = InputError::Gone(404).to_string();

@@ -54,6 +54,12 @@ impl Queue {
         }
     }
 
+    /// The row of a submission; none before its first read, and while it is known to be outdated.
+    pub fn present_row(&self, key: &Key) -> Option<Arc<Row>> {
+        let sub = self.subs.get(key).filter(|sub| !sub.outdated)?;
+        sub.view.row.clone()
+    }
+
     /// A write was not sent after all; it is chosen again.
     pub fn not_sent(&mut self, ticket: &Ticket) {
         if let Some(lane) = ticket

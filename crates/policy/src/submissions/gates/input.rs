@@ -9,7 +9,13 @@ use super::super::waits::Wait;
 use super::join;
 use crate::questions::{Fetched, INPUT_TRIES, Input};
 use leaderboard_api::text::sentence;
-use leaderboard_api::{Agents, Failure, Reason};
+use leaderboard_api::{Agents, Evalai, Failure, Reason};
+
+/// True if the copy has failed. The next try needs no slot, and a failure that is final waits for none.
+pub(super) fn has_failed(draft: &mut PlanBuilder<'_>) -> bool {
+    let is_answered = question(draft).is_some_and(|question| draft.view.input.answer_to(&question).is_some());
+    is_answered && waits(draft)
+}
 
 /// True if the file is not in the bucket yet. The submission keeps its slot for the first try alone: what is not served now may not be for
 /// long.
@@ -29,15 +35,12 @@ pub(super) fn waits(draft: &mut PlanBuilder<'_>) -> bool {
             end::failed(draft, too_large(question.limit));
             return true;
         }
-        Some(Ok(Fetched::Gone { status, times })) if *times >= INPUT_TRIES => {
-            let what = format!("EvalAI's address of the submitted file has answered {status}, {times} times in a row.");
+        Some(Ok(Fetched::Missing { why, times })) if *times >= INPUT_TRIES => {
+            let what = format!("The submitted file was asked for {times} times in a row: {why}.");
             end::failed(draft, infrastructure(Reason::InputMissing, &what));
             return true;
         }
-        Some(Ok(Fetched::Gone { status, .. })) => {
-            let why = format!("EvalAI's address of the file answers {status}.");
-            show_failed_try(draft, &why, false);
-        }
+        Some(Ok(Fetched::Missing { why, .. })) => show_failed_try(draft, &why.to_string(), false),
         Some(Err(failure)) => show_failed_try(draft, &failure.why, failure.is_refused),
     }
     draft.act(Action::Ask(Question::Input(Box::new(question))));
@@ -49,8 +52,10 @@ fn question(draft: &PlanBuilder<'_>) -> Option<Input> {
     let plan = draft.status.plan.as_ref();
     let plan = plan.filter(|plan| plan.agents() == Agents::Absent && draft.status.input.is_none())?;
     let bounds = plan.container()?.input.clone().unwrap_or_default();
+    let evalai = draft.leaderboard().and_then(|board| board.evalai.as_ref());
     Some(Input {
         attempt: draft.status.attempt.unwrap_or_default(),
+        server: evalai.map(Evalai::server).unwrap_or_default(),
         run_id: plan.run_id.clone(),
         storage: plan.storage.s3.clone(),
         submission: draft.spec().evalai?.submission,

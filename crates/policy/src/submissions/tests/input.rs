@@ -7,7 +7,7 @@ use serde_json::{Value, json};
 
 use super::builders::*;
 use crate::ask::{Answered, Failure, Lookup};
-use crate::questions::{Fetched, Input};
+use crate::questions::{Absence, Fetched, Input};
 use crate::submissions::{Action, EvalaiUpdate, Plan, Question, SlotUse};
 use crate::view::Turn;
 use leaderboard_api::State::{Failed, Pending};
@@ -52,6 +52,7 @@ fn file(size: i64) -> SubmittedFile {
 fn question(attempt: i64) -> Input {
     Input {
         attempt: Attempt(attempt),
+        server: "https://evalai.example".into(),
         run_id: "77".parse().unwrap(),
         storage: leaderboard(true).spec.storage.s3,
         submission: 77,
@@ -75,8 +76,8 @@ fn stored() -> Lookup<Input> {
     known(Ok(Fetched::Stored(file(12))))
 }
 
-fn gone(times: u32) -> Lookup<Input> {
-    known(Ok(Fetched::Gone { status: 404, times }))
+fn missing(why: Absence, times: u32) -> Lookup<Input> {
+    known(Ok(Fetched::Missing { why, times }))
 }
 
 fn asked(plan: &Plan) -> Option<&Input> {
@@ -216,8 +217,23 @@ fn a_file_that_is_too_large_is_the_participants() {
 }
 
 #[test]
-fn an_address_that_has_no_file_three_times_ends_it_uncharged_and_a_resume_asks_anew() {
+fn a_file_that_is_not_given_out_three_times_ends_it_uncharged_and_a_resume_asks_anew() {
+    for (why, says) in [
+        (
+            Absence::NoFile,
+            "3 times in a row: EvalAI's row of the submission names no file. ",
+        ),
+        (
+            Absence::Late,
+            "3 times in a row: it could not be copied within 30 min. ",
+        ),
+    ] {
+        let mut world = evalais();
+        world.view.input = missing(why, 3);
+        fails(&mut world, Reason::InputMissing, FailureClass::Infrastructure, says);
+    }
     let mut world = evalais();
+    let gone = |times| missing(Absence::Status(404), times);
     for times in [1, 2] {
         world.view.input = gone(times);
         let plan = world.pass_to(Pending, Reason::FetchingInput);
@@ -227,7 +243,7 @@ fn an_address_that_has_no_file_three_times_ends_it_uncharged_and_a_resume_asks_a
         assert!(message.contains("answers 404. It is tried again."), "{message}");
     }
     world.view.input = gone(3);
-    let says = "has answered 404, 3 times in a row. ";
+    let says = "3 times in a row: EvalAI's address of it answers 404. ";
     let plan = fails(&mut world, Reason::InputMissing, FailureClass::Infrastructure, says);
     assert_eq!(evalai_updates(&plan), [EvalaiUpdate::Failed]);
     assert_eq!(plan.status.retry, 0);
@@ -268,6 +284,56 @@ fn silence_is_waited_out_and_a_refusal_is_a_persons_to_fix() {
     refused.view.input = known(Err(Failure { is_refused: true, why }));
     let plan = refused.pass_to(Pending, Reason::FetchingInput);
     assert_eq!(condition(&plan, STALLED), ("True".into(), Reason::FetchingInput.into()));
+}
+
+#[test]
+fn a_copy_that_has_failed_waits_for_no_slot() {
+    let in_line = [Turn::NotInLine, Turn::Wait { position: 1, eta: None }];
+    for turn in in_line.clone() {
+        for (found, reason) in [
+            (known(Ok(Fetched::TooLarge)), Reason::InputInvalid),
+            (missing(Absence::Status(404), 3), Reason::InputMissing),
+        ] {
+            let mut world = evalais();
+            world.view.turn = turn.clone();
+            world.view.input = found;
+            world.pass_to(Failed, reason);
+        }
+    }
+    // Whatever its turn is meanwhile, the failure is counted from its beginning.
+    let mut world = evalais();
+    world.view.input = known(Err(Failure::silent("no")));
+    for (second, turn) in (0..).step_by(60).zip(in_line.iter().cycle().take(5)) {
+        world.view.turn = turn.clone();
+        world.go_to(second);
+        let plan = world.pass_to(Pending, Reason::FetchingInput);
+        assert_eq!((asked(&plan), plan.slot()), (Some(&question(1)), SlotUse::Leaves));
+    }
+    world.go_to(300);
+    let plan = world.pass_to(Pending, Reason::FetchingInput);
+    assert_eq!(condition(&plan, STALLED).0, "True");
+    // A file that is there stands in line.
+    world.view.input = stored();
+    world.view.turn = Turn::Wait { position: 1, eta: None };
+    let plan = world.pass_to(Pending, Reason::WaitingForSlot);
+    assert_eq!((asked(&plan), plan.status.input), (None, Some(file(12))));
+}
+
+#[test]
+fn a_job_that_is_made_again_waits_for_its_file() {
+    let mut world = evalais();
+    world.view.input = stored();
+    let mut world = world.with_job();
+    world.view.input = Lookup::default();
+    // Somebody removes the status, and then the Job.
+    world.submission().status = None;
+    world.pass_to(Pending, Reason::Preparing);
+    world.job_gone();
+    let plan = world.pass();
+    assert_eq!((asked(&plan), creates(&plan)), (Some(&question(1)), false));
+    world.view.input = stored();
+    let plan = world.pass();
+    assert_eq!((creates(&plan), plan.status.input), (true, Some(file(12))));
 }
 
 #[test]
