@@ -12,7 +12,7 @@ use crate::intake::ingest::{self, Incoming, Source};
 use crate::kubernetes::Store;
 use leaderboard_api::{Evalai, Foreign, Leaderboard, Submission};
 use leaderboard_evalai::{SweepRow, Swept};
-use leaderboard_policy::intake::route::Outcome;
+use leaderboard_policy::intake::route::{self, Outcome};
 
 /// Takes rows in until their sender is gone.
 pub async fn into_cluster(
@@ -30,6 +30,11 @@ pub async fn into_cluster(
 }
 
 async fn take(client: &Client, board: &Leaderboard, row: &SweepRow, kind: Swept) {
+    let server = &row.server;
+    if let Some(why) = route::misfit(row.is_static_code_upload, board) {
+        tracing::warn!(server, why, "EvalAI waits for a run of a submission, and none begins");
+        return;
+    }
     let namespace = board.namespace().unwrap_or_default();
     let api: Api<Submission> = Api::namespaced(client.clone(), &namespace);
     let incoming = Incoming {
@@ -40,7 +45,6 @@ async fn take(client: &Client, board: &Leaderboard, row: &SweepRow, kind: Swept)
         source: Source::Sweep(kind),
         sent_ms: row.time.as_millisecond(),
     };
-    let server = &row.server;
     match ingest::apply(&api, &board.name_any(), &incoming).await {
         Ok(Outcome::Repeat) => tracing::debug!(server, "the submission is known already"),
         Ok(outcome @ (Outcome::Refused | Outcome::NotNew | Outcome::IdTaken(_))) => {
@@ -107,6 +111,7 @@ mod tests {
             phase,
             submission: 7,
             kind: Swept::New,
+            is_static_code_upload: false,
             time: Timestamp::from_second(100).unwrap(),
         }
     }
@@ -196,6 +201,37 @@ mod tests {
         let (line, _) = made.next().unwrap();
         assert!(line.ends_with("/namespaces/quiet/submissions"), "{line}");
         assert!(made.next().is_none());
+    }
+
+    #[tokio::test]
+    async fn a_static_code_upload_is_made_in_the_mode_batch_alone() {
+        let in_mode = |mode: &str| {
+            let mut board = board(&mode.to_lowercase(), 1, &format!("http://{mode}"));
+            let evaluation = json!({"container": {"mode": mode, "image": "e", "command": ["e"]}});
+            board.spec.evaluation = serde_json::from_value(evaluation).unwrap();
+            board
+        };
+        let carla = board("carla", 1, "http://Carla");
+        let boards = [in_mode("Batch"), in_mode("Interactive"), in_mode("Predictions"), carla];
+        let (client, mut asked) = cluster();
+        let (sender, rows) = mpsc::unbounded_channel();
+        let rows_of = |is_static_code_upload| {
+            boards.iter().map(move |board| SweepRow {
+                is_static_code_upload,
+                ..row(&board.spec.evalai.as_ref().unwrap().server(), 2)
+            })
+        };
+        for row in rows_of(true).chain(rows_of(false)) {
+            sender.send(row).unwrap();
+        }
+        drop(sender);
+        into_cluster(client, Store::of(boards, |_| None), rows).await;
+        let made =
+            std::iter::from_fn(|| asked.try_recv().ok()).map(|(_, object)| object["spec"]["leaderboardName"].clone());
+        assert_eq!(
+            made.collect::<Vec<_>>(),
+            ["batch", "batch", "interactive", "predictions", "carla"]
+        );
     }
 
     #[tokio::test]

@@ -6,7 +6,7 @@ use std::collections::BTreeMap;
 
 use jiff::Timestamp;
 
-use super::row::{Phase, Split};
+use super::row::{Challenge, Phase, Split};
 use super::types::{Metrics, Target};
 use leaderboard_api::{Order, Ranking};
 
@@ -23,8 +23,8 @@ pub struct Catalog {
     pub codenames: BTreeMap<i64, Option<String>>,
     /// Whether the highest value leads, by the ids of leaderboards whose schemas leave it open; none where EvalAI does not show it.
     pub descending: BTreeMap<i64, Option<bool>>,
-    /// False if EvalAI's own worker evaluates its submissions. Read for a Leaderboard that takes files.
-    pub is_remote: bool,
+    /// Read for a Leaderboard that takes files.
+    pub settings: Challenge,
 }
 
 /// How a Leaderboard fits its challenge.
@@ -70,19 +70,30 @@ pub enum Misfit {
         "challenge {challenge} has remote_evaluation: false in EvalAI, so that EvalAI's own worker would evaluate its submissions; set it to true there"
     )]
     NotRemote { challenge: i64 },
+    /// Its submissions are no files.
+    #[error(
+        "challenge {challenge} has is_static_dataset_code_upload: true in EvalAI, so that its submissions are images and none starts here; set it to false there, or serve the challenge in the mode Batch"
+    )]
+    StaticCodeUpload { challenge: i64 },
 }
 
 impl Misfit {
     /// True if it keeps results from being published.
     fn prevents(&self) -> bool {
-        !matches!(self, Self::Unsent { .. } | Self::NotRemote { .. })
+        !matches!(
+            self,
+            Self::Unsent { .. } | Self::NotRemote { .. } | Self::StaticCodeUpload { .. }
+        )
     }
 }
 
 /// Compares a Leaderboard with its challenge.
 pub fn compare(target: &Target, catalog: &Catalog) -> Labels {
     let challenge = target.challenge;
-    let not_remote = (target.takes_files && !catalog.is_remote).then_some(Misfit::NotRemote { challenge });
+    let of_files = |is_so: bool, misfit| (target.takes_files && is_so).then_some(misfit);
+    let not_remote = of_files(!catalog.settings.is_remote, Misfit::NotRemote { challenge });
+    let is_static = catalog.settings.is_static_code_upload();
+    let images = of_files(is_static, Misfit::StaticCodeUpload { challenge });
     Labels {
         at: catalog.at,
         problems: target
@@ -90,6 +101,7 @@ pub fn compare(target: &Target, catalog: &Catalog) -> Labels {
             .iter()
             .flat_map(|phase| compare_phase(target, catalog, *phase))
             .chain(not_remote)
+            .chain(images)
             .collect(),
         rankings: target
             .phases
@@ -224,7 +236,7 @@ mod tests {
             splits: vec![split(1, 10, &["A", "B"]), split(2, 11, &["A", "B", "C"])],
             codenames: [(10, codename.map(str::to_owned)), (11, None)].into(),
             descending: BTreeMap::new(),
-            is_remote: true,
+            settings: Challenge::default(),
         }
     }
 
@@ -331,24 +343,34 @@ mod tests {
     }
 
     #[test]
-    fn a_leaderboard_that_takes_files_names_a_challenge_that_evalais_own_worker_evaluates() {
-        for (takes_files, is_remote, is_named) in [
-            (true, false, true),
-            (true, true, false),
-            (false, false, false),
-            (false, true, false),
+    fn a_leaderboard_that_takes_files_names_a_challenge_that_evalais_own_worker_evaluates_or_that_has_images() {
+        let (remote, challenge) = (Challenge::default(), 1);
+        let local = Challenge {
+            is_remote: false,
+            ..remote
+        };
+        let of_images = Challenge {
+            is_static: true,
+            ..remote
+        };
+        for (takes_files, settings, expected) in [
+            (true, local, Some(Misfit::NotRemote { challenge })),
+            (true, remote, None),
+            (true, of_images, Some(Misfit::StaticCodeUpload { challenge })),
+            (false, local, None),
+            (false, remote, None),
+            (false, of_images, None),
         ] {
             let target = Target {
                 takes_files,
                 ..target(&[1], &["A", "B"])
             };
             let catalog = Catalog {
-                is_remote,
+                settings,
                 ..catalog(Some("leaderboard"))
             };
             let found = compare(&target, &catalog);
-            let expected = is_named.then_some(Misfit::NotRemote { challenge: 1 });
-            assert_eq!(found.problems, Vec::from_iter(expected), "{takes_files} {is_remote}");
+            assert_eq!(found.problems, Vec::from_iter(expected), "{takes_files} {settings:?}");
             assert!(found.ok(), "results are published all the same");
         }
     }

@@ -149,16 +149,36 @@ impl<'de> Deserialize<'de> for Row {
     }
 }
 
-/// The settings of a challenge.
+/// The settings of a challenge; the default is what EvalAI is taken to say where it says nothing.
 #[derive(Clone, Copy, Debug, PartialEq, Eq, Deserialize)]
+#[serde(default)]
 pub struct Challenge {
-    /// EvalAI leaves the evaluation to the host. Where it does not say so, it is taken to.
-    #[serde(default = "yes", rename = "remote_evaluation", deserialize_with = "is_not_false")]
+    /// EvalAI leaves the evaluation to the host.
+    #[serde(rename = "remote_evaluation", deserialize_with = "is_not_false")]
     pub is_remote: bool,
+    /// Participants submit images.
+    #[serde(deserialize_with = "is_not_false")]
+    pub is_docker_based: bool,
+    /// An image writes predictions for a dataset that does not change.
+    #[serde(rename = "is_static_dataset_code_upload", deserialize_with = "is_true")]
+    pub is_static: bool,
 }
 
-fn yes() -> bool {
-    true
+impl Default for Challenge {
+    fn default() -> Self {
+        Self {
+            is_remote: true,
+            is_docker_based: true,
+            is_static: false,
+        }
+    }
+}
+
+impl Challenge {
+    /// True if its messages are of static code uploads.
+    pub fn is_static_code_upload(self) -> bool {
+        self.is_docker_based && self.is_static
+    }
 }
 
 fn is_not_false<'de, D: Deserializer<'de>>(deserializer: D) -> Result<bool, D::Error> {
@@ -363,6 +383,22 @@ mod tests {
         ] {
             let challenge: Challenge = serde_json::from_value(settings.clone()).unwrap();
             assert_eq!(challenge.is_remote, expected, "{settings}");
+        }
+    }
+
+    #[test]
+    fn a_challenge_has_static_code_uploads_only_where_it_takes_images() {
+        let (images, is_static) = ("is_docker_based", "is_static_dataset_code_upload");
+        for (settings, expected) in [
+            (json!({}), false),
+            (json!({images: true}), false),
+            (json!({images: true, is_static: true}), true),
+            (json!({is_static: true}), true),
+            (json!({images: false, is_static: true}), false),
+            (json!({images: true, is_static: "true"}), false),
+        ] {
+            let challenge: Challenge = serde_json::from_value(settings.clone()).unwrap();
+            assert_eq!(challenge.is_static_code_upload(), expected, "{settings}");
         }
     }
 

@@ -302,6 +302,8 @@ pub struct SweepRow {
     pub phase: i64,
     pub submission: i64,
     pub kind: Swept,
+    /// The challenge's submissions are static code uploads, as far as its settings were read.
+    pub is_static_code_upload: bool,
     /// When it asked to be run: its re-run or resume, else its submission.
     pub time: Timestamp,
 }

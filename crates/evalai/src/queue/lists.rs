@@ -12,7 +12,7 @@ use super::sub::Sub;
 use super::{Now, Queue};
 use crate::answer::{About, Answer};
 use crate::request::{Purpose, Reply, Request};
-use crate::row::{Row, Split};
+use crate::row::{Challenge, Row, Split};
 use crate::types::{Changed, Key, SweepRow, Swept};
 use leaderboard_api::evalai_status::Status;
 use leaderboard_api::names;
@@ -71,9 +71,9 @@ impl Queue {
                 });
             }
             (Request::Challenge(id), Reply::Challenge(answer)) => {
-                let answer = or_hidden(answer, |challenge| challenge.is_remote);
-                self.took_of_check(*id, answer, now, |check, is_remote| {
-                    check.is_remote = Some(is_remote.unwrap_or(true));
+                let answer = or_hidden(answer, |challenge| challenge);
+                self.took_of_check(*id, answer, now, |check, settings| {
+                    check.settings = Some(settings.unwrap_or_default());
                 });
             }
             _ => {}
@@ -184,6 +184,11 @@ impl Queue {
         let Some(challenge) = self.challenges.get_mut(&id) else {
             return;
         };
+        let settings = challenge.check.catalog.as_ref().map(|catalog| catalog.settings);
+        if target.takes_files && settings.is_none() {
+            // The settings may say that the row is of no file.
+            return;
+        }
         let (age, since) = (now.wall.duration_since(time), target.since);
         challenge.swept.retain(|_, (_, found)| *found + SWEPT_FOR > now.at);
         let is_known = challenge.swept.get(&row.id).is_some_and(|(at, _)| *at == time);
@@ -197,6 +202,7 @@ impl Queue {
             phase,
             submission: row.id,
             kind: kind_of(row, since),
+            is_static_code_upload: settings.is_some_and(Challenge::is_static_code_upload),
             time,
         });
     }

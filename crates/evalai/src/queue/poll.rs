@@ -9,7 +9,7 @@ use jiff::Timestamp;
 
 use crate::labels::Catalog;
 use crate::request::{Purpose, Request};
-use crate::row::{Phase, Split};
+use crate::row::{self, Phase, Split};
 use crate::types::Target;
 use leaderboard_base::backoff::Backoff;
 
@@ -112,10 +112,9 @@ pub(super) struct ChallengeCheck {
     pub codenames: BTreeMap<i64, Option<String>>,
     /// Whether the highest value leads, by the ids of the leaderboards whose schemas leave it open.
     pub descending: BTreeMap<i64, Option<bool>>,
-    /// True if a Leaderboard takes files, which EvalAI's own worker could evaluate, too.
+    /// True if a Leaderboard takes files: then the challenge's settings are read.
     pub takes_files: bool,
-    /// True if EvalAI leaves the evaluation to the host, as far as it shows that. Read for one that takes files.
-    pub is_remote: Option<bool>,
+    pub settings: Option<row::Challenge>,
     /// The last whole reading.
     pub catalog: Option<Catalog>,
     /// Why there is no newer one.
@@ -139,7 +138,7 @@ impl ChallengeCheck {
         (self.phases, self.splits) = (None, None);
         self.codenames.clear();
         self.descending.clear();
-        self.is_remote = None;
+        self.settings = None;
     }
 
     /// Starts anew at once: a list was refused as if the token's user were no host of the challenge.
@@ -164,7 +163,7 @@ impl ChallengeCheck {
         codename.or_else(|| {
             let is_open = |split: &&Split| split.schema.leaves_order_open() && !self.descending.contains_key(&split.id);
             let open = wanted().find(is_open);
-            let settings = (self.takes_files && self.is_remote.is_none()).then_some(Request::Challenge(challenge));
+            let settings = (self.takes_files && self.settings.is_none()).then_some(Request::Challenge(challenge));
             open.map(|split| Request::PhaseSplit(challenge, split.id)).or(settings)
         })
     }
@@ -176,7 +175,7 @@ impl ChallengeCheck {
         };
         let codenames = std::mem::take(&mut self.codenames);
         let descending = std::mem::take(&mut self.descending);
-        let is_remote = self.is_remote.take();
+        let settings = self.settings.take();
         (self.error, self.is_forbidden) = (None, false);
         self.catalog = Some(Catalog {
             at,
@@ -184,7 +183,7 @@ impl ChallengeCheck {
             splits,
             codenames,
             descending,
-            is_remote: is_remote.unwrap_or(true),
+            settings: settings.unwrap_or_default(),
         });
     }
 }

@@ -217,7 +217,7 @@ pub fn route(
         None => {}
     }
     if let Some(leaderboard) = readers.iter().find(|lb| lb.serves(message.challenge, message.phase)) {
-        return match misfit(message, leaderboard) {
+        return match misfit(message.is_static_code_upload, leaderboard) {
             None => MessageOutcome::Ingest {
                 namespace: leaderboard.namespace().unwrap_or_default(),
                 leaderboard: leaderboard.name_any(),
@@ -239,10 +239,10 @@ pub fn route(
     )))
 }
 
-/// Why a Leaderboard cannot run the submission of a message.
-fn misfit(message: &Message, leaderboard: &Leaderboard) -> Option<String> {
+/// Why a Leaderboard cannot run a submission of this kind.
+pub fn misfit(is_static_code_upload: bool, leaderboard: &Leaderboard) -> Option<String> {
     let mode = leaderboard.spec.evaluation.container().map(|container| container.mode);
-    if !message.is_static_code_upload || mode == Some(EvaluationMode::Batch) {
+    if !is_static_code_upload || mode == Some(EvaluationMode::Batch) {
         return None;
     }
     let name = leaderboard.name_any();

@@ -205,13 +205,25 @@ fn phase(id: i64) -> Phase {
 
 #[test]
 fn of_a_challenge_whose_submissions_are_files_it_is_read_who_evaluates_them() {
-    let of_host = |is_remote| Some(Answer::Done(Challenge { is_remote }));
-    let hidden = || Some(Answer::Refused(refusal(About::Request, 406)));
-    for (answer, is_named) in [
-        (of_host(false), true),
-        (of_host(true), false),
-        (hidden(), false),
-        (None, false),
+    let remote = Challenge::default();
+    let local = Challenge {
+        is_remote: false,
+        ..remote
+    };
+    let of_images = Challenge {
+        is_static: true,
+        ..remote
+    };
+    let hidden = Answer::Refused(refusal(About::Request, 406));
+    for (answer, expected) in [
+        (Some(Answer::Done(local)), Some(Misfit::NotRemote { challenge: 1 })),
+        (Some(Answer::Done(remote)), None),
+        (
+            Some(Answer::Done(of_images)),
+            Some(Misfit::StaticCodeUpload { challenge: 1 }),
+        ),
+        (Some(hidden), None),
+        (None, None),
     ] {
         let mut bench = Bench::new();
         let board = Target {
@@ -231,9 +243,9 @@ fn of_a_challenge_whose_submissions_are_files_it_is_read_who_evaluates_them() {
             bench.answer(&ticket, Reply::Challenge(answer));
         }
         bench.expect_nothing();
-        let problems = bench.queue.labels(&key(100)).0.unwrap().problems;
-        let named = problems.contains(&Misfit::NotRemote { challenge: 1 });
-        assert_eq!(named, is_named, "{answer:?}: {problems:?}");
+        let mut problems = bench.queue.labels(&key(100)).0.unwrap().problems;
+        problems.retain(|problem| matches!(problem, Misfit::NotRemote { .. } | Misfit::StaticCodeUpload { .. }));
+        assert_eq!(problems, Vec::from_iter(expected), "{answer:?}");
     }
 }
 

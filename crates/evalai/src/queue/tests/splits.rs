@@ -3,6 +3,7 @@
 use super::*;
 use crate::labels::Catalog;
 use crate::queue::payloads::fitted;
+use crate::row::Challenge;
 
 fn with_split(split: &str) -> Target {
     Target {
@@ -254,7 +255,7 @@ fn results_fit_the_splits_of_their_leaderboard_or_are_not_sent() {
             .map(|(id, name)| (id, name.map(str::to_owned)))
             .into(),
         descending: BTreeMap::new(),
-        is_remote: true,
+        settings: Challenge::default(),
     };
     let (of_evalai, fixed) = (takes_what_is_listed(None), with_split("val"));
     let (known, unnamed) = (catalog([Some("test"), Some("dev")]), catalog([Some("test"), None]));

@@ -1,6 +1,7 @@
 //! Sweeps of a phase: their answers and finds.
 
 use super::*;
+use crate::row::Challenge;
 use crate::types::Swept;
 
 #[test]
@@ -73,6 +74,48 @@ fn the_sweep_hands_out_what_was_lost_and_nothing_else() {
         again += bench.queue.take_sweep().len();
     }
     assert_eq!(again, 1, "once more after ten minutes");
+}
+
+#[test]
+fn the_sweep_says_of_a_row_whether_its_challenge_has_static_code_uploads_and_waits_for_that_where_files_are_taken() {
+    let old = || Row {
+        submitted_at: Some(wall(-1000)),
+        ..row(1, Status::Submitted)
+    };
+    for (takes_files, is_static, expected) in [
+        (true, true, [None, Some(true)]),
+        (true, false, [None, Some(false)]),
+        (false, true, [Some(false), None]),
+    ] {
+        let mut bench = Bench::new();
+        let board = Target {
+            takes_files,
+            ..target()
+        };
+        let now = bench.now();
+        bench.queue.serve(&key(100), &board, now);
+        let swept = |bench: &mut Bench| {
+            bench.list("sweep of submitted", vec![old()]);
+            bench.list("sweep of resuming", vec![]);
+            let rows = bench.queue.take_sweep();
+            rows.first().map(|row| row.is_static_code_upload)
+        };
+        let first = swept(&mut bench);
+        let ticket = bench.expect("phases");
+        bench.answer(&ticket, Reply::Phases(Answer::Done(vec![])));
+        let ticket = bench.expect("splits");
+        bench.answer(&ticket, Reply::Splits(Answer::Done(vec![])));
+        if takes_files {
+            let settings = Challenge {
+                is_static,
+                ..Challenge::default()
+            };
+            let ticket = bench.expect("challenge");
+            bench.answer(&ticket, Reply::Challenge(Answer::Done(settings)));
+        }
+        bench.wait(60.0);
+        assert_eq!([first, swept(&mut bench)], expected, "{takes_files} {is_static}");
+    }
 }
 
 #[test]
