@@ -35,7 +35,7 @@ pub(super) async fn look(client: &Client, leaderboard: &Leaderboard) -> Problems
 }
 
 /// The claims, each with the field that names it.
-fn named(leaderboard: &Leaderboard) -> Vec<(&'static str, &str)> {
+pub(super) fn named(leaderboard: &Leaderboard) -> Vec<(&'static str, &str)> {
     let Some(container) = leaderboard.spec.evaluation.container() else {
         return Vec::new();
     };

@@ -52,7 +52,10 @@ impl Ask for Pods {
 
     fn again(&self, result: &Result<TriedPods, Failure>, _failures: u32, _waited: Duration) -> Option<Duration> {
         match result {
-            Ok(pods) if pods.refused.is_none() && pods.claims.is_good() => pods.may_change.then_some(AGAIN),
+            Ok(pods) if pods.refused.is_none() && pods.claims.is_good() => {
+                let may_change = pods.may_change || !data_claims::named(&self.0).is_empty();
+                may_change.then_some(AGAIN)
+            }
             Ok(_) | Err(_) => Some(SOON),
         }
     }
@@ -173,4 +176,40 @@ fn sample_job(settings: &Settings, leaderboard: &Leaderboard, track: &Track) -> 
         // How old a measurement of the isolation is changes nothing that a Job is refused for.
         now: Timestamp::UNIX_EPOCH,
     }))
+}
+
+#[cfg(test)]
+mod tests {
+    use serde_json::json;
+
+    use super::*;
+
+    #[test]
+    fn what_depends_on_other_objects_is_looked_at_again() {
+        let claim = json!({"persistentVolumeClaim": {"claimName": "d"}});
+        let image = json!({"image": {"reference": "data:1"}});
+        let good = TriedPods::default;
+        let changing = || TriedPods {
+            may_change: true,
+            ..good()
+        };
+        let refused = || TriedPods {
+            refused: Some("no".to_owned()),
+            ..good()
+        };
+        for (dataset, pods, expected) in [
+            (&image, good(), None),
+            (&image, changing(), Some(AGAIN)),
+            (&image, refused(), Some(SOON)),
+            (&claim, good(), Some(AGAIN)),
+            (&claim, refused(), Some(SOON)),
+        ] {
+            let evaluation =
+                json!({"container": {"mode": "Batch", "image": "e", "command": ["e"], "dataset": dataset}});
+            let mut board = crate::fixtures::leaderboard("board", "http://127.0.0.1:1");
+            board.spec.evaluation = serde_json::from_value(evaluation).unwrap();
+            let again = Pods(Arc::new(board)).again(&Ok(pods), 0, Duration::ZERO);
+            assert_eq!(again, expected, "{dataset}");
+        }
+    }
 }
