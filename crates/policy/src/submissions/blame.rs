@@ -17,7 +17,9 @@ use super::waits::Wait;
 use super::{cause, failure};
 use crate::report_digest::clamp;
 use crate::view::{ContainerView, EndView, PodView};
-use leaderboard_api::{Agents, EndReason, Failure, LastEnd, RunPlan, SubmissionStatus, WorkerState, WorkerStatus};
+use leaderboard_api::{
+    Agents, EndReason, Failure, LastEnd, RunPlan, SubmissionStatus, WorkerState, WorkerStatus, names,
+};
 use leaderboard_evaluation::of_plan;
 use leaderboard_protocol::files::{Host, Member, Pair, Side};
 use leaderboard_protocol::verdict::{CODE_NO_PROCESS, CODE_NODE_REFUSED, What};
@@ -108,19 +110,25 @@ fn table(host: Option<&ContainerView>, agent: Option<&ContainerView>, now: Times
 /// Both sides were ended in one round, and by no process of the Pod: its sandbox was made anew, or its node started again. An agent can end
 /// itself in whatever way, but not its host so.
 fn from_outside(host: Option<&ContainerView>, agent: Option<&ContainerView>) -> Option<Crash> {
-    fn ended(container: &ContainerView) -> Option<&EndView> {
-        let end = container.last.as_ref()?;
-        let goes_on = container.running || container.waiting.is_some();
-        let is_it = match what(end) {
-            // In a Pod that is being ended both are asked to end, and neither comes back.
-            Some(What::Stopped) => goes_on,
-            None | Some(What::SilentDeath) => FROM_OUTSIDE.contains(&end.exit_code) && end.reason != "OOMKilled",
-            _ => false,
-        };
-        (is_it && !end.is_start_error()).then_some(end)
-    }
-    let (own, agent) = (ended(host?)?, ended(agent?)?);
+    let (own, agent) = (end_from_outside(host?)?, end_from_outside(agent?)?);
     (by_times_and_rounds(own, agent) == Order::SameRound).then(|| crash(EndReason::EndedFromOutside, own))
+}
+
+/// The last end of a container, if that can have come from outside.
+fn end_from_outside(container: &ContainerView) -> Option<&EndView> {
+    let end = container.last.as_ref()?;
+    let goes_on = container.running || container.waiting.is_some();
+    let is_it = match what(end) {
+        // In a Pod that is being ended both are asked to end, and neither comes back.
+        Some(What::Stopped) => goes_on,
+        None | Some(What::SilentDeath) => is_killed_from_outside(end),
+        _ => false,
+    };
+    (is_it && !end.is_start_error()).then_some(end)
+}
+
+fn is_killed_from_outside(end: &EndView) -> bool {
+    FROM_OUTSIDE.contains(&end.exit_code) && end.reason != "OOMKilled"
 }
 
 /// True if the kubelet could not start a host's container again that has run in this Pod, for want of processes. That is no failure of its own:
@@ -366,6 +374,10 @@ fn count_crashes(container: &ContainerView, agents: Agents) -> i32 {
         return container.restarts;
     };
     let is_host = Member::parse(&container.name).is_some_and(|member| member.side != Side::Agent);
+    // After that only a sandbox that is made anew starts it again.
+    if agents == Agents::First && !is_host && last.exit_code == 0 {
+        return 0;
+    }
     if is_host && agents == Agents::Beside && lacked_processes(container, last) {
         return 0;
     }
@@ -385,7 +397,7 @@ fn last_crash_of(pod: &PodView, (kind, agents): (Host, Agents), id: i32, now: Ti
     let (host, agent) = (container(pod, pair.host(kind)), container(pod, pair.agent()));
     match agents {
         Agents::Beside => last_crash(kind, host, agent, now),
-        Agents::First | Agents::Absent => alone::last_crash(host, agent),
+        Agents::First | Agents::Absent => alone::last_crash(host, agent, pod.container(names::CONTAINER_LOGCOPY)),
     }
 }
 

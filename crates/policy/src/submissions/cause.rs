@@ -8,11 +8,13 @@
 
 use serde_json::Value;
 
+use super::blame::agents_of;
 use super::failure::{self, charged, for_both, infrastructure, participant};
+use super::limits;
 use super::status::PlanBuilder;
 use crate::view::{ContainerView, PodView};
 use leaderboard_api::text::sentence;
-use leaderboard_api::{Failure, LeaderboardSpec, Reason, names};
+use leaderboard_api::{Agents, Failure, LeaderboardSpec, Reason, names};
 use leaderboard_contract::run::TOOLS;
 use leaderboard_contract::verdict::WorkspaceReason;
 use leaderboard_pod_spec::layout::{LOGS_VOLUME, SHM_VOLUME};
@@ -404,8 +406,12 @@ pub(super) fn disk_full(draft: &PlanBuilder<'_>) -> Option<Failure> {
     let (_, words) = pod.ended_by_node.as_ref().filter(|(reason, _)| reason == "Evicted")?;
     let account = Account::of(words)?;
     let what = format!("The Pod was evicted because its disk was full: {}", sentence(words));
+    // Nobody else writes before the evaluators.
+    let is_first = agents_of(&draft.status) == Agents::First && pod.agent_started.is_some();
+    let is_alone = is_first && !limits::have_hosts_begun(pod);
     let is_agents = match account {
         Account::Container(name) => is_agent(name),
+        Account::Volume(LOGS_VOLUME) | Account::Pod if is_alone => true,
         Account::Volume(LOGS_VOLUME) => {
             let report = draft.view.report.ours().filter(|report| report.pod_uid == pod.uid);
             report.is_some_and(|report| report.agents_fill_disk)

@@ -160,16 +160,15 @@ fn of_job(draft: &PlanBuilder<'_>, end: &JobEnd) -> Failure {
     }
     match end {
         JobEnd::Complete { .. } => failure::results_not_stored(),
-        // Without a limit on the run the deadline is not ours.
-        JobEnd::Failed { reason, .. } if reason == "DeadlineExceeded" && draft.deadlines().run_seconds.is_some() => {
-            let units = draft.words().units;
-            let what = format!("The Pod reached its time limit; finished {units} are kept.");
-            failure::charged(Reason::TimeLimit, &what)
+        JobEnd::Failed { reason, message, .. } => {
+            // Without a limit on the run the deadline is not ours.
+            let limit = draft.deadlines().run_seconds.filter(|_| reason == "DeadlineExceeded");
+            let late = limit.map(|limit| run::over_time(draft, limit));
+            late.or_else(|| failure::worst(&draft.status)).unwrap_or_else(|| {
+                let what = format!("The Job failed with {reason}: {}", sentence(message));
+                failure::infrastructure(Reason::JobFailed, &what)
+            })
         }
-        JobEnd::Failed { reason, message, .. } => failure::worst(&draft.status).unwrap_or_else(|| {
-            let what = format!("The Job failed with {reason}: {}", sentence(message));
-            failure::infrastructure(Reason::JobFailed, &what)
-        }),
     }
 }
 

@@ -102,6 +102,15 @@ pub(super) fn time_limit(seconds: i64, words: &Words) -> Failure {
     charged(Reason::TimeLimit, &what)
 }
 
+/// The evaluators are the hosts' own, and so is the time that they take.
+pub(super) fn evaluators_late(seconds: i64, words: &Words) -> Failure {
+    let what = format!(
+        "The evaluators had not finished after the {seconds} s of deadlines.runSeconds; finished {} are kept.",
+        words.units
+    );
+    infrastructure(Reason::EvaluatorFailed, &what)
+}
+
 pub(super) fn results_not_stored() -> Failure {
     infrastructure(
         Reason::ResultsNotStored,

@@ -32,6 +32,8 @@ pub(super) enum Gate {
     Policy,
     /// The pause after a failure that is not the participant's is over.
     NextTry,
+    /// What is known of the copy of its submitted file is no failure.
+    InputAnswer,
     /// It has a slot.
     Slot,
     /// Its submitted file is in the bucket.
@@ -46,6 +48,7 @@ pub(super) fn closed(draft: &mut PlanBuilder<'_>, gates: &[Gate]) -> Option<Gate
         Gate::Leaderboard => waits_for_leaderboard(draft),
         Gate::Policy => waits_for_policy(draft),
         Gate::NextTry => waits_for_next_try(draft),
+        Gate::InputAnswer => input::has_failed(draft),
         Gate::Slot => waits_for_slot(draft),
         Gate::Input => input::waits(draft),
     })

@@ -2,7 +2,7 @@
 //!
 //! The kubelet's events are not watched, and no condition covers images, so a pull is known by its containers: the kubelet starts them in
 //! order, and one that was never started, has no error and is next is waiting for its image. Where the agent runs first, the start of the
-//! evaluators begins at its end.
+//! evaluators begins at its end, and anew once its files are copied.
 
 use jiff::Timestamp;
 
@@ -24,11 +24,15 @@ pub(super) struct Limit {
     pub(super) is_of_pulls: bool,
 }
 
-/// The limit of a start; none before the Pod has a node. `stalled` is since when a container of it does not start, and that is known.
+/// The limit of a start; none before the Pod has a node, and while an input is copied, which may be large. `stalled` is since when a container
+/// of it does not start, and that is known.
 pub(super) fn limit(pod: &PodView, agents: Agents, deadlines: &Deadlines, stalled: Option<Timestamp>) -> Option<Limit> {
     let scheduled = pod.scheduled?;
+    if stalled.is_none() && copies_input(pod, agents) {
+        return None;
+    }
     let (began, ran) = match agents_end(pod, agents) {
-        Some(end) => (end.max(scheduled), 0),
+        Some(end) => (end.max(collected(pod).unwrap_or(end)).max(scheduled), 0),
         None => (scheduled, run_seconds(pod)),
     };
     let pulled_by = after(after(began, ran), deadlines.pull_seconds);
@@ -58,10 +62,37 @@ fn agents_end(pod: &PodView, agents: Agents) -> Option<Timestamp> {
     pod.containers.iter().find(is_it)?.last.as_ref()?.at
 }
 
+/// When its files were copied.
+fn collected(pod: &PodView) -> Option<Timestamp> {
+    let collect = pod.container(names::CONTAINER_COLLECT)?;
+    collect.last.as_ref().filter(|end| end.exit_code == 0)?.at
+}
+
 /// True if that agent is through, and no evaluator has begun.
 pub(super) fn awaits_evaluators(pod: &PodView, agents: Agents) -> bool {
-    let mut evaluators = pod.containers.iter().filter(|container| is_of_worker(container));
-    agents_end(pod, agents).is_some() && !evaluators.any(|one| !one.is_agents() && (one.running || one.last.is_some()))
+    agents_end(pod, agents).is_some() && !have_hosts_begun(pod)
+}
+
+/// True if a host's container of a worker has begun.
+pub(super) fn have_hosts_begun(pod: &PodView) -> bool {
+    let mut of_workers = pod.containers.iter().filter(|container| is_of_worker(container));
+    of_workers.any(|one| !one.is_agents() && (one.running || one.last.is_some()))
+}
+
+/// True if the files of a submission are being copied. They may be large.
+pub(super) fn copies_input(pod: &PodView, agents: Agents) -> bool {
+    let runs = |name: &str| pod.container(name).is_some_and(|container| container.running);
+    runs(names::CONTAINER_COLLECT) || (agents != Agents::Beside && runs(names::CONTAINER_WORKSPACE))
+}
+
+/// True if a run under way takes its time for agents. One that runs first takes none before it starts in its Pod, or once it has ended well.
+pub(super) fn is_agents_time(pod: Option<&PodView>, agents: Agents) -> bool {
+    let works = |one: &ContainerView| one.is_agents() && !one.has_ended_well();
+    match agents {
+        Agents::Beside => true,
+        Agents::First => pod.is_some_and(|pod| pod.agent_started.is_some() && pod.containers.iter().any(works)),
+        Agents::Absent => false,
+    }
 }
 
 fn is_of_worker(container: &ContainerView) -> bool {
@@ -139,12 +170,6 @@ pub(super) fn start_deadline(pod: &PodView, agents: Agents, over: Limit) -> Fail
 
 /// How far a start is.
 pub(super) fn stage(pod: &PodView) -> &'static str {
-    if pod
-        .container(names::CONTAINER_COLLECT)
-        .is_some_and(|collect| collect.running)
-    {
-        return "collect copies the files that the agent has left";
-    }
     if pod.logcopy_running {
         return "images are pulled, its containers start";
     }

@@ -106,7 +106,7 @@ fn in_line(draft: &mut PlanBuilder<'_>) {
     if !accept::decide(draft) {
         return draft.look_again(Wait::SLOT);
     }
-    match gates::closed(draft, &[Gate::NextTry, Gate::Slot, Gate::Input]) {
+    match gates::closed(draft, &[Gate::NextTry, Gate::InputAnswer, Gate::Slot, Gate::Input]) {
         None => start::start_job(draft),
         Some(Gate::NextTry) => {}
         Some(_) => draft.look_again(Wait::SLOT),
@@ -183,6 +183,10 @@ fn without_its_job(draft: &mut PlanBuilder<'_>) {
     }
     if let Some(left) = stop::requested_fence_left(draft) {
         return draft.requeue_in(left);
+    }
+    // Somebody has removed the status, and with it the file's size and digest.
+    if gates::closed(draft, &[Gate::Input]).is_some() {
+        return draft.look_again(Wait::SLOT);
     }
     if draft.was_job_seen() {
         if draft.status.recreated >= MAX_RECREATED {

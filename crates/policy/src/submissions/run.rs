@@ -13,7 +13,7 @@ use super::failure::{self, charged};
 use super::plan::{Action, EvalaiUpdate, Question, TableUpdate};
 use super::status::PlanBuilder;
 use super::waits::{Wait, after};
-use super::{blame, cause};
+use super::{blame, cause, limits};
 use crate::report_digest::{ReportDigest, clamp};
 use crate::view::{ContainerView, ObservedJob, ObservedReport, PodView, ReportDemand, Stage, Standing, View};
 use leaderboard_api::conditions::{self, Condition, Truth};
@@ -50,13 +50,31 @@ pub(super) fn watch(draft: &mut PlanBuilder<'_>) {
     let Some(ran) = run_seconds(draft).filter(|_| draft.leaderboard().is_some()) else {
         return;
     };
-    let Some(limit) = draft.deadlines().run_seconds else {
+    let Some(limit) = draft.deadlines().run_seconds.filter(|_| !awaits_images(draft)) else {
         return;
     };
     if ran >= limit {
-        draft.fail(failure::time_limit(limit, draft.words()));
+        let found = over_time(draft, limit);
+        draft.fail(found);
     } else if goes_on(draft) {
         draft.requeue_at(after(draft.now(), limit - ran));
+    }
+}
+
+/// True if the images of evaluators are pulled after an agent that runs first. That has a deadline of its own.
+fn awaits_images(draft: &PlanBuilder<'_>) -> bool {
+    let agents = blame::agents_of(&draft.status);
+    let pod = draft.view.pod.as_ref();
+    pod.is_some_and(|pod| limits::awaits_evaluators(pod, agents) && !limits::copies_input(pod, agents))
+}
+
+/// The failure of a run that took longer than its limit: the hosts' own, where no agent was at work.
+pub(super) fn over_time(draft: &PlanBuilder<'_>, limit: i64) -> Failure {
+    let pod = draft.view.pod.as_ref();
+    if limits::is_agents_time(pod, blame::agents_of(&draft.status)) {
+        failure::time_limit(limit, draft.words())
+    } else {
+        failure::evaluators_late(limit, draft.words())
     }
 }
 

@@ -8,13 +8,14 @@ use std::time::Duration;
 use jiff::Timestamp;
 use k8s_openapi::apimachinery::pkg::apis::meta::v1::Time;
 
+use super::blame::agents_of;
 use super::failure::{self, infrastructure};
-use super::logs;
 use super::plan::Action;
 use super::status::PlanBuilder;
 use super::waits::{Wait, after};
+use super::{limits, logs};
 use crate::view::{JobView, ObservedFence, ObservedLog, ObservedNode, PodView};
-use leaderboard_api::{Failure, Interruptions, MAX_INTERRUPTED_NODES, Reason, SubmissionStatus};
+use leaderboard_api::{Agents, Failure, Interruptions, MAX_INTERRUPTED_NODES, Reason, SubmissionStatus};
 use leaderboard_contract::run::Stop;
 
 /// Brings a Job to its end: first by word, then by deletion, then by force.
@@ -46,7 +47,7 @@ pub(super) fn decide(draft: &mut PlanBuilder<'_>, job: &JobView) {
     } else if draft.now() >= delete_at {
         end_job(draft, job, grace, log_left);
         draft.requeue_at(force_at);
-    } else if is_leaving && pod.delete_by.is_some() {
+    } else if (is_leaving && pod.delete_by.is_some()) || needs_no_evaluators(draft, pod) {
         // It stores all by itself; the Job must make no other Pod meanwhile.
         let left = delete_at.duration_since(draft.now()).as_secs();
         end_job(draft, job, left.max(grace), log_left);
@@ -54,6 +55,13 @@ pub(super) fn decide(draft: &mut PlanBuilder<'_>, job: &JobView) {
         annotate(draft, pod);
         draft.requeue_at(delete_at);
     }
+}
+
+/// True if a run has its final report and no evaluator yet. The kubelet would still pull the evaluators' images, to start what ends at once.
+fn needs_no_evaluators(draft: &PlanBuilder<'_>, pod: &PodView) -> bool {
+    let report = draft.view.report.ours().filter(|report| report.pod_uid == pod.uid);
+    let is_first = agents_of(&draft.status) == Agents::First;
+    is_first && report.is_some_and(|report| report.is_final) && !limits::have_hosts_begun(pod)
 }
 
 /// True if the Job ends because its node is about to go.

@@ -4,7 +4,7 @@ use super::builders::*;
 use super::container::{complete, of_mode, speaks_of_no_other_kind, told};
 use super::log::places;
 use crate::submissions::{Action, Plan};
-use crate::view::ContainerView;
+use crate::view::{ContainerView, JobEnd, ObservedReport};
 use leaderboard_api::FailureClass::{self, Infrastructure, Participant};
 use leaderboard_api::State::{Cancelled, Failed, Finished, Pending, Running};
 use leaderboard_api::{EndReason, Failure, PinnedImage, Reason};
@@ -19,7 +19,7 @@ fn next(name: &str) -> ContainerView {
 }
 
 /// The Pod is prepared, and its agent's image is pulled.
-fn prepared() -> World {
+pub(super) fn prepared() -> World {
     let mut world = of_mode("Batch").with_job();
     world.view.pod = Some(pod(0));
     world.pod().logcopy_running = true;
@@ -37,7 +37,7 @@ fn see(world: &mut World, container: ContainerView) {
 }
 
 /// Its agent runs since second 10.
-fn agent_runs() -> (World, Plan) {
+pub(super) fn agent_runs() -> (World, Plan) {
     let mut world = prepared();
     world.pass_to(Pending, Reason::Preparing);
     world.pod().agent_started = Some(at(10));
@@ -56,7 +56,7 @@ fn agent_is_done() -> World {
 }
 
 /// Its files are copied.
-fn collected() -> World {
+pub(super) fn collected() -> World {
     let mut world = agent_is_done();
     see(&mut world, ended("collect", 0, "", 0, AGENT_ENDS + 10));
     world.go_to(AGENT_ENDS + 10);
@@ -64,7 +64,7 @@ fn collected() -> World {
 }
 
 /// Its evaluators run.
-fn evaluating() -> World {
+pub(super) fn evaluating() -> World {
     let mut world = collected();
     world.pass_to(Running, Reason::Running);
     for name in ["evaluator-1", "evaluator-2"] {
@@ -249,27 +249,149 @@ fn an_image_of_an_evaluator_has_its_time_from_the_agents_end() {
 
     // A pull that says nothing is over at last, too.
     let mut world = collected();
-    world.go_to(AGENT_ENDS + 5399);
+    world.go_to(AGENT_ENDS + 10 + 5399);
     world.pass_to(Running, Reason::Running);
-    world.go_to(AGENT_ENDS + 5400);
+    world.go_to(AGENT_ENDS + 10 + 5400);
     assert_eq!(
         is_stopped(&mut world, Infrastructure, Reason::StartDeadline).message,
         "The images of the Pod were not pulled within 5400 s on node-a; these containers wait: evaluator-1, evaluator-2."
     );
+    let mut world = collected();
+    for name in ["evaluator-1", "evaluator-2"] {
+        see(&mut world, waiting(name, "Odd", ""));
+    }
+    world.go_to(AGENT_ENDS + 10 + 1800);
+    let message = is_stopped(&mut world, Infrastructure, Reason::StartDeadline).message;
+    assert!(
+        message.starts_with("The evaluators did not start within 1800 s, and node-a reports no reason: "),
+        "{message}"
+    );
+}
+
+/// Its files are being copied.
+fn collecting() -> World {
     let mut world = agent_is_done();
+    let began = Some(at(AGENT_ENDS));
     see(
         &mut world,
         ContainerView {
-            began: Some(at(AGENT_ENDS)),
+            began,
             ..running("collect")
         },
     );
-    world.go_to(AGENT_ENDS + 1800);
-    let message = is_stopped(&mut world, Infrastructure, Reason::StartDeadline).message;
-    assert!(
-        message.starts_with("The evaluators did not start within 1800 s, and node-a reports no reason: collect copies"),
-        "{message}"
+    world
+}
+
+/// When the run of these worlds is over.
+const RUN_ENDS: i64 = 10 + 86_400;
+
+#[test]
+fn a_copy_may_take_as_long_as_the_run() {
+    let mut world = collecting();
+    world.go_to(RUN_ENDS - 1);
+    world.pass_to(Running, Reason::Running);
+    world.go_to(RUN_ENDS);
+    is_stopped(&mut world, Infrastructure, Reason::EvaluatorFailed);
+}
+
+#[test]
+fn the_end_of_the_runs_time_is_charged_while_the_agent_runs() {
+    let (mut world, _) = agent_runs();
+    world.go_to(RUN_ENDS);
+    let plan = world.pass_to(Running, Reason::Stopping);
+    assert_eq!(annotated(&plan), Some(Stop::RunDeadline));
+    assert_eq!(plan.status.failure.unwrap().class, Participant);
+
+    let mut world = evaluating();
+    world.go_to(RUN_ENDS - 1);
+    world.pass_to(Running, Reason::Running);
+    world.go_to(RUN_ENDS);
+    assert_eq!(
+        is_stopped(&mut world, Infrastructure, Reason::EvaluatorFailed).message,
+        "The evaluators had not finished after the 86400 s of deadlines.runSeconds; finished units are kept."
     );
+    // Their next Job has the whole time again, and the agent's files.
+    world.complete();
+    assert_eq!(world.pass_to(Pending, Reason::Replacing).status.retry, 1);
+
+    // The Pod's own deadline.
+    for (mut world, class, reason) in [
+        (agent_runs().0, Participant, Reason::TimeLimit),
+        (evaluating(), Infrastructure, Reason::EvaluatorFailed),
+    ] {
+        world.leaderboard().retries.infrastructure = 0;
+        let (reason_of_job, message) = ("DeadlineExceeded".into(), "no more".into());
+        world.job().end = Some(JobEnd::Failed {
+            at: None,
+            reason: reason_of_job,
+            message,
+        });
+        world.view.report.stored = ObservedReport::Absent;
+        assert_eq!(world.pass_to(Failed, reason).status.failure.unwrap().class, class);
+    }
+}
+
+#[test]
+fn images_of_evaluators_that_are_pulled_past_the_runs_time_have_their_own() {
+    let mut world = collected();
+    world.leaderboard().deadlines.run_seconds = Some(AGENT_ENDS);
+    world.go_to(AGENT_ENDS + 5000);
+    world.pass_to(Running, Reason::Running);
+    // A Pod in its place begins with what the agent has left.
+    let mut next = world.clone();
+    next.view.pod = Some(pod(AGENT_ENDS + 4000));
+    next.pod().created = Some(at(AGENT_ENDS + 4000));
+    is_stopped(&mut next, Infrastructure, Reason::EvaluatorFailed);
+    see(&mut world, running("evaluator-1"));
+    is_stopped(&mut world, Infrastructure, Reason::EvaluatorFailed);
+}
+
+#[test]
+fn a_sandbox_that_is_made_anew_counts_against_neither_side() {
+    let made_anew = |world: &mut World, name: &str, restarts: i32, second: i64| {
+        see(world, restarted("logcopy", restarts, "", 255, second));
+        see(world, restarted(name, restarts, "silentDeath", 137, second));
+        world.go_to(second + 1);
+        let plan = world.pass_to(Running, Reason::Running);
+        assert_eq!(plan.status.workers[0].crashes, 0, "{name} {restarts}");
+    };
+    let (mut world, _) = agent_runs();
+    for time in 1..=5 {
+        made_anew(&mut world, "agent-1", time, 100 * i64::from(time));
+    }
+    let mut world = evaluating();
+    for time in 1..=5 {
+        // The agent's runner finds its mark, and ends.
+        see(&mut world, ended("agent-1", time, "incomplete", 0, AGENT_ENDS));
+        made_anew(&mut world, "evaluator-1", time, 8000 + 100 * i64::from(time));
+    }
+    // An agent that was forgiven its crashes is not charged for it either.
+    let (mut world, _) = agent_runs();
+    see(&mut world, ended("agent-1", 2, "exited", 1, 100));
+    world.go_to(100);
+    assert_eq!(world.pass_to(Running, Reason::Running).status.workers[0].crashes, 3);
+    world.go_to(AGENT_ENDS);
+    for restarts in [3, 4] {
+        see(&mut world, ended("agent-1", restarts, "incomplete", 0, AGENT_ENDS));
+        world.pass_to(Running, Reason::Running);
+    }
+}
+
+#[test]
+fn a_stop_waits_for_no_image_of_an_evaluator() {
+    let is_deleted = |plan: &Plan| has(plan, |action| matches!(action, Action::DeleteJob { .. }));
+    for (mut world, ends) in [(agent_runs().0, true), (collected(), true), (evaluating(), false)] {
+        world.submission().spec.cancel = true;
+        for is_final in [false, true] {
+            world.report(Report {
+                is_final,
+                stopped: is_final.then_some(Stop::Cancel),
+                ..told(0)
+            });
+            let plan = world.pass_to(Running, Reason::Stopping);
+            assert_eq!(is_deleted(&plan), ends && is_final);
+        }
+    }
 }
 
 #[test]

@@ -13,7 +13,7 @@ fn third(name: &str, what: &str, exit_code: i32) -> ContainerView {
 
 #[track_caller]
 fn is_judged(host: Option<&ContainerView>, agent: Option<&ContainerView>, expected: Option<EndReason>) {
-    let found = last_crash(host, agent);
+    let found = last_crash(host, agent, Some(&running("logcopy")));
     assert_eq!(found.map(|crash| crash.cause), expected, "{host:?} {agent:?}");
     assert!(found.is_none_or(|crash| crash.is_settled), "nothing is waited for");
 }
@@ -67,6 +67,44 @@ fn an_evaluators_end_is_its_own_whatever_became_of_the_agent() {
     ] {
         for agent in [None, Some(&agent)] {
             is_judged(Some(&evaluator), agent, expected);
+        }
+    }
+}
+
+#[test]
+fn what_ends_together_with_logcopy_was_ended_from_outside() {
+    use EndReason::{EndedFromOutside, EvaluatorCrashed, Exited, Killed, SilentDeath};
+    let logcopy = |exit_code, reason: &str| {
+        let mut container = restarted("logcopy", 1, "", exit_code, 100);
+        reason.clone_into(&mut container.last.as_mut().unwrap().reason);
+        container
+    };
+    let (lost, asked) = (logcopy(255, "Unknown"), logcopy(0, "Completed"));
+    let (no_memory, broken) = (logcopy(137, "OOMKilled"), logcopy(1, "Error"));
+    let agent = |what| restarted("agent-1", 3, what, 137, 100);
+    let later = since(101, ended("agent-1", 3, "silentDeath", 137, 160));
+    for (logcopy, container, expected) in [
+        (&lost, agent("silentDeath"), EndedFromOutside),
+        (&asked, agent("stopped"), EndedFromOutside),
+        (&lost, agent(""), EndedFromOutside),
+        (&lost, agent("exited"), Exited),
+        (&lost, later, SilentDeath),
+        (&no_memory, agent("silentDeath"), SilentDeath),
+        (&broken, agent("stopped"), Killed),
+    ] {
+        let found = last_crash(None, Some(&container), Some(logcopy)).unwrap();
+        assert_eq!(
+            (found.cause, found.is_settled),
+            (expected, true),
+            "{container:?} {logcopy:?}"
+        );
+    }
+    for (logcopy, expected) in [(&lost, EndedFromOutside), (&no_memory, EvaluatorCrashed)] {
+        let evaluator = restarted("evaluator-1", 3, "silentDeath", 137, 100);
+        let done = ended("agent-1", 1, "incomplete", 0, 40);
+        for agent in [None, Some(&done)] {
+            let found = last_crash(Some(&evaluator), agent, Some(logcopy)).unwrap();
+            assert_eq!(found.cause, expected, "{logcopy:?}");
         }
     }
 }

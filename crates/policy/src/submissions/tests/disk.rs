@@ -2,6 +2,7 @@
 
 use serde_json::json;
 
+use super::batch;
 use super::builders::*;
 use leaderboard_api::FailureClass::{Infrastructure, Participant};
 use leaderboard_api::State::{Failed, Running};
@@ -77,6 +78,28 @@ fn a_full_volume_of_logs_is_the_agents_where_logcopy_has_measured_it_in_this_pod
             (Reason::DiskFull, class),
             "{pod_uid}"
         );
+    }
+}
+
+/// Nobody but the agent of Batch writes before the evaluators begin.
+#[test]
+fn before_the_evaluators_a_full_pod_is_the_agents_that_runs_first() {
+    let logs = "Usage of EmptyDir volume \"logs\" exceeds the limit \"10Gi\". ";
+    let all = "Pod ephemeral local storage usage exceeds the total limit of containers 20Mi. ";
+    let node = "Container evaluator-1 exceeded its local ephemeral storage limit \"1Gi\". ";
+    for (words, mut world, class) in [
+        (logs, batch::agent_runs().0, Participant),
+        (all, batch::agent_runs().0, Participant),
+        (node, batch::agent_runs().0, Infrastructure),
+        (logs, batch::collected(), Participant),
+        (logs, batch::prepared(), Infrastructure),
+        (logs, batch::evaluating(), Infrastructure),
+        (all, batch::evaluating(), Infrastructure),
+    ] {
+        world.pod().ended_by_node = Some(("Evicted".into(), words.into()));
+        let failure = world.pass().status.failure.unwrap();
+        let found = (failure.reason.known(), failure.class);
+        assert_eq!(found, (Some(Reason::DiskFull), class), "{words}");
     }
 }
 

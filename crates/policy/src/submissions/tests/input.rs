@@ -327,7 +327,7 @@ fn a_job_that_is_made_again_waits_for_its_file() {
     world.view.input = Lookup::default();
     // Somebody removes the status, and then the Job.
     world.submission().status = None;
-    world.pass_to(Pending, Reason::Preparing);
+    assert_eq!(world.pass().status.input, None);
     world.job_gone();
     let plan = world.pass();
     assert_eq!((asked(&plan), creates(&plan)), (Some(&question(1)), false));

@@ -116,9 +116,9 @@ const ENDS: [(End, FailureClass, Reason, &[&str]); 6] = [
     ),
     (
         |world| world.go_to(90_000),
-        Participant,
-        Reason::TimeLimit,
-        &["s3 evaluators/1/console.log", "node evaluator-1"],
+        Infrastructure,
+        Reason::EvaluatorFailed,
+        &["node evaluator-1", "s3 evaluators/1/console.log"],
     ),
     (
         |world| {

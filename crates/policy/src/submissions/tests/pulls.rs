@@ -159,13 +159,13 @@ fn agent_first(containers: Vec<ContainerView>, later: &[&str]) -> PodView {
     pod(starts(first.into_iter().chain(containers).collect(), later))
 }
 
-type Stage = (&'static str, PodView, Option<i64>, &'static [&'static str], i64);
+type Stage = (&'static str, PodView, Option<i64>, &'static [&'static str], Option<i64>);
 
 /// The stages of such a Pod, each with the containers that wait for an image, and by when it has to be further.
 fn stages_of_agent_first() -> [Stage; 6] {
     const EVALUATORS: [&str; 2] = ["evaluator-1", "evaluator-2"];
     let agent = || ran("agent-1", 2000, 9000);
-    let collect = || ran("collect", 9010, 9020);
+    let collect = || ran("collect", 9010, 30_000);
     let failing = || waits("evaluator-1", "ErrImagePull");
     [
         (
@@ -173,42 +173,42 @@ fn stages_of_agent_first() -> [Stage; 6] {
             agent_first(vec![], &["agent-1", "collect", "evaluator-1", "evaluator-2"]),
             None,
             &["agent-1"][..],
-            510 + 5400,
+            Some(510 + 5400),
         ),
         (
             "collect is next",
             agent_first(vec![agent()], &["collect", "evaluator-1", "evaluator-2"]),
             None,
             &["collect"],
-            9000 + 5400,
+            Some(9000 + 5400),
         ),
         (
             "its files are copied",
             agent_first(vec![agent(), runs("collect", 9010)], &EVALUATORS),
             None,
             &[],
-            9010 + 1800,
+            None,
         ),
         (
             "the images of the evaluators are pulled",
             agent_first(vec![agent(), collect()], &EVALUATORS),
             None,
             &EVALUATORS,
-            9000 + 5400,
+            Some(30_000 + 5400),
         ),
         (
             "one cannot be pulled",
             agent_first(vec![agent(), collect(), failing()], &["evaluator-2"]),
-            Some(9100),
+            Some(30_100),
             &["evaluator-2"],
-            9100 + 1800,
+            Some(30_100 + 1800),
         ),
         (
             "causes take turns",
             agent_first(vec![agent(), collect(), failing()], &["evaluator-2"]),
             Some(80_000),
             &["evaluator-2"],
-            9000 + 5400 + 1800,
+            Some(30_000 + 5400 + 1800),
         ),
     ]
 }
@@ -217,7 +217,25 @@ fn stages_of_agent_first() -> [Stage; 6] {
 fn after_an_agent_that_runs_first_the_evaluators_have_the_deadlines_of_a_start_from_its_end() {
     for (what, pod, stalled, names, second) in stages_of_agent_first() {
         assert_eq!(waiting(&pod, Agents::First), names, "{what}");
-        let found = limit(&pod, Agents::First, &deadlines(), stalled.map(at)).unwrap();
-        assert_eq!(found.at, at(second), "{what}");
+        let found = limit(&pod, Agents::First, &deadlines(), stalled.map(at));
+        assert_eq!(found.map(|limit| limit.at), second.map(at), "{what}");
     }
+}
+
+#[test]
+fn a_workspace_that_copies_an_input_has_all_the_time_that_this_takes() {
+    let copying = pod(starts(vec![runs("workspace", 100)], &["logcopy"]));
+    for (agents, stalled, second) in [
+        (Agents::Beside, None, Some(100 + 1800)),
+        (Agents::First, None, None),
+        (Agents::Absent, None, None),
+        (Agents::Absent, Some(500), Some(500 + 1800)),
+    ] {
+        let found = limit(&copying, agents, &deadlines(), stalled.map(at));
+        assert_eq!(found.map(|limit| limit.at), second.map(at), "{agents:?}");
+    }
+    // A pull after it has the whole time of pulls.
+    let copied = pod(starts(vec![ran("workspace", 100, 20_000)], &["logcopy"]));
+    let found = limit(&copied, Agents::Absent, &deadlines(), None).unwrap();
+    assert_eq!(found.at, at(19_900 + 5400));
 }
