@@ -56,7 +56,10 @@ RARE: Mapping[tuple[str, str], str] = {
         "submission-worker",
         "logs:GetLogEvents",
     ): "only after lines without an answer, as tests/api/pod/cloudwatch.rs has it",
-    ("controller", "s3:AbortMultipartUpload"): "only for a large file that fails, as crates/aws/src/archive/stream has it",
+    (
+        "controller",
+        "s3:AbortMultipartUpload",
+    ): "only for a large file that fails, as crates/aws/src/archive/stream has it",
     ("submission-worker", "s3:AbortMultipartUpload"): "only for an upload in parts that fails, as tests/resume has it",
 }
 

@@ -230,9 +230,15 @@ class Submitted:
 
 def submit_game(settings: Settings, kube: Kube, pinned: dict[str, str]) -> str:
     """Begins step 7 with a submission to the challenge without CARLA, which runs beside; returns its name."""
-    step(7, f"a submission to {GAME} by kubectl, and one of team-a to EvalAI, phase SENSORS", "30 s until the score is published")
+    step(
+        7,
+        f"a submission to {GAME} by kubectl, and one of team-a to EvalAI, phase SENSORS",
+        "30 s until the score is published",
+    )
     given = manifest(settings, "game.yaml", pinned)
-    made = kube.run("kubectl", "create", "--filename=-", "--output=name", given=given, action="kubectl create of a game")
+    made = kube.run(
+        "kubectl", "create", "--filename=-", "--output=name", given=given, action="kubectl create of a game"
+    )
     return made.strip().partition("/")[2]
 
 

@@ -228,13 +228,13 @@ fn times() -> Vec<Case> {
         ),
         create(
             Leaderboard,
-            "idleSeconds must be shorter than runSeconds",
+            "idleSeconds (800 by default) must be shorter",
             &deadlines(json!({"idleSeconds": 7199, "runSeconds": 7200})),
             &deadlines(json!({"idleSeconds": 7200})),
         ),
         create(
             Leaderboard,
-            "readySeconds must be shorter than runSeconds",
+            "readySeconds (3600 by default) must be shorter",
             &deadlines(json!({"readySeconds": 3599, "runSeconds": 3600})),
             &deadlines(json!({"readySeconds": 3600})),
         ),

@@ -43,7 +43,8 @@ impl EvaluationMode {
 /// Treatment of the results of several workers.
 #[derive(Serialize, Deserialize, JsonSchema, Clone, Copy, Debug, Default, PartialEq, Eq)]
 pub enum MergeMethod {
-    /// Each metric is the mean of all workers, weighted by the units that each has done.
+    /// Each metric is the mean of all workers, weighted by the units that each has done. A metric that is no mean over units, such as F1,
+    /// needs one worker.
     #[default]
     Mean,
     /// Each metric is the sum of all workers.
@@ -142,7 +143,7 @@ pub struct DataImage {
     /// The image.
     #[schemars(length(min = 1, max = 512), regex(pattern = r"^[^\s]+$"))]
     pub reference: String,
-    /// The folder in it.
+    /// The folder in it; `/dataset` by default, for labels, too.
     #[serde(default = "defaults::data_path")]
     #[schemars(length(min = 1, max = 512), regex(pattern = r"^/[^\s]*$"))]
     pub path: String,

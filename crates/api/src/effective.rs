@@ -100,7 +100,13 @@ pub fn results_url(bucket: &S3Bucket, run_id: &RunId) -> String {
 
 /// The plan of a submission's first attempt. `image` is the participant's, if it is an image; `resume` means that stored results are taken up. `None` for a
 /// track without the score that its kind of evaluation needs, which the API server refuses.
-pub fn plan(spec: &LeaderboardSpec, track: &Track, run_id: RunId, image: Option<String>, resume: bool) -> Option<RunPlan> {
+pub fn plan(
+    spec: &LeaderboardSpec,
+    track: &Track,
+    run_id: RunId,
+    image: Option<String>,
+    resume: bool,
+) -> Option<RunPlan> {
     let evaluation = match &spec.evaluation {
         Evaluation::Carla(carla) => PlannedEvaluation::Carla(carla_plan(carla, track)),
         Evaluation::Container(container) => {

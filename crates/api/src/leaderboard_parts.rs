@@ -123,7 +123,7 @@ pub struct CheckImage {
     pub image: String,
 }
 
-/// How the submitted image is run in each pair.
+/// How the submitted image is run by each worker.
 #[derive(Serialize, Deserialize, KubeSchema, Clone, Debug, PartialEq)]
 #[serde(rename_all = "camelCase")]
 #[x_kube(
@@ -154,7 +154,7 @@ pub struct AgentContainer {
     /// Size of `leaderboard.log` at which it is no longer written: `1Mi` to `1Ti`.
     #[serde(default = "defaults::log_size_limit")]
     pub log_size_limit: ByteQuantity,
-    /// Size of each agent's `/dev/shm`, in memory: `1Mi` to `1Ti`. What lies there counts to the agent's memory limit. Absent: 64 MiB, as the container runtime makes it.
+    /// Size of each agent's `/dev/shm`, in memory: `1Mi` to `1Ti`. What lies there counts to the agent's memory limit. Absent: `evaluation.container.shmSize`, and with CARLA 64 MiB, as the container runtime makes it.
     #[serde(default, skip_serializing_if = "Option::is_none")]
     pub shm_size: Option<ByteQuantity>,
     /// Images that may be submitted, such as `registry.example/team-{team}/*`: `{team}` is the id of the submission's team, `*` one or more characters between two slashes. Default for EvalAI's submissions: `*.dkr.ecr.*.amazonaws.com/*-participant-team-{team}`. `[]`: any image. The host's own images are never among them.
@@ -183,8 +183,8 @@ pub struct Retries {
 #[derive(Serialize, Deserialize, KubeSchema, Clone, Copy, Debug, PartialEq, Eq)]
 #[serde(rename_all = "camelCase")]
 #[x_kube(
-    validation = Rule::new("!has(self.runSeconds) || self.idleSeconds < self.runSeconds").message("deadlines.idleSeconds must be shorter than runSeconds: it could never be reached"),
-    validation = Rule::new("!has(self.runSeconds) || self.readySeconds < self.runSeconds").message("deadlines.readySeconds must be shorter than runSeconds: the run would end before a simulator may be ready"),
+    validation = Rule::new("!has(self.runSeconds) || self.idleSeconds < self.runSeconds").message("deadlines.idleSeconds (800 by default) must be shorter than runSeconds: it could never be reached"),
+    validation = Rule::new("!has(self.runSeconds) || self.readySeconds < self.runSeconds").message("deadlines.readySeconds (3600 by default) must be shorter than runSeconds: the run would end before a simulator or an evaluator may be ready"),
     validation = Rule::new("self.cancelSeconds <= self.flushSeconds").message("deadlines.cancelSeconds may not be longer than flushSeconds: a cancelled run would be given more time for its results than a finished one")
 )]
 #[allow(
@@ -208,7 +208,7 @@ pub struct Deadlines {
     #[serde(default = "defaults::ready_seconds")]
     #[schemars(range(min = 1, max = 31_536_000))]
     pub ready_seconds: i64,
-    /// Seconds without output after which an agent is stopped.
+    /// Seconds without output after which an agent is stopped. Evaluators may be silent.
     #[serde(default = "defaults::idle_seconds")]
     #[schemars(range(min = 1, max = 31_536_000))]
     pub idle_seconds: i64,

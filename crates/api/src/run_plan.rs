@@ -5,7 +5,10 @@
 use k8s_openapi::api::core::v1::{EnvVar, ResourceRequirements, SecurityContext};
 
 use super::leaderboard_parts::Evaluation;
-use super::{CarlaPlan, ContainerPlan, DataSource, EvaluationMode, LeaderboardSpec, PlannedEvaluation, RouteSlice, RunPlan, Track, effective};
+use super::{
+    CarlaPlan, ContainerPlan, DataSource, EvaluationMode, LeaderboardSpec, PlannedEvaluation, RouteSlice, RunPlan,
+    Track, effective,
+};
 
 /// How the agents of a run stand to the containers of the host.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]

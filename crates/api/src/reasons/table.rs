@@ -192,7 +192,7 @@ reasons! {
             log: "the log of simulator `<n>`, read from its node before the Pod ends; else `simulator/console-<n>.log`";
         EvaluatorFailed,
             "An evaluator crashed, was not ready, or had no final result more often than `retries.perWorker` allows. Or it wrote a \
-             `result.json` that cannot be used.",
+             `result.json` that cannot be used. Or they outlasted `runSeconds`.",
             "Look at the evaluator's log and at `evaluators/<n>/result.json`; `kubectl leaderboard lint FILE` says what is wrong with \
              it. Correct the evaluator's image, then resume the submission.",
             log: "the log of evaluator `<n>`, `evaluators/<n>/console.log`";
@@ -373,7 +373,7 @@ reasons! {
             "An older Leaderboard of another namespace or another EvalAI server has the same bucket and prefix.",
             "Make one of them anew with another `storage.s3.prefix`.";
         LabelsDiffer,
-            "The challenge's phases, splits or metric labels are not those of the Leaderboard.",
+            "The challenge's phases, splits or CARLA's metric labels are not those of the Leaderboard.",
             "Compare `evalai.challenge`, `evalai.split` and the tracks' phases with the challenge; the message names the difference.";
         BucketUnreachable,
             "The bucket does not answer, or refuses the operator.",

@@ -46,8 +46,8 @@ use crate::overlay as pod_overlay;
 use crate::owner::owner_reference;
 pub use gpu_count::gpus;
 use leaderboard_api::{
-    Attempt, Deadlines, Enforcement, FailedNode, GpuSource, JobNumber, Leaderboard, LeaderboardSpec, PolicySource,
-    Reason, RunPlan, Submission, SubmittedFile, Track, Verify, conditions, effective, names,
+    Agents, Attempt, Deadlines, Enforcement, FailedNode, GpuSource, JobNumber, Leaderboard, LeaderboardSpec,
+    PolicySource, Reason, RunPlan, Submission, SubmittedFile, Track, Verify, conditions, effective, names,
 };
 use leaderboard_contract::run::{Isolation, Run, SCHEMA};
 use leaderboard_evaluation::Evaluation;
@@ -257,10 +257,14 @@ fn backoff_limit(input: &JobInput<'_>) -> i32 {
 
 /// The net for an absent controller; none without a limit on the run. It belongs to the Pod and not to the Job, whose own
 /// would count the wait for a node.
-fn active_deadline(deadlines: &Deadlines) -> Option<i64> {
+fn active_deadline(input: &JobInput<'_>) -> Option<i64> {
+    let deadlines = input.deadlines();
+    let start = deadlines.pull_seconds.saturating_add(deadlines.start_seconds);
+    // Evaluators that start after an agent pull their images then.
+    let second = if input.plan.agents() == Agents::First { start } else { 0 };
     let seconds = [
-        deadlines.pull_seconds,
-        deadlines.start_seconds,
+        start,
+        second,
         deadlines.run_seconds?,
         deadlines.cancel_seconds,
         deadlines.flush_seconds,
@@ -305,7 +309,7 @@ fn pod(input: &JobInput<'_>, workloads: &[Workload]) -> PodSpec {
         init_containers: Some(init.chain(first).collect()),
         containers: workers::all(input, workloads),
         volumes: Some(volumes::all(input, workloads)),
-        active_deadline_seconds: active_deadline(&input.deadlines()),
+        active_deadline_seconds: active_deadline(input),
         termination_grace_period_seconds: Some(GRACE_SECONDS),
         service_account_name: identity.and_then(|identity| identity.service_account_name.clone()),
         automount_service_account_token: Some(false),

@@ -83,6 +83,7 @@ fn a_full_volume_of_logs_is_the_agents_where_logcopy_has_measured_it_in_this_pod
 
 /// Nobody but the agent of Batch writes before the evaluators begin.
 #[test]
+#[expect(clippy::large_stack_arrays, reason = "a table of worlds")]
 fn before_the_evaluators_a_full_pod_is_the_agents_that_runs_first() {
     let logs = "Usage of EmptyDir volume \"logs\" exceeds the limit \"10Gi\". ";
     let all = "Pod ephemeral local storage usage exceeds the total limit of containers 20Mi. ";

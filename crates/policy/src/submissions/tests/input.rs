@@ -316,7 +316,7 @@ fn a_copy_that_has_failed_waits_for_no_slot() {
     world.view.input = stored();
     world.view.turn = Turn::Wait { position: 1, eta: None };
     let plan = world.pass_to(Pending, Reason::WaitingForSlot);
-    assert_eq!((asked(&plan), plan.status.input), (None, Some(file(12))));
+    assert_eq!((asked(&plan), plan.status.input.as_ref()), (None, Some(&file(12))));
 }
 
 #[test]
