@@ -102,7 +102,10 @@ class Units(unittest.TestCase):
 
 class Images(unittest.TestCase):
     def test_the_demo_s_images_are_described(self) -> None:
-        files = [REPOSITORY / "local" / name for name in ("operator-image.toml", "challenge/images.toml", "games/images.toml")]
+        files = [
+            REPOSITORY / "local" / name
+            for name in ("operator-image.toml", "challenge/images.toml", "games/images.toml")
+        ]
         names = {spec.name for file in files for spec in image.specs(file)}
         self.assertLessEqual(set(demo.IMAGES), names)
         board = (REPOSITORY / "examples" / "demo" / "leaderboard.yaml").read_text()
