@@ -60,6 +60,9 @@ RARE: Mapping[Right, str] = {
     Right(
         "controller", "get", "priorityclasses", "scheduling.k8s.io"
     ): "only for a track with priorityClassName, as tests/api/boards.rs has it",
+    Right(
+        "controller", "get", "persistentvolumeclaims", ""
+    ): "only for a claim with the data of a challenge, as src/leaderboards/data_claims.rs has it",
     Right("controller", "create", "submissions", GROUP): "only for a submission whose message was lost",
     Right("controller", "get", "submissions", GROUP): "only for a submission whose message was lost",
 }
