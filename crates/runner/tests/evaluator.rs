@@ -457,6 +457,7 @@ fn the_words_of_both_commands_see_their_environment() {
     for _ in 0..2 {
         let mut evaluator = pod.evaluator(&script("evaluator"), &["--peer-seconds=0"]);
         assert_eq!(evaluator.code(), 1);
+        fs::write(pod.path("results/kept"), "").unwrap();
     }
     assert_eq!(said("evaluator"), "1 [] $(WORKER)\n1 [1] $(WORKER)\n");
     pod.write(StatusFile::Of(EVALUATOR, Mark::Start(2)));

@@ -392,6 +392,7 @@ async fn only_hosts_write_results() {
     let pk = stand.submit().await;
     let body = put_body(pk, "finished", 1.0);
     let put = async |path: &str, auth: &str| stand.call(reqwest::Method::PUT, path, auth, &body).await;
+    stand.handle.with_state(|state| state.seed.challenges[2].hosts.clear());
     put(UPDATE, TEAM_A).await.is(&errors::NOT_HOST, &[]);
     put(&UPDATE.replace('1', "99"), HOST).await.is(&errors::NOT_HOST, &[]);
     put(&UPDATE.replace('1', "3"), HOST).await.is(&errors::NOT_HOST, &[]);
