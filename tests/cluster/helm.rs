@@ -212,10 +212,10 @@ impl<'a> Quickstart<'a> {
         assert_finished(&settled);
         assert_eq!(settled.uid(), before.uid());
         assert_eq!(scene.pod(name).await.uid(), pod.uid(), "another Pod has run it");
-        assert_eq!(scene.jobs().await, ["submission-1-1", "submission-2-1"]);
+        assert_eq!(scene.jobs().await, ["game-1-1", "submission-1-1", "submission-2-1"]);
         assert_eq!(
             names(&scene.all::<Submission>().await),
-            ["submission-1", "submission-2"]
+            ["game-1", "submission-1", "submission-2"]
         );
         self.assert_published_once(2).await;
         self.say("the second submission has ended");
