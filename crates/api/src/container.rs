@@ -11,6 +11,7 @@ use serde::{Deserialize, Serialize};
 use super::byte_quantity::ByteQuantity;
 use super::order::Order;
 use super::progress::MAX_NAME;
+use super::run_plan::Agents;
 use super::shared_text::SharedText;
 use super::track_container::TrackContainer;
 
@@ -29,9 +30,18 @@ pub enum EvaluationMode {
 }
 
 impl EvaluationMode {
+    /// How its agents stand to the evaluators.
+    pub const fn agents(self) -> Agents {
+        match self {
+            Self::Interactive => Agents::Beside,
+            Self::Batch => Agents::First,
+            Self::Predictions => Agents::Absent,
+        }
+    }
+
     /// True if a submission is an image, whose agent runs.
     pub const fn has_agent(self) -> bool {
-        !matches!(self, Self::Predictions)
+        !matches!(self.agents(), Agents::Absent)
     }
 
     /// True if the evaluators read files at `/input`.

@@ -6,8 +6,7 @@ use k8s_openapi::api::core::v1::{EnvVar, ResourceRequirements, SecurityContext};
 
 use super::leaderboard_parts::Evaluation;
 use super::{
-    CarlaPlan, ContainerPlan, DataSource, EvaluationMode, LeaderboardSpec, PlannedEvaluation, RouteSlice, RunPlan,
-    Track, effective,
+    CarlaPlan, ContainerPlan, DataSource, LeaderboardSpec, PlannedEvaluation, RouteSlice, RunPlan, Track, effective,
 };
 
 /// How the agents of a run stand to the containers of the host.
@@ -24,11 +23,8 @@ pub enum Agents {
 impl RunPlan {
     /// How its agents stand to the containers of the host.
     pub fn agents(&self) -> Agents {
-        match self.container().map(|container| container.mode) {
-            None | Some(EvaluationMode::Interactive) => Agents::Beside,
-            Some(EvaluationMode::Batch) => Agents::First,
-            Some(EvaluationMode::Predictions) => Agents::Absent,
-        }
+        self.container()
+            .map_or(Agents::Beside, |container| container.mode.agents())
     }
 
     /// How many workers share the work.

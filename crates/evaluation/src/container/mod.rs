@@ -63,11 +63,7 @@ impl Evaluation for Container {
     }
 
     fn agents(&self) -> Agents {
-        match self.0 {
-            EvaluationMode::Interactive => Agents::Beside,
-            EvaluationMode::Batch => Agents::First,
-            EvaluationMode::Predictions => Agents::Absent,
-        }
+        self.0.agents()
     }
 
     fn columns(&self) -> Vec<Column> {

@@ -1,6 +1,6 @@
 //! Evaluators and agents: images, commands, flags, variables and mounts of a worker, mode by mode. Pure.
 
-use leaderboard_api::{ContainerEvaluation, ContainerPlan, EvaluationMode, LeaderboardSpec, PORT_STEP, names};
+use leaderboard_api::{Agents, ContainerEvaluation, ContainerPlan, EvaluationMode, LeaderboardSpec, PORT_STEP, names};
 use leaderboard_contract::keys::{INPUT, SUBMISSION_FOLDER, agent_folder, host_folder, host_log_name};
 use leaderboard_protocol::files::Pair;
 
@@ -84,10 +84,10 @@ pub(super) fn workload(asked: &Asked<'_>, worker: Pair) -> Option<Workload> {
         plan: asked.plan.container()?,
         worker,
     };
-    let has_agent = match known.plan.mode {
-        EvaluationMode::Interactive => true,
-        EvaluationMode::Batch => worker.index() == 0,
-        EvaluationMode::Predictions => false,
+    let has_agent = match known.plan.mode.agents() {
+        Agents::Beside => true,
+        Agents::First => worker.index() == 0,
+        Agents::Absent => false,
     };
     Some(Workload {
         host: known.evaluator(),
