@@ -14,14 +14,12 @@ use k8s_openapi::apimachinery::pkg::apis::meta::v1::Time;
 
 use super::status::PlanBuilder;
 use super::waits::Wait;
+use super::workers::{agents_of, cause_of, host_of, pair_with};
 use super::{cause, failure};
 use crate::report_digest::clamp;
 use crate::view::{ContainerView, EndView, PodView};
-use leaderboard_api::{
-    Agents, EndReason, Failure, LastEnd, RunPlan, SubmissionStatus, WorkerState, WorkerStatus, names,
-};
-use leaderboard_evaluation::of_plan;
-use leaderboard_protocol::files::{Host, Member, Pair, Side};
+use leaderboard_api::{Agents, EndReason, Failure, LastEnd, SubmissionStatus, WorkerState, WorkerStatus, names};
+use leaderboard_protocol::files::{Host, Member, Side};
 use leaderboard_protocol::verdict::{CODE_NO_PROCESS, CODE_NODE_REFUSED, What};
 
 /// Exit codes of a container that was ended with all others of its Pod, as by a sandbox that is made anew: killed, or lost from sight.
@@ -401,22 +399,6 @@ fn last_crash_of(pod: &PodView, (kind, agents): (Host, Agents), id: i32, now: Ti
     }
 }
 
-/// The program in the hosts' containers of the workers.
-pub(super) fn host_of(status: &SubmissionStatus) -> Host {
-    let plan = status.plan.as_ref();
-    // Without a plan nothing is decided before it is pinned anew.
-    plan.map_or(Host::Simulator, |plan| of_plan(plan).host())
-}
-
-/// How the agents of a submission stand to its hosts' containers.
-pub(super) fn agents_of(status: &SubmissionStatus) -> Agents {
-    status.plan.as_ref().map_or(Agents::Beside, RunPlan::agents)
-}
-
-pub(super) fn pair_with(id: i32) -> Option<Pair> {
-    u16::try_from(id).ok().and_then(Pair::new)
-}
-
 fn container(pod: &PodView, member: Member) -> Option<&ContainerView> {
     pod.container(&member.to_string())
 }
@@ -449,11 +431,11 @@ pub(super) fn too_many(draft: &mut PlanBuilder<'_>) -> Option<Failure> {
     let limit = draft.retries().per_worker.saturating_add(1);
     let sides = (host_of(&draft.status), agents_of(&draft.status));
     let is_too_many = |worker: &&WorkerStatus| {
-        worker.crashes >= limit || (worker.crashes > 0 && failure::cause_of(worker).is_some_and(is_hopeless))
+        worker.crashes >= limit || (worker.crashes > 0 && cause_of(worker).is_some_and(is_hopeless))
     };
     let mut awaited = None;
     for worker in draft.status.workers.iter().filter(is_too_many) {
-        let Some(cause) = failure::cause_of(worker) else {
+        let Some(cause) = cause_of(worker) else {
             continue;
         };
         let pod = draft.view.pod.as_ref();

@@ -8,10 +8,10 @@
 
 use serde_json::Value;
 
-use super::blame::agents_of;
 use super::failure::{self, charged, for_both, infrastructure, participant};
 use super::limits;
 use super::status::PlanBuilder;
+use super::workers::agents_of;
 use crate::view::{ContainerView, PodView};
 use leaderboard_api::text::sentence;
 use leaderboard_api::{Agents, Failure, LeaderboardSpec, Reason, names};

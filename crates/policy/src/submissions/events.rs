@@ -3,7 +3,8 @@
 //! Pure.
 
 use super::plan::Event;
-use super::{blame, publish};
+use super::publish;
+use super::workers::agents_of;
 use leaderboard_api::conditions;
 use leaderboard_api::{Agents, Reason, ReasonName, State, SubmissionStatus};
 
@@ -29,7 +30,7 @@ fn start(old: Option<&SubmissionStatus>, new: &SubmissionStatus) -> Option<Event
     }
     let node = new.node_name.as_ref().map(|node| format!(" on node {node}"));
     let (attempt, node) = (new.attempt?, node.unwrap_or_default());
-    let message = match blame::agents_of(new) {
+    let message = match agents_of(new) {
         Agents::Beside => format!("The agents of attempt {attempt} run{node}."),
         Agents::First => format!("The agent of attempt {attempt} runs{node}."),
         Agents::Absent => format!("The evaluators of attempt {attempt} run{node}."),

@@ -2,7 +2,7 @@
 //!
 //! No text for a participant names a file, an object or a machine of the hosts.
 
-use super::blame::{agents_of, pair_with};
+use super::workers::{agents_of, cause_of, pair_with};
 use crate::report_digest::{ReportDigest, clamp};
 use crate::view::ObservedNode;
 use leaderboard_api::text::sentence;
@@ -207,10 +207,6 @@ pub(super) fn is_refusal(status: &SubmissionStatus, found: &Failure, report: &Re
     let by_itself = |worker: &WorkerStatus| matches!(cause_of(worker), Some(EndReason::Exited | EndReason::Incomplete));
     let is_of_results = found.reason.is_one_of(&[Reason::AgentCrashed, Reason::InvalidResults]);
     is_of_results && status.workers.iter().any(by_itself) && report.is_verdict() && report.refused.is_some()
-}
-
-pub(super) fn cause_of(worker: &WorkerStatus) -> Option<EndReason> {
-    worker.last.as_ref().map(|last| last.reason)
 }
 
 pub(super) fn of_worker(worker: &WorkerStatus, cause: EndReason, status: &SubmissionStatus) -> Failure {

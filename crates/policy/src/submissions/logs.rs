@@ -1,6 +1,6 @@
 //! Which log explains a failure, and where it may be. Pure.
 
-use super::blame::{agents_of, host_of, pair_with};
+use super::workers::{agents_of, host_of, pair_with};
 use crate::view::{ContainerView, LogAt, LogPlace, PodView};
 use leaderboard_api::{Agents, FailureClass, Reason, SubmissionStatus, names};
 use leaderboard_contract::keys::{OWN_LOG, agent_log, host_log};

@@ -7,8 +7,8 @@
 //! ```
 //!
 //! `cause` and `blame` decide whose fault a start or a crash was. `failure` makes it a sentence with its next step, and `logs` finds the log for
-//! it. `waits` has how long anything is waited for, and `limits` how long a start may take. All write into one `status`; `write` decides whether
-//! a changed one is worth a write, `events` has its events, and `plan` is the result.
+//! it. `waits` has how long anything is waited for, `limits` how long a start may take, and `workers` who runs. All write into one `status`;
+//! `write` decides whether a changed one is worth a write, `events` has its events, and `plan` is the result.
 
 mod accept;
 mod blame;
@@ -30,6 +30,7 @@ mod suspend;
 #[cfg(test)]
 mod tests;
 mod waits;
+mod workers;
 mod write;
 
 use std::sync::Arc;

@@ -13,6 +13,7 @@ use super::failure::{self, charged};
 use super::plan::{Action, EvalaiUpdate, Question, TableUpdate};
 use super::status::PlanBuilder;
 use super::waits::{Wait, after};
+use super::workers::agents_of;
 use super::{blame, cause, limits};
 use crate::report_digest::{ReportDigest, clamp};
 use crate::view::{ContainerView, ObservedJob, ObservedReport, PodView, ReportDemand, Stage, Standing, View};
@@ -63,7 +64,7 @@ pub(super) fn watch(draft: &mut PlanBuilder<'_>) {
 
 /// True if the images of evaluators are pulled after an agent that runs first. That has a deadline of its own.
 fn awaits_images(draft: &PlanBuilder<'_>) -> bool {
-    let agents = blame::agents_of(&draft.status);
+    let agents = agents_of(&draft.status);
     let pod = draft.view.pod.as_ref();
     pod.is_some_and(|pod| limits::awaits_evaluators(pod, agents) && !limits::copies_input(pod, agents))
 }
@@ -71,7 +72,7 @@ fn awaits_images(draft: &PlanBuilder<'_>) -> bool {
 /// The failure of a run that took longer than its limit: the hosts' own, where no agent was at work.
 pub(super) fn over_time(draft: &PlanBuilder<'_>, limit: i64) -> Failure {
     let pod = draft.view.pod.as_ref();
-    if limits::is_agents_time(pod, blame::agents_of(&draft.status)) {
+    if limits::is_agents_time(pod, agents_of(&draft.status)) {
         failure::time_limit(limit, draft.words())
     } else {
         failure::evaluators_late(limit, draft.words())

@@ -10,7 +10,8 @@ use super::failure::infrastructure;
 use super::plan::Action;
 use super::status::PlanBuilder;
 use super::waits::{Wait, after};
-use super::{blame, limits, run, suspend};
+use super::workers::agents_of;
+use super::{limits, run, suspend};
 use crate::view::{JobView, ObservedJob, ObservedNode, PodView, ScaleUp};
 use leaderboard_api::Reason;
 use leaderboard_api::conditions::{self, Truth};
@@ -109,7 +110,7 @@ fn on_its_node(draft: &mut PlanBuilder<'_>, pod: &PodView, since: Timestamp) {
         .as_ref()
         .map(|found| draft.blocked_since(found.reason).unwrap_or(draft.now()));
     // Until the scheduler has spoken there is no node that could be late.
-    let agents = blame::agents_of(&draft.status);
+    let agents = agents_of(&draft.status);
     let limit = limits::limit(pod, agents, &draft.deadlines(), stalled);
     let over = limit.filter(|limit| draft.now() >= limit.at);
     let lasted = found.as_ref().and_then(|found| lasts(draft, found));

@@ -8,11 +8,11 @@ use std::time::Duration;
 use jiff::Timestamp;
 use k8s_openapi::apimachinery::pkg::apis::meta::v1::Time;
 
-use super::blame::agents_of;
 use super::failure::{self, infrastructure};
 use super::plan::Action;
 use super::status::PlanBuilder;
 use super::waits::{Wait, after};
+use super::workers::agents_of;
 use super::{limits, logs};
 use crate::view::{JobView, ObservedFence, ObservedLog, ObservedNode, PodView};
 use leaderboard_api::{Agents, Failure, Interruptions, MAX_INTERRUPTED_NODES, Reason, SubmissionStatus};

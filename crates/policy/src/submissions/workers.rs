@@ -1,0 +1,25 @@
+//! The workers of a submission, as its status has them. Pure.
+
+use leaderboard_api::{Agents, EndReason, RunPlan, SubmissionStatus, WorkerStatus};
+use leaderboard_evaluation::of_plan;
+use leaderboard_protocol::files::{Host, Pair};
+
+/// The program in the hosts' containers of the workers.
+pub(super) fn host_of(status: &SubmissionStatus) -> Host {
+    let plan = status.plan.as_ref();
+    // Without a plan nothing is decided before it is pinned anew.
+    plan.map_or(Host::Simulator, |plan| of_plan(plan).host())
+}
+
+/// How the agents of a submission stand to its hosts' containers.
+pub(super) fn agents_of(status: &SubmissionStatus) -> Agents {
+    status.plan.as_ref().map_or(Agents::Beside, RunPlan::agents)
+}
+
+pub(super) fn pair_with(id: i32) -> Option<Pair> {
+    u16::try_from(id).ok().and_then(Pair::new)
+}
+
+pub(super) fn cause_of(worker: &WorkerStatus) -> Option<EndReason> {
+    worker.last.as_ref().map(|last| last.reason)
+}
