@@ -3,7 +3,6 @@
 //! Pure.
 
 use super::plan::Event;
-use super::publish;
 use super::workers::agents_of;
 use leaderboard_api::conditions;
 use leaderboard_api::{Agents, Reason, ReasonName, State, SubmissionStatus};
@@ -42,7 +41,7 @@ fn start(old: Option<&SubmissionStatus>, new: &SubmissionStatus) -> Option<Event
 fn transition(old: Option<&SubmissionStatus>, new: &SubmissionStatus) -> Option<Event> {
     let shown = |status: &SubmissionStatus| {
         let state = status.state_of_conditions();
-        let awaits = state == State::Finished && publish::is_awaited(status);
+        let awaits = state == State::Finished && is_awaited(status);
         (state, status.present_reason(), awaits)
     };
     let (state, reason, awaits) = shown(new);
@@ -59,6 +58,11 @@ fn transition(old: Option<&SubmissionStatus>, new: &SubmissionStatus) -> Option<
         ));
     }
     Some(event(state == State::Failed, reason, message.to_owned()))
+}
+
+/// True while EvalAI is to have an end and has not answered it.
+fn is_awaited(status: &SubmissionStatus) -> bool {
+    status.condition(conditions::PUBLISHED).is_some() && !status.is_delivered(conditions::PUBLISHED)
 }
 
 fn event(warning: bool, reason: impl Into<ReasonName>, message: String) -> Event {

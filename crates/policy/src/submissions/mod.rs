@@ -64,7 +64,7 @@ pub fn decide(view: &View) -> Plan {
         }
     }
     let report = run::demand(&draft);
-    draft.into_plan(report)
+    write::plan(draft, report)
 }
 
 /// The life of a submission. An end that is decided here is published at once.

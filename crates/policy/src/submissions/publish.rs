@@ -57,11 +57,6 @@ pub(super) fn decide(draft: &mut PlanBuilder<'_>) {
     leave::release(draft, complete);
 }
 
-/// True while EvalAI is to have an end and has not answered it.
-pub(super) fn is_awaited(status: &SubmissionStatus) -> bool {
-    status.condition(conditions::PUBLISHED).is_some() && !status.is_delivered(conditions::PUBLISHED)
-}
-
 /// How far another system is with the end.
 #[derive(Clone, Copy, PartialEq, Eq)]
 pub(super) enum Delivery {

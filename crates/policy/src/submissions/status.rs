@@ -1,15 +1,13 @@
-//! The status and the plan while they are being made. It knows no stage of life.
+//! The status and the plan while they are being made. It knows no stage of life; `write` makes the plan of it.
 
 use std::time::Duration;
 
 use jiff::Timestamp;
 use k8s_openapi::apimachinery::pkg::apis::meta::v1::Time;
 
-use super::events;
-use super::plan::{Action, Event, Plan, StatusWrite, job_name};
+use super::plan::{Action, Event, job_name};
 use super::waits::Wait;
-use super::write::{self, Change};
-use crate::view::{EvalaiInfo, ObservedJob, ReportDemand, View};
+use crate::view::{EvalaiInfo, ObservedJob, View};
 use leaderboard_api::conditions::{self, Truth};
 use leaderboard_api::{
     Attempt, BlockedSince, Deadlines, Failure, Ingested, LeaderboardSpec, Reason, ReasonName, Retries, RunPlan, Score,
@@ -21,9 +19,9 @@ use leaderboard_evaluation::{Words, words};
 pub(super) struct PlanBuilder<'a> {
     pub(super) view: &'a View,
     pub(super) status: SubmissionStatus,
-    actions: Vec<Action>,
-    events: Vec<Event>,
-    requeue: Option<Duration>,
+    pub(super) actions: Vec<Action>,
+    pub(super) events: Vec<Event>,
+    pub(super) requeue: Option<Duration>,
     /// The end is published with the report.
     pub(super) needs_report: bool,
 }
@@ -448,44 +446,6 @@ impl<'a> PlanBuilder<'a> {
     pub(super) fn fail(&mut self, failure: Failure) {
         if self.status.failure.is_none() {
             self.status.failure = Some(Box::new(failure));
-        }
-    }
-
-    pub(super) fn into_plan(mut self, report: Option<ReportDemand>) -> Plan {
-        // Without an attempt nothing was decided yet.
-        if self.status.attempt.is_some() {
-            self.status.state = Some(self.status.state_of_conditions());
-            self.status.reason = self.status.reason.take().filter(|reason| !self.status.repeats(reason));
-            let old = self.submission().status.as_ref();
-            self.events.extend(events::of_change(old, &self.status));
-        }
-        self.status.fit();
-        Plan {
-            report,
-            write: self.status_write(),
-            status: self.status,
-            actions: self.actions,
-            events: self.events,
-            requeue: self.requeue,
-        }
-    }
-
-    /// API writes are what a submission costs its cluster: what may wait is written with what comes next.
-    fn status_write(&mut self) -> StatusWrite {
-        let nothing = SubmissionStatus::default();
-        let old = self.submission().status.as_ref().unwrap_or(&nothing);
-        match write::change(old, &self.status) {
-            Change::Nothing => StatusWrite::NotNow,
-            Change::Place(position) if position > write::FIRST_PLACES => StatusWrite::InTurn,
-            Change::Progress => {
-                let patience = write::patience(self.period());
-                let left = self.view.written_ago.and_then(|ago| patience.checked_sub(ago));
-                if let Some(left) = left {
-                    self.requeue_in(left);
-                }
-                left.map_or(StatusWrite::Now, |_| StatusWrite::NotNow)
-            }
-            Change::Place(_) | Change::Real => StatusWrite::Now,
         }
     }
 

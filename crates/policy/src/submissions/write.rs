@@ -4,19 +4,66 @@
 
 use std::time::Duration;
 
+use super::events;
+use super::plan::{Plan, StatusWrite};
+use super::status::PlanBuilder;
 use super::waits::Wait;
+use crate::view::ReportDemand;
 use leaderboard_api::conditions::STALLED;
 use leaderboard_api::{ReasonName, SharedText, SubmissionStatus, WorkerState};
 
 /// Places in line that are written without waiting for their turn.
-pub(super) const FIRST_PLACES: i32 = 20;
+const FIRST_PLACES: i32 = 20;
 
 /// Periods that progress waits for, where that is shorter.
 const PERIODS: u32 = 3;
 
+/// The plan that a draft has become.
+pub(super) fn plan(mut draft: PlanBuilder<'_>, report: Option<ReportDemand>) -> Plan {
+    // Without an attempt nothing was decided yet.
+    if draft.status.attempt.is_some() {
+        draft.status.state = Some(draft.status.state_of_conditions());
+        draft.status.reason = draft
+            .status
+            .reason
+            .take()
+            .filter(|reason| !draft.status.repeats(reason));
+        let old = draft.submission().status.as_ref();
+        draft.events.extend(events::of_change(old, &draft.status));
+    }
+    draft.status.fit();
+    Plan {
+        report,
+        write: status_write(&mut draft),
+        status: draft.status,
+        actions: draft.actions,
+        events: draft.events,
+        requeue: draft.requeue,
+    }
+}
+
+/// API writes are what a submission costs its cluster: what may wait is written with what comes next.
+fn status_write(draft: &mut PlanBuilder<'_>) -> StatusWrite {
+    let nothing = SubmissionStatus::default();
+    let old = draft.submission().status.as_ref().unwrap_or(&nothing);
+    match change(old, &draft.status) {
+        Change::Nothing => StatusWrite::NotNow,
+        Change::Place(position) if position > FIRST_PLACES => StatusWrite::InTurn,
+        Change::Progress => {
+            let patience = patience(draft.period());
+            let left = draft.view.written_ago.and_then(|ago| patience.checked_sub(ago));
+            if let Some(left) = left {
+                draft.requeue_in(left);
+            }
+            left.map_or(StatusWrite::Now, |_| StatusWrite::NotNow)
+        }
+        Change::Place(_) | Change::Real => StatusWrite::Now,
+    }
+}
+
 /// The difference of two statuses.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
-pub(super) enum Change {
+enum Change {
     Nothing,
     /// Only its place in line, which moves for many at once; the new one.
     Place(i32),
@@ -26,7 +73,7 @@ pub(super) enum Change {
 }
 
 /// Compares the status that is stored with the one that is wanted.
-pub(super) fn change(old: &SubmissionStatus, new: &SubmissionStatus) -> Change {
+fn change(old: &SubmissionStatus, new: &SubmissionStatus) -> Change {
     if old == new {
         Change::Nothing
     } else if let Some(position) = place_alone(old, new) {
@@ -49,7 +96,7 @@ fn place_alone(old: &SubmissionStatus, new: &SubmissionStatus) -> Option<i32> {
 }
 
 /// How long progress may wait since the last write, with reports of this period.
-pub(super) fn patience(period: Duration) -> Duration {
+fn patience(period: Duration) -> Duration {
     Wait::PROGRESS.silence().min(period * PERIODS)
 }
 
