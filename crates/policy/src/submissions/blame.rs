@@ -6,42 +6,26 @@
 //! cause. Where the two never live at one time, `alone` judges.
 
 pub(super) mod alone;
+pub(super) mod ends;
 
 use std::collections::BTreeSet;
 
 use jiff::Timestamp;
 use k8s_openapi::apimachinery::pkg::apis::meta::v1::Time;
 
+use super::failure;
 use super::status::PlanBuilder;
 use super::waits::Wait;
 use super::workers::{agents_of, cause_of, host_of, pair_with};
-use super::{cause, failure};
 use crate::report_digest::clamp;
 use crate::view::{ContainerView, EndView, PodView};
+use ends::{
+    Crash, Order, by_times_and_rounds, crash, end_from_outside, is_crash, is_false_claim, is_of_processes,
+    lacked_processes, of_agent, of_evaluator, of_host, order, what,
+};
 use leaderboard_api::{Agents, EndReason, Failure, LastEnd, SubmissionStatus, WorkerState, WorkerStatus, names};
 use leaderboard_protocol::files::{Host, Member, Side};
-use leaderboard_protocol::verdict::{CODE_NO_PROCESS, CODE_NODE_REFUSED, What};
-
-/// Exit codes of a container that was ended with all others of its Pod, as by a sandbox that is made anew: killed, or lost from sight.
-const FROM_OUTSIDE: [i32; 2] = [137, 255];
-
-/// The kubelet's and the runtime's words where a container cannot be started for want of processes. A Pod has a number of them, and its
-/// agents can use it up.
-const OF_PROCESSES: [&str; 3] = [
-    "resource temporarily unavailable",
-    "connection reset by peer",
-    "failed to create new os thread",
-];
-
-/// The last crash of a worker.
-#[derive(Clone, Copy, Debug, PartialEq, Eq)]
-pub(super) struct Crash {
-    pub(super) cause: EndReason,
-    pub(super) exit_code: i32,
-    pub(super) at: Option<Timestamp>,
-    /// Nothing that may still be seen changes it.
-    pub(super) is_settled: bool,
-}
+use leaderboard_protocol::verdict::What;
 
 /// The last crash of a worker with this kind of host. `None`: neither side has crashed; whether their Pod is lost is not judged here.
 pub(super) fn last_crash(
@@ -58,17 +42,6 @@ pub(super) fn last_crash(
     let has_result = |host: &ContainerView| host.last.as_ref().and_then(what) == Some(What::Finished);
     let cause = of_evaluator(crash.cause);
     (!host.is_some_and(has_result)).then_some(Crash { cause, ..crash })
-}
-
-/// A cause of the table where the host's container is an evaluator, whose agent writes no results of its own.
-fn of_evaluator(cause: EndReason) -> EndReason {
-    match cause {
-        EndReason::SimulatorCrashed | EndReason::SimulatorSilent => EndReason::EvaluatorCrashed,
-        EndReason::SimulatorNotReady => EndReason::EvaluatorNotReady,
-        EndReason::SimulatorNotStarted => EndReason::EvaluatorNotStarted,
-        EndReason::Incomplete => EndReason::Exited,
-        cause => cause,
-    }
 }
 
 /// The table, in a simulator's words.
@@ -112,64 +85,6 @@ fn from_outside(host: Option<&ContainerView>, agent: Option<&ContainerView>) -> 
     (by_times_and_rounds(own, agent) == Order::SameRound).then(|| crash(EndReason::EndedFromOutside, own))
 }
 
-/// The last end of a container, if that can have come from outside.
-fn end_from_outside(container: &ContainerView) -> Option<&EndView> {
-    let end = container.last.as_ref()?;
-    let goes_on = container.running || container.waiting.is_some();
-    let is_it = match what(end) {
-        // In a Pod that is being ended both are asked to end, and neither comes back.
-        Some(What::Stopped) => goes_on,
-        None | Some(What::SilentDeath) => is_killed_from_outside(end),
-        _ => false,
-    };
-    (is_it && !end.is_start_error()).then_some(end)
-}
-
-fn is_killed_from_outside(end: &EndView) -> bool {
-    FROM_OUTSIDE.contains(&end.exit_code) && end.reason != "OOMKilled"
-}
-
-/// True if the kubelet could not start a host's container again that has run in this Pod, for want of processes. That is no failure of its own:
-/// it is waited for, and an agent that ends meanwhile is the cause.
-fn lacked_processes(container: &ContainerView, end: &EndView) -> bool {
-    !is_of_first_life(container) && is_start_without_process(end)
-}
-
-fn is_start_without_process(end: &EndView) -> bool {
-    end.is_start_error() && end.why.as_deref().is_some_and(is_of_processes)
-}
-
-fn is_of_processes(words: &str) -> bool {
-    let words = words.to_lowercase();
-    OF_PROCESSES.iter().any(|sign| words.contains(sign))
-}
-
-/// True if the last end of a container is that of its first life. The kubelet counts, so no agent changes it.
-fn is_of_first_life(container: &ContainerView) -> bool {
-    container.restarts <= i32::from(container.has_next_life())
-}
-
-/// True if an end was a crash, and not one that was asked for.
-pub(super) fn is_crash(end: &EndView) -> bool {
-    let is_asked_for = matches!(what(end), Some(What::Stopped | What::Cancelled | What::Finished));
-    end.exit_code != 0 && !is_asked_for
-}
-
-/// True if an agent reports that it was asked to end, and it was not: its host had to end because of it, or the kubelet starts it
-/// again, which it does in no Pod that is being ended. Where the host was ended from outside, too, the agent may be right.
-fn is_false_claim(host: Option<&ContainerView>, agent: &ContainerView, end: &EndView) -> bool {
-    if end.exit_code == 0 {
-        return false;
-    }
-    let own_end = host.and_then(|container| container.last.as_ref());
-    let goes_on = agent.running || agent.waiting.is_some();
-    match own_end.map(|own| (own, what(own))) {
-        Some((_, Some(What::Stopped | What::Cancelled))) => false,
-        Some((own, Some(What::PeerCrashed))) => goes_on || order(host, own, end) == Order::SameRound,
-        _ => goes_on,
-    }
-}
-
 /// True if a crash was a failure of the host's container itself, which it was not if its Pod was being ended.
 fn is_hosts_own(host: Option<&ContainerView>, crash: &Crash) -> bool {
     let was_ended = host.and_then(|container| what(container.last.as_ref()?)) == Some(What::Stopped);
@@ -184,41 +99,6 @@ fn is_hosts_own(host: Option<&ContainerView>, crash: &Crash) -> bool {
             | EndReason::EvaluatorNotStarted
     );
     is_its && !was_ended
-}
-
-fn what(end: &EndView) -> Option<What> {
-    end.verdict.as_ref().map(|verdict| verdict.what)
-}
-
-/// Which of the two ends belongs to the later round.
-#[derive(Clone, Copy, PartialEq, Eq)]
-enum Order {
-    SameRound,
-    AgentIsLater,
-    HostIsLater,
-}
-
-fn order(host: Option<&ContainerView>, end: &EndView, agent: &EndView) -> Order {
-    // A runner writes a verdict as soon as it begins, so this life never began, and the one that runs now is another.
-    let is_replaced = end.verdict.is_none() && host.is_some_and(|container| container.running);
-    if is_replaced {
-        return Order::AgentIsLater;
-    }
-    by_times_and_rounds(end, agent)
-}
-
-fn by_times_and_rounds(end: &EndView, agent: &EndView) -> Order {
-    // By the kubelet's times, whatever round the agent claims: a life that began after an end is of a later round.
-    if agent.began.zip(end.at).is_some_and(|(began, at)| began > at) {
-        return Order::AgentIsLater;
-    }
-    let round = |end: &EndView| end.verdict.as_ref().and_then(|verdict| verdict.round);
-    match round(end).zip(round(agent)) {
-        Some((host, agent)) if agent > host => Order::AgentIsLater,
-        Some((host, agent)) if agent < host => Order::HostIsLater,
-        // An agent without a round has replaced its verdict.
-        _ => Order::SameRound,
-    }
 }
 
 fn of_both(host: Option<&ContainerView>, end: &EndView, blamed: Crash) -> Crash {
@@ -263,71 +143,6 @@ fn cannot_be_started(host: &ContainerView) -> bool {
 /// True if the other side's end may still be seen. A clock that was set back does not prolong this.
 fn is_awaited(at: Option<Timestamp>, now: Timestamp) -> bool {
     at.is_some_and(|at| now.duration_since(at).as_secs().abs() < Wait::PEER.longest)
-}
-
-fn crash(cause: EndReason, end: &EndView) -> Crash {
-    Crash {
-        cause,
-        exit_code: end.exit_code,
-        at: end.at,
-        is_settled: true,
-    }
-}
-
-fn of_host(host: Option<&ContainerView>, end: &EndView) -> EndReason {
-    let is_first = host.is_none_or(is_of_first_life);
-    match what(end) {
-        // The agents can use up the Pod's processes once they run.
-        Some(What::NoProcess) if !is_first => EndReason::NoProcess,
-        Some(What::NotReady | What::NoResult) => EndReason::SimulatorNotReady,
-        Some(What::ServerSilent) => EndReason::SimulatorSilent,
-        Some(What::PortTaken) => EndReason::PortTaken,
-        Some(What::NoGpu) => EndReason::NoGPU,
-        Some(What::GraphicsDriverMissing) => EndReason::GraphicsDriverMissing,
-        None if end.is_start_error() => EndReason::SimulatorNotStarted,
-        _ => EndReason::SimulatorCrashed,
-    }
-}
-
-/// The cause that the agent's own end shows; all of it is the agent's fault, but what its node refused its runner before the agent's command ran. The
-/// exit code is the runner's, which no process of the agent has. Processes alone the other agents of the Pod can use up, once they run.
-fn of_agent(container: &ContainerView, end: &EndView) -> EndReason {
-    let is_first = is_of_first_life(container);
-    match end.exit_code {
-        CODE_NODE_REFUSED => return EndReason::NodeCannotStart,
-        CODE_NO_PROCESS if is_first => return EndReason::NodeCannotStart,
-        CODE_NO_PROCESS => return EndReason::NoProcess,
-        _ if !is_first && is_start_without_process(end) => return EndReason::NoProcess,
-        _ => {}
-    }
-    let exit_code = end.verdict.as_ref().and_then(|verdict| verdict.exit_code);
-    match what(end) {
-        Some(
-            What::PeerCrashed
-            | What::NotReady
-            | What::NoResult
-            | What::ServerSilent
-            | What::PortTaken
-            | What::NoGpu
-            | What::GraphicsDriverMissing,
-        ) => EndReason::BlamesHost,
-        Some(What::Idle) => EndReason::Idle,
-        Some(What::CannotStart) => EndReason::CannotStart,
-        _ if end.reason == "OOMKilled" => EndReason::OutOfMemory,
-        Some(What::Exited) if exit_code == Some(0) => EndReason::Incomplete,
-        Some(What::Exited) => EndReason::Exited,
-        Some(What::SilentDeath) => EndReason::SilentDeath,
-        None if end.is_start_error() => of_start_error(end),
-        _ => EndReason::Killed,
-    }
-}
-
-fn of_start_error(end: &EndView) -> EndReason {
-    if cause::of_start(end.why.as_deref().unwrap_or_default()).is_images() {
-        EndReason::StartError
-    } else {
-        EndReason::NodeCannotStart
-    }
 }
 
 /// Counts the crashes of each worker and remembers the last one: its Pod may be gone when the cause is looked for.

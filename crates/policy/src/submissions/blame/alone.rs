@@ -3,8 +3,10 @@
 //! In Batch the agent ends before the evaluators begin, and in Predictions there is none. So no end follows from that of another container, and
 //! none is waited for. The end of logcopy shows if all containers were ended from outside.
 
-use super::{Crash, Order, by_times_and_rounds, crash, end_from_outside, is_crash, is_false_claim};
-use super::{is_killed_from_outside, of_agent, of_evaluator, of_host};
+use super::ends::{
+    Crash, Order, by_times_and_rounds, crash, end_from_outside, is_crash, is_false_claim, is_killed_from_outside,
+    of_agent, of_evaluator, of_host,
+};
 use crate::view::{ContainerView, EndView};
 use leaderboard_api::EndReason;
 use leaderboard_protocol::verdict::CODE_NO_GRAPHICS;

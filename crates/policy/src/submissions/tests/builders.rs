@@ -8,7 +8,7 @@ use serde_json::json;
 
 use super::{foreign, rules};
 use crate::report_digest::ReportDigest;
-use crate::submissions::blame::is_crash;
+use crate::submissions::blame::ends::is_crash;
 use crate::submissions::{Action, EvalaiUpdate, Plan, decide, job_name};
 use crate::view::{
     ContainerView, EndView, EvalaiEnd, EvalaiInfo, EvalaiView, JobEnd, JobView, NodeView, ObservedFence, ObservedJob,
