@@ -1,6 +1,7 @@
 //! The gates between acceptance and a Job: another program's run, a Leaderboard that is ready, its NetworkPolicy, a slot, the submitted file.
 
 pub(super) mod input;
+mod slot;
 
 use std::fmt;
 
@@ -11,12 +12,10 @@ use super::waits::Wait;
 use super::{end, run, stop};
 use crate::ask::{Answered, Failure};
 use crate::questions::{ForeignRun, Row};
-use crate::slots::member::check_team;
-use crate::slots::turns::{InLine, Turn};
 use crate::view::{JobView, PodView};
 use leaderboard_api::conditions::{self, Truth};
 use leaderboard_api::text::{LONGEST_NAME, one_line, sentence};
-use leaderboard_api::{Eta, PolicySource, Reason, ResourceExt, Waiting, names};
+use leaderboard_api::{PolicySource, Reason, names};
 use leaderboard_contract::verdict::WorkspaceReason;
 
 /// A condition that a submission passes on its way to a Job.
@@ -49,7 +48,7 @@ pub(super) fn closed(draft: &mut PlanBuilder<'_>, gates: &[Gate]) -> Option<Gate
         Gate::Policy => waits_for_policy(draft),
         Gate::NextTry => waits_for_next_try(draft),
         Gate::InputAnswer => input::has_failed(draft),
-        Gate::Slot => waits_for_slot(draft),
+        Gate::Slot => slot::waits(draft),
         Gate::Input => input::waits(draft),
     })
 }
@@ -359,64 +358,4 @@ fn waits_for_next_try(draft: &mut PlanBuilder<'_>) -> bool {
     }
     draft.requeue_at(at);
     true
-}
-
-/// A submission that waits for nothing but a slot joins the line, and shows its place there.
-fn waits_for_slot(draft: &mut PlanBuilder<'_>) -> bool {
-    let (position, eta, reason, message) = match draft.view.turn.clone() {
-        Turn::Go => return false,
-        Turn::NotInLine => {
-            join(draft);
-            // Its first place is worth a write, that it has none yet is not.
-            draft.keeps_status();
-            return true;
-        }
-        Turn::Wait { position, eta } => (
-            position,
-            known_eta(draft, position).or(eta),
-            Reason::WaitingForSlot,
-            "All slots of the Leaderboard are in use; concurrency.total and concurrency.perTeam set their number.",
-        ),
-        Turn::Paused { position } => (
-            position,
-            None,
-            Reason::Paused,
-            "The Leaderboard is paused; it starts again with paused: false.",
-        ),
-    };
-    draft.status.waiting = Some(Box::new(Waiting::new(position, eta)));
-    draft.waits(reason);
-    draft.show(reason, message);
-    // Its priority may have been edited since.
-    join(draft);
-    run::update_evalai(draft);
-    true
-}
-
-fn join(draft: &mut PlanBuilder<'_>) {
-    let status = &draft.status;
-    let team = status.team.as_ref();
-    let team = team.and_then(|team| team.id.clone().or_else(|| team.name.clone()));
-    let is_check = draft.spec().check;
-    let own = is_check.then(|| check_team(&draft.submission().name_any()));
-    let place = InLine {
-        uid: draft.submission().metadata.uid.clone().unwrap_or_default(),
-        name: draft.submission().name_any(),
-        team: own.or(team).unwrap_or_default(),
-        track: status.track.clone().unwrap_or_default(),
-        priority: draft.spec().priority,
-        submitted: status.times.submitted.as_ref().map_or(draft.now(), |time| time.0),
-        is_check,
-    };
-    draft.act(Action::JoinLine(place));
-}
-
-/// The wait that is shown of this place. One that is only estimated anew is not worth a write; it follows the place.
-fn known_eta(draft: &PlanBuilder<'_>, position: i32) -> Option<Eta> {
-    let known = draft
-        .status
-        .waiting
-        .as_deref()
-        .filter(|known| known.position == position);
-    known.and_then(Waiting::eta)
 }

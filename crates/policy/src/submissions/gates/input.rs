@@ -6,7 +6,7 @@ use super::super::plan::{Action, Question};
 use super::super::run;
 use super::super::status::PlanBuilder;
 use super::super::waits::Wait;
-use super::join;
+use super::slot::join;
 use crate::questions::{Fetched, INPUT_TRIES, Input};
 use leaderboard_api::text::sentence;
 use leaderboard_api::{Agents, Evalai, Failure, Reason};
