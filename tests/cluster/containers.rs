@@ -140,7 +140,7 @@ async fn await_partial(evalai: &Evalai) {
 }
 
 /// It has ended with the score that was worked out by hand.
-fn assert_exact(submission: &Submission) {
+pub(super) fn assert_exact(submission: &Submission) {
     let status = submission.status.as_ref().unwrap();
     assert_eq!(state(submission), Some(State::Finished));
     let progress = status.progress.as_ref().unwrap();

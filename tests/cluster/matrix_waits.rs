@@ -15,6 +15,7 @@ use leaderboard_api::names::{CONTAINER_CONTENTS, CONTAINER_WORKSPACE};
 use leaderboard_api::{Reason, State, Submission, conditions};
 use serde_json::{Value, json};
 
+use super::containers::{assert_exact, game, submit};
 use super::matrix::{Case, SHOWN, together};
 use crate::evalai::Evalai;
 use crate::operator::controller;
@@ -333,16 +334,14 @@ async fn evalai_away(scene: &Scene, name: &'static str, answer: Failure) {
     case.close();
 }
 
-/// A node that is no machine, whose kubelet is played, goes away with its Pod; the Job's next one runs on the real node.
+/// A node that is no machine, whose kubelet is played, goes away with its Pods; the Jobs' next ones run on the real node.
 async fn node_lost(scene: &Scene) {
-    let mut case = Case::open(
-        "node lost",
-        "Running Running; Running Replacing; Finished; attempt 1, try 0, crashes 0",
-    );
+    let expected = "Running Running; Running Replacing; Finished; attempt 1, try 0, crashes 0";
+    let mut cases = ["node lost", "node lost under evaluators of a host"].map(|case| Case::open(case, expected));
     let nodes: Api<Node> = Api::all(scene.client.clone());
     let label = scene.namespace.as_str();
     nodes.create(&PostParams::default(), &fake_node(label)).await.unwrap();
-    let outcome = AssertUnwindSafe(on_the_lost_node(&mut case, scene, &nodes, label))
+    let outcome = AssertUnwindSafe(on_the_lost_node(&mut cases, scene, &nodes, label))
         .catch_unwind()
         .await;
     // Whatever came of it, other tests find the nodes as they were.
@@ -352,46 +351,58 @@ async fn node_lost(scene: &Scene) {
         label_node(&nodes, &node.name_any(), Value::Null).await;
     }
     match outcome {
-        Ok(()) => case.close(),
+        Ok(()) => cases.into_iter().for_each(Case::close),
         Err(panic) => resume_unwind(panic),
     }
 }
 
-async fn on_the_lost_node(case: &mut Case, scene: &Scene, nodes: &Api<Node>, label: &str) {
-    let track = json!({
-        "name": "sensors",
-        "carla": {"codename": "SENSORS"},
-        "nodeSelector": {NODE_LABEL: label},
-        "tolerations": [{"key": NODE_LABEL, "operator": "Exists"}],
-    });
-    board(
-        scene,
-        "lost-node",
-        json!({"tracks": [track], "retries": {"perWorker": 0}}),
-    )
-    .await;
-    scene.submit_to("lost-node", "lost-node", "agent:standard").await;
-    let pod = scene.first_pod("lost-node", LIMIT).await.name_any();
-    let scheduled = |pod: Option<&Pod>| pod.is_some_and(|pod| pod.spec.as_ref().is_some_and(|s| s.node_name.is_some()));
-    let pod = scene.wait(&pod, "it has a node", LIMIT, scheduled).await.unwrap();
-    play_kubelet(scene, &pod).await;
-    case.shows(scene, "lost-node", "Running", "").await;
+/// Of CARLA and of a game, as `node_lost` names its cases.
+const LOST: [&str; 2] = ["lost-node", "lost-game"];
 
-    case.cause();
+async fn on_the_lost_node(cases: &mut [Case; 2], scene: &Scene, nodes: &Api<Node>, label: &str) {
+    let change = json!({
+        "tracks": [{
+            "nodeSelector": {NODE_LABEL: label},
+            "tolerations": [{"key": NODE_LABEL, "operator": "Exists"}],
+        }],
+        "retries": {"perWorker": 0},
+    });
+    let mut of_carla = change.clone();
+    lay_over(
+        &mut of_carla["tracks"][0],
+        json!({"name": "sensors", "carla": {"codename": "SENSORS"}}),
+    );
+    board(scene, LOST[0], of_carla).await;
+    let mut of_game = game(&scene.lab, json!({}));
+    let track = of_game["tracks"][0].take();
+    lay_over(&mut of_game, change);
+    lay_over(&mut of_game["tracks"][0], track);
+    scene.leaderboard(LOST[1], of_game).await;
+    scene.submit_to(LOST[0], LOST[0], "agent:standard").await;
+    submit(scene, LOST[1], LOST[1], "agent:1").await;
+    let scheduled = |pod: Option<&Pod>| pod.is_some_and(|pod| pod.spec.as_ref().is_some_and(|s| s.node_name.is_some()));
+    for (case, name) in cases.iter_mut().zip(LOST) {
+        let pod = scene.first_pod(name, LIMIT).await.name_any();
+        let pod = scene.wait(&pod, "it has a node", LIMIT, scheduled).await.unwrap();
+        play_kubelet(scene, &pod).await;
+        case.shows(scene, name, "Running", "").await;
+    }
+
+    cases.iter_mut().for_each(Case::cause);
     nodes.delete(label, &DeleteParams::default()).await.unwrap();
-    case.shows(scene, "lost-node", "Replacing", "The Pod was lost").await;
+    for (case, name) in cases.iter_mut().zip(LOST) {
+        case.shows(scene, name, "Replacing", "The Pod was lost").await;
+    }
     label_node(nodes, REAL_NODE, json!(label)).await;
-    finishes(case, scene, "lost-node").await;
-    let status = scene
-        .api::<Submission>()
-        .get("lost-node")
-        .await
-        .unwrap()
-        .status
-        .unwrap();
-    let crashes: i32 = status.workers.iter().map(|pair| pair.crashes).sum();
-    let (attempt, retry) = (status.attempt.unwrap_or_default(), status.retry);
-    case.also(&format!("attempt {attempt}, try {retry}, crashes {crashes}"));
+    let [of_carla, of_game] = cases;
+    finishes(of_carla, scene, LOST[0]).await;
+    assert_exact(&of_game.ends(scene, LOST[1], LIMIT).await);
+    for (case, name) in cases.iter_mut().zip(LOST) {
+        let status = scene.api::<Submission>().get(name).await.unwrap().status.unwrap();
+        let crashes: i32 = status.workers.iter().map(|worker| worker.crashes).sum();
+        let (attempt, retry) = (status.attempt.unwrap_or_default(), status.retry);
+        case.also(&format!("attempt {attempt}, try {retry}, crashes {crashes}"));
+    }
 }
 
 async fn label_node(nodes: &Api<Node>, name: &str, value: Value) {

@@ -32,8 +32,8 @@ use super::played;
 const NODE: &str = "played";
 /// Longest wait for something that the controller does.
 const LIMIT: Duration = Duration::from_mins(2);
-/// Init containers that have ended before the agents run.
-const BEFORE: [&str; 2] = [names::CONTAINER_WORKSPACE, names::CONTAINER_CONTENTS];
+/// Begins the name of each agent's container.
+const AGENT: &str = "agent-";
 
 /// A namespace in which a test acts for the cluster.
 #[derive(Clone)]
@@ -130,22 +130,52 @@ pub fn running(pod: &Pod) -> Value {
     status(pod, "Running", |_| String::new(), &played::running())
 }
 
-/// Status of a Pod whose `workspace` and `contents` have ended well, and all of whose other containers have this state.
+/// Status of a Pod whose init containers have ended well, and all of whose other containers have this state.
 pub fn status(pod: &Pod, phase: &str, image_id: impl Fn(&str) -> String, state: &Value) -> Value {
-    let spec = pod.spec.as_ref().unwrap();
     let over = played::ended(0, "");
-    let status = |container: &Container| {
-        let image = container.image.as_deref().unwrap_or_default();
-        let is_over = BEFORE.contains(&container.name.as_str());
-        played::container(
-            &container.name,
-            image,
-            &image_id(image),
-            if is_over { &over } else { state },
-        )
+    status_of_each(pod, phase, image_id, |container, is_init| {
+        let is_sidecar = container.restart_policy.is_some();
+        if is_init && !is_sidecar { &over } else { state }
+    })
+}
+
+/// Status of a Pod whose agent runs before the evaluators; `None` where it has no such agent.
+pub fn agent_first(pod: &Pod, image_id: impl Fn(&str) -> String) -> Option<Value> {
+    let init = pod.spec.as_ref()?.init_containers.as_ref()?;
+    let agent = init.iter().position(|container| container.name.starts_with(AGENT))?;
+    let before: Vec<&str> = init[..agent].iter().map(|container| container.name.as_str()).collect();
+    let (over, running) = (played::ended(0, ""), played::running());
+    let waiting = json!({"waiting": {"reason": "PodInitializing"}});
+    let state = |container: &Container, _: bool| {
+        let runs = container.restart_policy.is_some() || container.name == init[agent].name;
+        match (runs, before.contains(&container.name.as_str())) {
+            (true, _) => &running,
+            (false, true) => &over,
+            (false, false) => &waiting,
+        }
     };
-    let init: Vec<_> = spec.init_containers.iter().flatten().map(status).collect();
-    let containers: Vec<_> = spec.containers.iter().map(status).collect();
+    Some(status_of_each(pod, "Pending", image_id, state))
+}
+
+/// Status of a Pod whose containers have the states that `state` gives; it is asked whether one is an init container.
+fn status_of_each<'a>(
+    pod: &Pod,
+    phase: &str,
+    image_id: impl Fn(&str) -> String,
+    state: impl Fn(&Container, bool) -> &'a Value,
+) -> Value {
+    let spec = pod.spec.as_ref().unwrap();
+    let status = |container: &Container, is_init| {
+        let image = container.image.as_deref().unwrap_or_default();
+        played::container(&container.name, image, &image_id(image), state(container, is_init))
+    };
+    let init: Vec<_> = spec
+        .init_containers
+        .iter()
+        .flatten()
+        .map(|one| status(one, true))
+        .collect();
+    let containers: Vec<_> = spec.containers.iter().map(|one| status(one, false)).collect();
     played::pod(phase, &init, &containers)
 }
 

@@ -13,7 +13,7 @@ use kube::api::{Api, PostParams};
 use kube::core::NamespaceResourceScope;
 use kube::runtime::wait::await_condition;
 use kube::{Client, Resource};
-use leaderboard_api::{Leaderboard, State, Submission, conditions, names};
+use leaderboard_api::{Leaderboard, State, Submission, SubmissionStatus, conditions, names};
 use leaderboard_base::shutdown::Stop;
 use leaderboard_operator::observability::Observability;
 use leaderboard_operator::observability::traces::Traces;
@@ -45,6 +45,8 @@ const OF_THE_LEADERBOARD: &str = "leaderboards/status";
 const READS: [&str; 2] = ["get", "list"];
 /// No report comes before the last one: how many there are would depend on the machine.
 const NO_REPORT: Duration = Duration::from_hours(1);
+const BATCH: &str = "Batch";
+const PREDICTIONS: &str = "Predictions";
 /// So often a controller comes to rest in a submission's life.
 const STAGES: usize = 3;
 
@@ -54,34 +56,44 @@ pub struct Scenario {
     pub name: &'static str,
     has_evalai: bool,
     has_limits: bool,
-    /// A container of the host's evaluates it.
-    has_evaluator: bool,
+    /// Mode of the host's container that evaluates it, in place of CARLA.
+    mode: Option<&'static str>,
 }
 
 impl Scenario {
-    pub const ALL: [Self; 5] = [
+    pub const ALL: [Self; 7] = [
         Self::of("local", false, false),
         Self::of("local, limited", false, true),
         Self::of("EvalAI and table", true, false),
         Self::of("EvalAI and table, limited", true, true),
-        Self::EVALUATED,
+        Self::EVALUATED[0],
+        Self::EVALUATED[1],
+        Self::EVALUATED[2],
     ];
 
     /// One that EvalAI and a table get.
     pub const PUBLISHED: Self = Self::ALL[2];
 
-    /// The same with a host's own evaluator.
-    pub const EVALUATED: Self = Self {
-        has_evaluator: true,
-        ..Self::of("EvalAI and table, a host's evaluator", true, false)
-    };
+    /// The same with a host's own evaluator, in each of its modes.
+    pub const EVALUATED: [Self; 3] = [
+        Self::by_container("EvalAI and table, a host's evaluator", "Interactive"),
+        Self::by_container("EvalAI and table, an agent before the evaluator", BATCH),
+        Self::by_container("EvalAI and table, an uploaded file", PREDICTIONS),
+    ];
 
     const fn of(name: &'static str, has_evalai: bool, has_limits: bool) -> Self {
         Self {
             name,
             has_evalai,
             has_limits,
-            has_evaluator: false,
+            mode: None,
+        }
+    }
+
+    const fn by_container(name: &'static str, mode: &'static str) -> Self {
+        Self {
+            mode: Some(mode),
+            ..Self::of(name, true, false)
         }
     }
 
@@ -180,6 +192,7 @@ impl World {
         let namespace = server().await.namespace("counts").await;
         let (config, _) = Config::in_memory().unwrap();
         let evalai = if scenario.has_evalai {
+            let config = of_mode(config, scenario.mode);
             let listener = TcpListener::bind("127.0.0.1:0").await.unwrap();
             let config = Config { throttle: 0, ..config };
             Some(evalai_stand_in::serve(config, vec![listener]))
@@ -226,10 +239,12 @@ impl World {
             make_table(&self.aws, &table).await;
             spec["table"] = json!({"dynamoDB": {"name": table, "endpoint": self.table.endpoint()}});
         }
-        if scenario.has_evaluator {
-            let container = json!({"mode": "Interactive", "image": "evaluator:1", "command": ["evaluate"]});
+        if let Some(mode) = scenario.mode {
+            let container = json!({"mode": mode, "image": "evaluator:1", "command": ["evaluate"]});
             spec["evaluation"] = json!({"carla": null, "container": container});
-            spec["agent"]["command"] = json!(["play"]);
+            if mode != PREDICTIONS {
+                spec["agent"]["command"] = json!(["play"]);
+            }
             spec["tracks"][0]["container"] = json!({"score": {"metric": "Driving score"}});
         }
         let api = Kind::Leaderboard.api(&self.client, &self.namespace);
@@ -289,6 +304,9 @@ impl World {
             let pk = evalai.with_state(|state| push(state, new, FileState::Stored, Timestamp::now()));
             spec["evalai"] = json!({"challenge": 1, "phase": 1, "submission": pk});
             spec["track"] = Value::Null;
+            if evalai.with_state(|state| !state.seed.challenges[0].is_docker_based) {
+                spec["image"] = Value::Null;
+            }
             // As the bridge creates it.
             metadata["finalizers"] = json!([names::FINALIZER_SUBMISSION]);
         }
@@ -313,15 +331,24 @@ impl World {
     }
 }
 
+/// EvalAI whose challenge takes what the mode evaluates.
+fn of_mode(mut config: Config, mode: Option<&str>) -> Config {
+    let challenge = &mut config.seed.challenges[0];
+    challenge.is_docker_based = mode != Some(PREDICTIONS);
+    challenge.is_static_dataset_code_upload = mode == Some(BATCH);
+    config
+}
+
 /// The Job is made.
 pub(super) fn has_job(submission: &Submission) -> bool {
     submission.status.as_ref().is_some_and(|s| s.job_name.is_some())
 }
 
-/// Its agents run, and their image is pinned with the same write.
+/// It runs, and the image of its agents, if it has any, is pinned with the same write.
 pub(super) fn is_running(submission: &Submission) -> bool {
     let status = submission.status.as_ref();
-    status.is_some_and(|s| s.state_of_conditions() == State::Running && s.image.is_some())
+    let is_known = |s: &SubmissionStatus| s.image.is_some() || s.input.is_some();
+    status.is_some_and(|s| s.state_of_conditions() == State::Running && is_known(s))
 }
 
 pub(super) fn is_read(request: &Request) -> bool {

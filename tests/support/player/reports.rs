@@ -8,13 +8,14 @@ use evalai_stand_in::Config;
 use futures::FutureExt;
 use futures::future::BoxFuture;
 use kube::ResourceExt;
-use leaderboard_api::{Attempt, Metric, WorkerState, names};
+use kube::runtime::wait::await_condition;
+use leaderboard_api::{Attempt, Metric, State, Submission, WorkerState, names};
 use leaderboard_aws::archive::Archive;
 use leaderboard_contract::report::{Outcome, REPORT_KEY, Report, ReportWorker, SCHEMA};
 use serde_json::json;
 use tokio::time::{Instant, interval_at};
 
-use super::{Part, played, status};
+use super::{Part, agent_first, played, status};
 
 /// Routes of every run.
 pub const ROUTES: u32 = 1000;
@@ -46,10 +47,15 @@ pub fn reports_as(
 async fn play(mut part: Part, archive: Archive, period: Duration, change: fn(Report) -> Report) {
     let dressed = |phase: &str, state| status(&part.pod, phase, digest, &state);
     let name = part.pod.name_any();
-    part.cluster
-        .set_pod(&name, &dressed("Running", played::running()))
-        .await;
+    let running = dressed("Running", played::running());
+    let first = agent_first(&part.pod, digest);
+    part.cluster.set_pod(&name, first.as_ref().unwrap_or(&running)).await;
     part.cluster.set_job(&part.job, &played::job_started()).await;
+    if first.is_some() {
+        let submission = &part.job.labels()[names::LABEL_SUBMISSION];
+        await_condition(part.cluster.api(), submission, runs).await.unwrap();
+        part.cluster.set_pod(&name, &running).await;
+    }
     let (submission, pod) = (part.job.owner_references()[0].uid.clone(), part.pod.uid().unwrap());
     let report = |round: u32, done| Report {
         round: round.into(),
@@ -84,6 +90,12 @@ async fn play(mut part: Part, archive: Archive, period: Duration, change: fn(Rep
         .await;
     part.cluster.set_job(&part.job, &played::job_complete()).await;
     part.has_ended();
+}
+
+/// The controller has seen that the agent runs.
+fn runs(submission: Option<&Submission>) -> bool {
+    let status = submission.and_then(|submission| submission.status.as_ref());
+    status.is_some_and(|status| status.state_of_conditions() == State::Running)
 }
 
 /// Name of an image by its digest, as a registry gives it to a node.
