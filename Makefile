@@ -12,7 +12,7 @@ BENCH_LINES ?= target/bench/lines.jsonl
 BENCH_FLAGS ?=
 
 .DEFAULT_GOAL := help
-.PHONY: help demo test test-core measure-scale measure-intake measure-failover cluster down status build static image images crds docs fmt lint deny bench bench-quick bench-report bench-results fuzz chart-test lab-test
+.PHONY: help demo test test-core measure-scale measure-intake measure-failover measure-uploads cluster down status build static image images crds docs fmt lint deny bench bench-quick bench-report bench-results fuzz chart-test lab-test
 
 help: ## Explain every target
 	@awk -F ':.*## ' '/^[a-z-]+:.*## / { printf "  %-14s %s\n", $$1, $$2 }' $(MAKEFILE_LIST)
@@ -43,6 +43,12 @@ measure-failover: ## Measure how long the other replica takes to go on, ten ends
 	LEADERBOARD_MINISTACK="$${LEADERBOARD_MINISTACK:-$$($(LAB) aws-venv)/ministack}" \
 	cargo test --workspace --profile $(PROFILE) --test api -- --ignored --nocapture --test-threads 1 \
 		the_leader_ends_ten_times
+
+measure-uploads: ## Measure the controller's memory while it copies two uploaded files of 1 GiB (5 min and 8 GiB of memory; no root, no node)
+	KUBEBUILDER_ASSETS="$${KUBEBUILDER_ASSETS:-$$($(LAB) tools etcd kube-apiserver kubectl)}" \
+	LEADERBOARD_MINISTACK="$${LEADERBOARD_MINISTACK:-$$($(LAB) aws-venv)/ministack}" \
+	cargo test --workspace --profile $(PROFILE) --test api -- --ignored --nocapture --test-threads 1 \
+		two_uploaded_files_of_a_gibibyte
 
 cluster: ## Start the one-node cluster and the AWS stand-in; prints the KUBECONFIG line to copy
 	$(LAB) up

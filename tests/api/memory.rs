@@ -1,17 +1,19 @@
-//! The memory of the controller's own process while many results with the largest texts are published: all of them were stored while it
-//! was away.
+//! The memory of the controller's own process while many results with the largest texts are published, all of them stored while it
+//! was away; and while it copies files that participants have uploaded.
 #![cfg(test)]
 
 use evalai_stand_in::model::Status;
 use futures::StreamExt;
 use kube::ResourceExt;
 use kube::api::{Patch, PatchParams};
-use leaderboard_api::{Submission, SubmissionStatus, conditions};
+use leaderboard_api::{Submission, SubmissionStatus, SubmittedFile, conditions};
 use leaderboard_contract::report::{REPORT_KEY, Report, StoredFile};
-use serde_json::json;
+use serde_json::{Value, json};
 use sha2::{Digest, Sha256};
+use tokio::time::Instant;
 
 use super::intake::program::Program;
+use super::rule_cases::container::by_container;
 use super::world::{World, ago};
 use crate::support::player::{self, ROUTES};
 
@@ -19,7 +21,7 @@ use crate::support::player::{self, ROUTES};
 const RESULTS: usize = 50;
 /// The largest text that is passed on.
 const LARGEST: usize = 4 << 20;
-/// The chart's limit of the controller's memory, in KiB.
+/// Half of the chart's limit of the controller's memory, in KiB.
 const LIMIT_KIB: u64 = 128 << 10;
 const METADATA: &str = "evalai/metadata.json";
 
@@ -141,6 +143,63 @@ async fn a_row_that_its_participant_has_filled_takes_no_memory_and_holds_nobody_
     let is_known = |s: &SubmissionStatus| is_accepted(s) || is_unread(s);
     world.until(&name, "its row was asked for", is_known).await;
     let most = controller.most_memory();
+    assert!(
+        most < LIMIT_KIB,
+        "{most} KiB, more than the chart allows; {}",
+        controller.log()
+    );
+}
+
+#[tokio::test(flavor = "multi_thread", worker_threads = 2)]
+async fn two_uploaded_files_at_once_are_copied_within_the_charts_limit_of_memory() {
+    two_uploads(96 << 20).await;
+}
+
+/// 1 GiB each, the default bound of an input. `make measure-uploads`.
+#[tokio::test(flavor = "multi_thread", worker_threads = 2)]
+#[ignore = "it takes 6 GiB of memory for the stand-ins, and minutes"]
+async fn two_uploaded_files_of_a_gibibyte_at_once_are_copied_within_the_charts_limit_of_memory() {
+    two_uploads(1 << 30).await;
+}
+
+async fn two_uploads(bytes: usize) {
+    let world = World::new().await;
+    world.evalai.with_state(|state| {
+        state.seed.challenges[0].is_docker_based = false;
+    });
+    let spec = by_container(&json!({
+        "evaluation": {"container": {"mode": "Predictions"}},
+        "tracks": [{"name": "test", "phase": 1, "container": {"score": {"metric": "Driving score"}}}],
+    }));
+    world.leaderboard_with("lb", 1, "Hosts", &spec).await;
+    let controller = Program::start("controller", "controller-0", &world.namespace).await;
+    let before = controller.most_memory();
+    let began = Instant::now();
+    let mut all = Vec::new();
+    for fill in [1, 2] {
+        let pk = world.upload(1, vec![fill; bytes]);
+        all.push((world.object("lb", 1, pk, &Value::Null).await, fill));
+    }
+    for (name, fill) in all {
+        let is_copied = |s: &SubmissionStatus| s.input.is_some() && s.job_name.is_some();
+        world
+            .until(&name, "its file is copied and its Job made", is_copied)
+            .await;
+        let status = world.api::<Submission>().get(&name).await.unwrap().status.unwrap();
+        let expected = SubmittedFile {
+            sha256: hex::encode(Sha256::digest(vec![fill; bytes])),
+            size: i64::try_from(bytes).unwrap(),
+        };
+        assert_eq!(status.input, Some(expected), "{name}");
+    }
+    let most = controller.most_memory();
+    println!(
+        "two files of {} MiB in {:.1} s: at most {} MiB, {} MiB before",
+        bytes >> 20,
+        began.elapsed().as_secs_f64(),
+        most >> 10,
+        before >> 10
+    );
     assert!(
         most < LIMIT_KIB,
         "{most} KiB, more than the chart allows; {}",
