@@ -7,8 +7,7 @@ use k8s_openapi::apimachinery::pkg::apis::meta::v1::Time;
 
 use super::refusal::Refusal;
 use super::standings::{self, Named, Results};
-use super::view::{Claims, EvalaiStanding, Policy, Unreachable};
-use crate::submissions::previous_controller;
+use super::view::{Claims, EvalaiStanding, Policy, Unreachable, previous_controller};
 use leaderboard_api::conditions::{self, Truth};
 use leaderboard_api::leaderboard::Counts;
 use leaderboard_api::{

@@ -1,5 +1,7 @@
 //! How the things stand that a Leaderboard names, as `decide` sees them.
 
+use jiff::Timestamp;
+
 use leaderboard_api::Reason;
 use leaderboard_api::conditions::Truth;
 
@@ -53,6 +55,15 @@ pub enum EvalaiStanding {
         /// Something to be shown although it works, such as a token that ends soon.
         note: Option<String>,
     },
+}
+
+/// Why nothing is written to EvalAI for a moment. A request of a controller that ended without an answer may still be worked on.
+pub(crate) fn previous_controller(until: Timestamp) -> String {
+    format!(
+        "Nothing is written to EvalAI before {} UTC: the previous controller did not confirm its last requests, and they may \
+         still be running. Nothing to do.",
+        until.strftime("%H:%M:%S")
+    )
 }
 
 /// How the policy of a Leaderboard stands.

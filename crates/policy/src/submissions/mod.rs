@@ -41,7 +41,6 @@ use crate::view::{JobView, ObservedJob, Stage, View};
 use gates::Gate;
 use leaderboard_api::{JOB_SECONDS, LeaderboardSpec, Reason};
 pub use plan::{Action, EvalaiUpdate, Event, Plan, Question, SlotUse, StatusWrite, TableUpdate, job_name};
-pub use publish::previous_controller;
 pub use run::pinned;
 pub use run::{awaits_publication, patience};
 use status::PlanBuilder;

@@ -13,6 +13,7 @@ use super::run::{self, Reading};
 use super::status::PlanBuilder;
 use super::waits::{Wait, after};
 use super::{gates, leave, logs, stop};
+use crate::leaderboards::view::previous_controller;
 use crate::view::{EvalaiEnd, EvalaiView, ObservedLog};
 use leaderboard_api::conditions::{self, Truth};
 use leaderboard_api::evalai_status::Status;
@@ -232,15 +233,6 @@ fn is_of_another_phase(draft: &PlanBuilder<'_>) -> bool {
     let accepted = draft.status.condition(conditions::ACCEPTED);
     let differs = accepted.is_some_and(|c| c.reason == Reason::PhaseDiffers);
     differs && draft.status.plan.is_none() && draft.status.state_of_conditions() == State::Cancelled
-}
-
-/// Why nothing is written to EvalAI for a moment. A request of a controller that ended without an answer may still be worked on.
-pub fn previous_controller(until: Timestamp) -> String {
-    format!(
-        "Nothing is written to EvalAI before {} UTC: the previous controller did not confirm its last requests, and they may \
-         still be running. Nothing to do.",
-        until.strftime("%H:%M:%S")
-    )
 }
 
 /// The message for an end that cannot be read. The first text stands: another one for the same would be a write each time.
