@@ -53,15 +53,23 @@ struct Shared<Q: Ask> {
 }
 
 impl<Q: Ask> Asker<Q> {
-    /// Starts the task that asks.
-    pub fn start<F>(name: &'static str, tasks: &Tasks, wake: Wake, ask: impl Fn(Asked<Q>) -> F + Send + 'static) -> Self
+    /// Starts the task that asks. Each read gets a clone of `uses`.
+    pub fn start<U, F>(
+        name: &'static str,
+        tasks: &Tasks,
+        wake: Wake,
+        uses: U,
+        ask: impl Fn(U, Asked<Q>) -> F + Send + 'static,
+    ) -> Self
     where
+        U: Clone + Send + 'static,
         F: Future<Output = Result<Q::Answer, Failure>> + Send + 'static,
     {
         let shared = Arc::new(Shared {
             state: Mutex::default(),
             notify: Notify::new(),
         });
+        let ask = move |asked| ask(uses.clone(), asked);
         tasks.until_stop(name, answer_all(Arc::clone(&shared), wake, ask));
         Self(shared)
     }

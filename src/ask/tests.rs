@@ -83,7 +83,7 @@ impl World {
         let (woken, wakes) = mpsc::unbounded_channel();
         let wake = Box::new(move |object: &ObjectKey| woken.send(object.name.clone()).unwrap());
         let (began, noted) = (Instant::now(), Arc::clone(&sent));
-        let ask = move |Asked { question, about, .. }: Asked<Question>| {
+        let ask = move |(), Asked { question, about, .. }: Asked<Question>| {
             let second = began.elapsed().as_secs();
             lock(&noted).push((about.uid, question.number, second));
             async move {
@@ -95,7 +95,7 @@ impl World {
             }
         };
         let (stop, signal) = Stop::new();
-        let asker = Asker::start("test", &Tasks::new(signal), wake, ask);
+        let asker = Asker::start("test", &Tasks::new(signal), wake, (), ask);
         Self {
             _stop: stop,
             asker,

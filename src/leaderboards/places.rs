@@ -6,6 +6,7 @@ use std::fmt::Display;
 use std::sync::Arc;
 
 use super::reach::{AwsResource, Place, Seen};
+use crate::ask::Asked;
 use crate::runtime::objects::key_of;
 use leaderboard_api as api;
 use leaderboard_api::Leaderboard;
@@ -58,7 +59,8 @@ pub(super) fn named(leaderboard: &Arc<Leaderboard>) -> Vec<Place> {
 }
 
 /// Asks for one place.
-pub(super) async fn ask(aws: &Aws, place: &Place) -> Result<Seen, Failure> {
+pub(super) async fn ask(aws: Aws, asked: Asked<Place>) -> Result<Seen, Failure> {
+    let (aws, place) = (&aws, &asked.question);
     let spec = &place.leaderboard.spec;
     let answer = match (place.resource, spec.dynamo_table(), spec.sqs(), spec.log_group()) {
         (AwsResource::Table, Some(table), ..) => of_table(Table::describe(aws, table).await),

@@ -13,7 +13,7 @@ use super::places;
 use super::reach::{AwsResource, Place, Reach};
 use super::token::of_entry;
 use super::tried_pods::{self, Pods, TriedPods};
-use crate::ask::{Asker, Wake};
+use crate::ask::{Asked, Asker, Wake};
 use crate::kubernetes::call;
 use crate::metrics::leader::{self, Gauge};
 use crate::runtime::objects::key_of;
@@ -71,32 +71,15 @@ pub struct Asks {
 impl Asks {
     /// Starts the tasks. Each task calls its own result of `wake` with each Leaderboard that has news.
     pub fn start(client: &Client, aws: &Aws, settings: &Settings, tasks: &Tasks, wake: impl Fn() -> Wake) -> Self {
-        let place = |(resource, task)| {
-            let aws = aws.clone();
-            let asker = Asker::start(task, tasks, wake(), move |asked| {
-                let aws = aws.clone();
-                async move { places::ask(&aws, &asked.question).await }
-            });
+        let places = AwsResource::ALL.into_iter().map(|(resource, task)| {
+            let asker = Asker::start(task, tasks, wake(), aws.clone(), places::ask);
             (resource, asker)
-        };
-        let (reader, secrets) = (client.clone(), aws.clone());
-        let token = Asker::start("ask tokens", tasks, wake(), move |asked| {
-            let (client, aws) = (reader.clone(), secrets.clone());
-            async move {
-                let TokenQuestion { place, .. } = &asked.question;
-                let read = read_token(&client, &aws, &asked.about.namespace, place).await;
-                read.map_err(|why| Failure { is_refused: true, why })
-            }
         });
-        let (client, settings) = (client.clone(), settings.clone());
-        let pods = Asker::start("try Pods", tasks, wake(), move |asked| {
-            let (client, settings) = (client.clone(), settings.clone());
-            async move { Ok(tried_pods::try_pods(&client, &settings, &asked).await) }
-        });
+        let (secrets, trying) = ((client.clone(), aws.clone()), (client.clone(), settings.clone()));
         Self {
-            token,
-            pods,
-            places: AwsResource::ALL.into_iter().map(place).collect(),
+            token: Asker::start("ask tokens", tasks, wake(), secrets, read_token),
+            pods: Asker::start("try Pods", tasks, wake(), trying, tried_pods::try_pods),
+            places: places.collect(),
         }
     }
 
@@ -234,7 +217,15 @@ fn unanswered<Q: Ask>(lookup: &Lookup<Q>) -> Option<Duration> {
     asked.and(lookup.waited)
 }
 
-async fn read_token(client: &Client, aws: &Aws, namespace: &str, place: &TokenPlace) -> Result<Arc<Token>, String> {
+async fn read_token(
+    (client, aws): (Client, Aws),
+    Asked { about, question, .. }: Asked<TokenQuestion>,
+) -> Result<Arc<Token>, Failure> {
+    let read = token_of(&client, &aws, &about.namespace, &question.place).await;
+    read.map(Arc::new).map_err(|why| Failure { is_refused: true, why })
+}
+
+async fn token_of(client: &Client, aws: &Aws, namespace: &str, place: &TokenPlace) -> Result<Token, String> {
     let token = match (&place.secret_key_ref, &place.secrets_manager) {
         (Some(key), _) => {
             let api: Api<Secret> = Api::namespaced(client.clone(), namespace);
@@ -250,7 +241,7 @@ async fn read_token(client: &Client, aws: &Aws, namespace: &str, place: &TokenPl
         (None, Some(entry)) => of_entry(aws, entry).await,
         (None, None) => return Err("evalai.token names no place".into()),
     };
-    token.map(Arc::new).map_err(|error| error.to_string())
+    token.map_err(|error| error.to_string())
 }
 
 #[cfg(test)]

@@ -75,23 +75,23 @@ pub(super) struct TriedPods {
 }
 
 /// Tries whether Pods of this Leaderboard would be refused, and what is to be noted. Puts the template of their claims in place.
-pub(super) async fn try_pods(client: &Client, settings: &Settings, asked: &Asked<Pods>) -> TriedPods {
+pub(super) async fn try_pods((client, settings): (Client, Settings), asked: Asked<Pods>) -> Result<TriedPods, Failure> {
     let leaderboard = asked.question.0.as_ref();
-    let tried = try_templates(client, settings, leaderboard).await;
-    let claims = claims::keep(client, leaderboard).await;
+    let tried = try_templates(&client, &settings, leaderboard).await;
+    let claims = claims::keep(&client, leaderboard).await;
     // Right after an edit a Job of the spec before may be on its way.
     let is_edited = asked.last.as_ref().is_none_or(|last| last.question != asked.question);
     if !is_edited
         && claims == Claims::InPlace
-        && let Err(error) = claims::remove_others(client, leaderboard).await
+        && let Err(error) = claims::remove_others(&client, leaderboard).await
     {
         tracing::warn!(leaderboard = %key_of(leaderboard), %error, "old ResourceClaimTemplates are not removed");
     }
-    TriedPods {
+    Ok(TriedPods {
         may_change: tried.may_change || claims != Claims::NotRequired,
         claims,
         ..tried
-    }
+    })
 }
 
 /// The verdict of our own rules and of the API server on its Pods.

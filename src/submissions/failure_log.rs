@@ -14,13 +14,12 @@ use kube::api::LogParams;
 use kube::{Api, Client};
 
 use super::reports::RunFiles;
-use crate::ask::{Asked, Asker, Wake};
+use crate::ask::Asked;
 use leaderboard_api::client_errors;
 use leaderboard_api::names::FAILURE_LOG_KEY;
 use leaderboard_api::{Attempt, JobNumber, names};
 use leaderboard_aws::archive::Archive;
 use leaderboard_aws::clients::Aws;
-use leaderboard_base::tasks::Tasks;
 use leaderboard_policy::ask::{Ask, Failure, Lookup, Service};
 use leaderboard_policy::view::{LogAt, LogPlace, ObservedLog};
 
@@ -61,15 +60,6 @@ impl Ask for FailureLog {
     fn again(&self, _result: &Result<LogAnswer, Failure>, _failures: u32, _waited: Duration) -> Option<Duration> {
         None
     }
-}
-
-/// Starts the task that looks for logs and stores them.
-pub fn start(client: &Client, aws: &Aws, tasks: &Tasks, wake: Wake) -> Asker<FailureLog> {
-    let (client, aws) = (client.clone(), aws.clone());
-    Asker::start("failure logs", tasks, wake, move |asked| {
-        let (client, aws) = (client.clone(), aws.clone());
-        async move { Ok(keep(&client, &aws, &asked).await) }
-    })
 }
 
 /// The state of the log of a Job. `is_over`: the log at the end of the submission.
@@ -136,15 +126,15 @@ pub struct LogAnswer {
 }
 
 /// Keeps the tail of the first log that is there. Stores it once the submission has come to its end.
-async fn keep(client: &Client, aws: &Aws, asked: &Asked<FailureLog>) -> LogAnswer {
+pub async fn keep((client, aws): (Client, Aws), asked: Asked<FailureLog>) -> Result<LogAnswer, Failure> {
     let question = &asked.question;
-    let archive = question.files.archive(aws);
+    let archive = question.files.archive(&aws);
     let known = asked.last.as_ref().filter(|last| last.question.job == question.job);
     let found = known.and_then(|last| last.result.as_ref().as_ref().ok());
     let mut tail = found.and_then(|found| found.tail.clone());
     let is_done = known.is_some_and(|last| last.question.is_over == question.is_over);
     if let Some(found) = found.filter(|found| is_done && found.tail.is_some()) {
-        return found.clone();
+        return Ok(found.clone());
     }
     let mut is_unclear = true;
     for attempt in 0..TRIES {
@@ -153,7 +143,7 @@ async fn keep(client: &Client, aws: &Aws, asked: &Asked<FailureLog>) -> LogAnswe
         }
         (tail, is_unclear) = match tail {
             Some(tail) => (Some(tail), false),
-            None => look(client, &archive, &asked.about.namespace, question).await,
+            None => look(&client, &archive, &asked.about.namespace, question).await,
         };
         if let Some(tail) = tail.as_ref().filter(|_| question.is_over) {
             is_unclear |= !store(&archive, tail).await;
@@ -162,7 +152,7 @@ async fn keep(client: &Client, aws: &Aws, asked: &Asked<FailureLog>) -> LogAnswe
             break;
         }
     }
-    LogAnswer { tail, is_unclear }
+    Ok(LogAnswer { tail, is_unclear })
 }
 
 /// The first log that is there, or else whether one that may have it did not answer.

@@ -4,10 +4,9 @@ use std::sync::Arc;
 use std::time::Duration;
 
 use super::reports::{RunFiles, silent};
-use crate::ask::{Asked, Asker, Wake};
+use crate::ask::Asked;
 use leaderboard_api::JobNumber;
 use leaderboard_aws::clients::Aws;
-use leaderboard_base::tasks::Tasks;
 use leaderboard_contract::report::{OWNER_KEY, Owner};
 use leaderboard_policy::ask::{Ask, Failure, Lookup, Service};
 use leaderboard_policy::view::ObservedFence;
@@ -40,18 +39,10 @@ impl Ask for Fence {
     }
 }
 
-/// Starts the task that writes.
-pub fn start(aws: &Aws, tasks: &Tasks, wake: Wake) -> Asker<Fence> {
-    let aws = aws.clone();
-    Asker::start("fences", tasks, wake, move |asked| {
-        let aws = aws.clone();
-        async move { write(&aws, &asked).await }
-    })
-}
-
-async fn write(aws: &Aws, asked: &Asked<Fence>) -> Result<(), Failure> {
+/// Writes it.
+pub async fn write(aws: Aws, asked: Asked<Fence>) -> Result<(), Failure> {
     let Fence { mark, files, .. } = &asked.question;
-    let archive = files.archive(aws);
+    let archive = files.archive(&aws);
     let put = archive.put(OWNER_KEY, Owner::new(mark).to_json());
     let written = match tokio::time::timeout(TRIES.saturating_sub(asked.waited), put).await {
         Ok(written) => written.map(|_| ()).map_err(|error| silent(&error)),

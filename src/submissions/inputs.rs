@@ -7,10 +7,9 @@ use hyper::body::Bytes;
 use tokio::time::{Instant, timeout_at};
 
 use super::reports::silent;
-use crate::ask::{Asked, Asker, Wake};
+use crate::ask::Asked;
 use leaderboard_aws::archive::{Archive, StreamError};
 use leaderboard_aws::clients::Aws;
-use leaderboard_base::tasks::Tasks;
 use leaderboard_contract::keys::INPUT_FILE;
 use leaderboard_evalai::{Hub, InputError, InputStream};
 use leaderboard_policy::ask::Failure;
@@ -34,20 +33,14 @@ impl From<InputError> for Unread {
     }
 }
 
-/// Starts the task that copies.
-pub fn start(aws: &Aws, hub: &Hub, tasks: &Tasks, wake: Wake) -> Asker<Input> {
-    let (aws, hub) = (aws.clone(), hub.clone());
-    Asker::start("inputs", tasks, wake, move |asked| {
-        let (aws, hub) = (aws.clone(), hub.clone());
-        async move {
-            let fetched = fetch(&aws, &hub, &asked).await;
-            match &fetched {
-                Ok(fetched) => tracing::info!(%fetched, "the submitted file was asked for"),
-                Err(failure) => tracing::warn!(why = failure.why, "the submitted file was not copied"),
-            }
-            fetched
-        }
-    })
+/// Copies it, and logs the outcome.
+pub async fn copy((aws, hub): (Aws, Hub), asked: Asked<Input>) -> Result<Fetched, Failure> {
+    let fetched = fetch(&aws, &hub, &asked).await;
+    match &fetched {
+        Ok(fetched) => tracing::info!(%fetched, "the submitted file was asked for"),
+        Err(failure) => tracing::warn!(why = failure.why, "the submitted file was not copied"),
+    }
+    fetched
 }
 
 async fn fetch(aws: &Aws, hub: &Hub, asked: &Asked<Input>) -> Result<Fetched, Failure> {

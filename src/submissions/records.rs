@@ -64,21 +64,17 @@ pub fn start(
     tasks: &Tasks,
     wake: Wake,
 ) -> Asker<Record> {
-    let shared = Arc::new((tables, may_write));
-    Asker::start("records", tasks, wake, move |asked| {
-        let shared = Arc::clone(&shared);
-        async move {
-            let (tables, may_write) = shared.as_ref();
-            if !may_write() {
-                return Err(Failure::silent("this process does not lead any more"));
-            }
-            let Record { table, row, .. } = &asked.question;
-            let written = tables.write(table, row).await;
-            written.map_err(|error| {
-                tracing::warn!(%error, "the row is not in the table");
-                failure(&error)
-            })
+    let uses = (tables, Arc::new(may_write));
+    Asker::start("records", tasks, wake, uses, |(tables, may_write), asked| async move {
+        if !may_write() {
+            return Err(Failure::silent("this process does not lead any more"));
         }
+        let Record { table, row, .. } = &asked.question;
+        let written = tables.write(table, row).await;
+        written.map_err(|error| {
+            tracing::warn!(%error, "the row is not in the table");
+            failure(&error)
+        })
     })
 }
 

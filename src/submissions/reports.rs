@@ -7,11 +7,10 @@ use std::time::Duration;
 
 use jiff::Timestamp;
 
-use crate::ask::{Asked, Asker, Wake};
+use crate::ask::Asked;
 use leaderboard_api::{Attempt, JobNumber, RunPlan, S3Bucket, effective};
 use leaderboard_aws::archive::{Archive, ArchiveError, Fetched};
 use leaderboard_aws::clients::Aws;
-use leaderboard_base::tasks::Tasks;
 use leaderboard_contract::report::{MAX_BYTES, REPORT_KEY};
 use leaderboard_policy::ask::{Ask, Failure, Lookup, Rank, Service};
 use leaderboard_policy::report_digest::ReportDigest;
@@ -116,23 +115,15 @@ impl Ask for Report {
     }
 }
 
-/// Starts the task that reads.
-pub fn start(aws: &Aws, tasks: &Tasks, wake: Wake) -> Asker<Report> {
-    let aws = aws.clone();
-    Asker::start("reports", tasks, wake, move |asked| {
-        let aws = aws.clone();
-        async move { read(&aws, &asked).await }
-    })
-}
-
-async fn read(aws: &Aws, asked: &Asked<Report>) -> Result<Stored, Failure> {
+/// Reads it, unless the bucket holds the one that is known.
+pub async fn read(aws: Aws, asked: Asked<Report>) -> Result<Stored, Failure> {
     let known = asked.last.as_ref().and_then(|last| last.result.as_ref().as_ref().ok());
     let etag = match known {
         Some(Stored::Foreign { etag } | Stored::Report { etag, .. }) => etag.as_deref(),
         Some(Stored::Nothing) | None => None,
     };
     let files = &asked.question.files;
-    let archive = files.archive(aws);
+    let archive = files.archive(&aws);
     let object = match archive.get_if_none_match(REPORT_KEY, etag, MAX_BYTES as u64).await {
         Ok(Fetched::NotModified) => return Ok(known.cloned().unwrap_or(Stored::Nothing)),
         Ok(Fetched::Absent) => return Ok(Stored::Nothing),

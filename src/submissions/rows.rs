@@ -3,24 +3,17 @@
 
 use std::sync::Arc;
 
-use crate::ask::{Asker, Wake};
+use crate::ask::Asked;
 use leaderboard_aws::table::{ObservedRow, TableError, Tables};
-use leaderboard_base::tasks::Tasks;
 use leaderboard_policy::ask::Failure;
 use leaderboard_policy::questions::{ForeignRun, Row};
 
 /// Words of the old pipeline's row for a run that has not ended.
 const UNDER_WAY: [&str; 2] = ["SUBMITTED", "RUNNING"];
 
-/// Starts the task that reads.
-pub fn start(tables: Arc<Tables>, tasks: &Tasks, wake: Wake) -> Asker<Row> {
-    Asker::start("rows", tasks, wake, move |asked| {
-        let tables = Arc::clone(&tables);
-        async move { read(&tables, &asked.question).await }
-    })
-}
-
-async fn read(tables: &Tables, row: &Row) -> Result<Option<ForeignRun>, Failure> {
+/// Reads it.
+pub async fn read(tables: Arc<Tables>, asked: Asked<Row>) -> Result<Option<ForeignRun>, Failure> {
+    let row = &asked.question;
     match tables.read(&row.table, &row.team, row.run_id.as_str()).await {
         Ok(found) => Ok(found.and_then(foreign_run)),
         Err(error) => failure(&error).map_or(Ok(None), Err),

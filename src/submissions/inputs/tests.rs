@@ -19,6 +19,7 @@ use leaderboard_base::lock::lock;
 use leaderboard_base::object_key::ObjectKey;
 use leaderboard_base::shutdown::Stop;
 use leaderboard_base::spans::LogSpan;
+use leaderboard_base::tasks::Tasks;
 use leaderboard_evalai::token::Token;
 use leaderboard_evalai::types::Metrics;
 use leaderboard_evalai::{Options, Run, Subject, Target};

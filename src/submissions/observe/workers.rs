@@ -39,12 +39,14 @@ impl Workers {
         tasks: &Tasks,
         wake: impl Fn() -> Wake<Submission>,
     ) -> Self {
+        let wake = || by_key(wake());
+        let (logs, files) = ((client.clone(), aws.clone()), (aws.clone(), hub.clone()));
         Self {
-            reports: reports::start(aws, tasks, by_key(wake())),
-            fences: fences::start(aws, tasks, by_key(wake())),
-            logs: failure_log::start(client, aws, tasks, by_key(wake())),
-            rows: rows::start(tables, tasks, by_key(wake())),
-            inputs: inputs::start(aws, hub, tasks, by_key(wake())),
+            reports: Asker::start("reports", tasks, wake(), aws.clone(), reports::read),
+            fences: Asker::start("fences", tasks, wake(), aws.clone(), fences::write),
+            logs: Asker::start("failure logs", tasks, wake(), logs, failure_log::keep),
+            rows: Asker::start("rows", tasks, wake(), tables, rows::read),
+            inputs: Asker::start("inputs", tasks, wake(), files, inputs::copy),
         }
     }
 
