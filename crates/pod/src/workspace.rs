@@ -231,8 +231,7 @@ async fn claim(run: &Run, archive: &Archive) -> Result<Claim, WorkspaceError> {
     if run.plan.resume || run.attempt > Attempt::FIRST {
         return Ok(Claim::TakeUp);
     }
-    let stored = archive.get(REPORT_KEY, MAX_BYTES as u64).await?;
-    let stored = stored.and_then(|object| Report::parse(&object.bytes).ok());
+    let stored = last_report(archive).await?;
     if stored.is_some_and(|report| report.submission_uid == run.uid) {
         return Ok(Claim::TakeUp);
     }
@@ -249,6 +248,12 @@ async fn claim(run: &Run, archive: &Archive) -> Result<Claim, WorkspaceError> {
         return Ok(Claim::Fresh(there.into_iter().filter(is_of_nobody).collect()));
     }
     Err(WorkspaceError::PrefixInUse(place(run, "")))
+}
+
+/// The report that was stored last; `None` if there is none that can be read.
+async fn last_report(archive: &Archive) -> Result<Option<Report>, ArchiveError> {
+    let stored = archive.get(REPORT_KEY, MAX_BYTES as u64).await?;
+    Ok(stored.and_then(|object| Report::parse(&object.bytes).ok()))
 }
 
 /// True if the evaluators read what a submission brings.

@@ -1,6 +1,6 @@
 //! The Pod of a host's own evaluators: what it stores, reports and takes up.
 
-use leaderboard_contract::report::Outcome;
+use leaderboard_contract::report::{Outcome, RefusedResults};
 use leaderboard_evaluation::fixtures::{container_run, put_result, result};
 
 use super::*;
@@ -104,6 +104,56 @@ async fn a_replaced_pod_gives_each_evaluator_its_own_files_back() {
     assert_eq!(read("evaluators/1/result.json"), good.as_bytes());
     assert_eq!(read("evaluators/2/episodes/1.json"), b"{}");
     assert!(!next.path("escaped").exists());
+}
+
+#[tokio::test]
+async fn only_where_results_were_refused_a_new_attempt_goes_on_without_the_final_ones() {
+    let first = evaluated().await.report().await.unwrap();
+    let ended = Report {
+        is_final: true,
+        unusable: Some(RefusedResults::new(Some(2), "torn")),
+        ..first.clone()
+    };
+    let by_participant = Report {
+        refused: ended.unusable.clone(),
+        unusable: None,
+        ..ended.clone()
+    };
+    let stopped = Report {
+        stopped: Some(Stop::Interruption),
+        ..ended.clone()
+    };
+    let lost = Report {
+        is_final: false,
+        ..by_participant.clone()
+    };
+    for (what, attempt, report, is_kept) in [
+        ("unusable", 2, &ended, false),
+        ("refused", 2, &by_participant, false),
+        ("another Job of the attempt", 1, &ended, true),
+        ("a stop", 2, &stopped, true),
+        ("a lost node", 2, &lost, true),
+        ("a lost node at the beginning", 2, &first, true),
+    ] {
+        let before = evaluated().await;
+        for (key, bytes) in [
+            ("evaluators/1/result.json", result(2, 2, 0.5).into_bytes()),
+            ("evaluators/1/games.json", b"{}".to_vec()),
+            ("evaluators/2/result.json", result(1, 2, 0.5).into_bytes()),
+            (REPORT_KEY, serde_json::to_vec(report).unwrap()),
+        ] {
+            before.archive.put(key, bytes).await.unwrap();
+        }
+        let mut next = before.replaced("pod-2").await;
+        next.setting.run.attempt = Attempt(attempt);
+        next.prepare().await.unwrap();
+        let path = "evaluators/1/result.json";
+        assert_eq!(next.path(path).exists(), is_kept, "{what}");
+        assert_eq!(next.stored(path).await.is_some(), is_kept, "{what}");
+        for other in ["evaluators/1/games.json", "evaluators/2/result.json"] {
+            assert!(next.path(other).exists(), "{what}: {other}");
+        }
+    }
 }
 
 #[tokio::test]

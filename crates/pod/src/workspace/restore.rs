@@ -11,15 +11,16 @@ use std::sync::Arc;
 
 use futures::{StreamExt, TryStreamExt};
 
-use super::{WorkspaceError, input};
+use super::{WorkspaceError, input, last_report};
 use crate::blocking;
 use crate::daily::Daily;
 use crate::upload::quota::{LEAST, Quota};
 use crate::upload::{Memory, Stored, fingerprint};
+use leaderboard_api::evaluator_result::{MAX_BYTES, parse};
 use leaderboard_api::names::FAILURE_LOG_KEY;
-use leaderboard_aws::archive::{Archive, Listed};
-use leaderboard_contract::keys::{EVALAI, EVALUATORS, MERGED, REFUSED, SUBMISSION_FOLDER, checkpoint_path};
-use leaderboard_contract::report::{OWNER_KEY, REPORT_KEY};
+use leaderboard_aws::archive::{Archive, ArchiveError, Listed};
+use leaderboard_contract::keys::{EVALAI, EVALUATORS, MERGED, REFUSED, SUBMISSION_FOLDER, checkpoint_path, result_path};
+use leaderboard_contract::report::{OWNER_KEY, REPORT_KEY, Report};
 use leaderboard_contract::run::{Run, STATUS_FOLDER};
 use leaderboard_evaluation::{Results, of_plan};
 use leaderboard_evidence::{Stamp, Tree, TreeError, is_plain};
@@ -50,6 +51,7 @@ pub async fn restore(
 ) -> Result<Restored, WorkspaceError> {
     let statuses = archive.list(&format!("{STATUS_FOLDER}/"), MAX_OBJECTS).await?;
     remove(archive, statuses.objects).await?;
+    remove_refused(run, archive).await?;
 
     let listing = archive.list("", MAX_OBJECTS).await?;
     if !listing.complete {
@@ -96,6 +98,28 @@ pub async fn restore(
 pub(super) async fn remove(archive: &Archive, objects: Vec<Listed>) -> Result<(), WorkspaceError> {
     let keys: Vec<String> = objects.into_iter().map(|object| object.key).collect();
     Ok(archive.delete(&keys).await?)
+}
+
+/// Removes the final results of evaluators where an attempt before this one has ended because of its results: an evaluator does not start
+/// beside a final one, so a corrected one would judge nothing.
+async fn remove_refused(run: &Run, archive: &Archive) -> Result<(), ArchiveError> {
+    let is_refused = |report: Report| {
+        let by_results = report.refused.is_some() || report.unusable.is_some();
+        let is_own = report.belongs_to(&run.uid, run.attempt);
+        by_results && report.is_final && report.stopped.is_none() && !is_own
+    };
+    if run.plan.container().is_none() || !last_report(archive).await?.is_some_and(is_refused) {
+        return Ok(());
+    }
+    let mut finals = Vec::new();
+    for path in Pair::first(run.plan.workers()).map(result_path) {
+        let stored = archive.get(&path, MAX_BYTES as u64).await?;
+        let found = stored.and_then(|object| parse(&object.bytes).ok());
+        if found.is_some_and(|result| result.is_final) {
+            finals.push(path);
+        }
+    }
+    archive.delete(&finals).await
 }
 
 /// Objects whose content is not known.
