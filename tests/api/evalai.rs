@@ -351,7 +351,7 @@ async fn a_submission_lives_through_all_of_it() {
     world.update(pk, DesiredUpdate::Running);
     world.until(pk, |view| view.progress == Some(Progress::Running)).await;
     world.update(pk, DesiredUpdate::Partial(results(&world.target, 41.0)));
-    world.until(pk, |view| view.partial_at.is_some()).await;
+    world.until(pk, |view| view.partial_done.is_some()).await;
     assert_eq!(world.stored(pk), Stored::PartiallyEvaluated);
     world.finish(pk);
     assert!(matches!(
@@ -383,7 +383,7 @@ async fn a_submission_that_was_deleted_while_it_ran_is_noticed_and_cancelled() {
     let pk = world.submit();
     world.live(pk);
     world.update(pk, DesiredUpdate::Partial(results(&world.target, 41.0)));
-    world.until(pk, |view| view.partial_at.is_some()).await;
+    world.until(pk, |view| view.partial_done.is_some()).await;
     world.delete(pk);
     let view = world.until(pk, |view| view.ended.is_some()).await;
     assert_eq!((view.ended, view.overtaken), (Some(Status::Deleted), true));

@@ -221,16 +221,12 @@ pub struct SubmissionState {
     pub overtaken: bool,
     /// Outcome of the update to an end.
     pub end: Option<Ended>,
-    /// When partial results were last taken.
-    pub partial_at: Option<Timestamp>,
     /// Units of work in the partial results that were last answered.
     pub partial_done: Option<u32>,
     /// Why what the bucket holds of an end cannot be read.
     pub unread: Option<String>,
     /// The last error; none after the next success.
     pub last_error: Option<String>,
-    /// Nothing is written until then, because a write was not answered.
-    pub unanswered_until: Option<Timestamp>,
 }
 
 /// Image that the uploaded file names, or why it names none.

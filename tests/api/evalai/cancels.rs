@@ -55,7 +55,7 @@ async fn cancels_between_a_list_and_a_write_are_found_by_the_read_of_that_write(
         };
         world.update(pk, update);
         let view = world.until(pk, |view| {
-            view.ended.is_some() || view.progress.is_some() || view.partial_at.is_some()
+            view.ended.is_some() || view.progress.is_some() || view.partial_done.is_some()
         });
         let view = view.await;
         assert_eq!(

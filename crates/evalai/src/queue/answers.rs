@@ -5,8 +5,6 @@
 use std::sync::Arc;
 use std::time::Duration;
 
-use jiff::SignedDuration;
-
 use super::poll::pause;
 use super::sub::{RETRY_END, Sub};
 use super::{Busy, Now, Queue, Ticket};
@@ -114,14 +112,8 @@ impl Queue {
         if lane.unsure && requested >= lane.hold_until {
             lane.unsure = false;
         }
-        let sure = !lane.unsure;
-        lane.checked = (for_write && sure).then_some(now.at);
-        self.spread(&Arc::new(row), requested, now, |sub| {
-            if sure {
-                sub.view.unanswered_until = None;
-            }
-            sub.read_done();
-        });
+        lane.checked = (for_write && !lane.unsure).then_some(now.at);
+        self.spread(&Arc::new(row), requested, now, Sub::read_done);
     }
 
     /// EvalAI does not have it, which is to be confirmed.
@@ -141,9 +133,9 @@ impl Queue {
         let calm = lane.is_none_or(|lane| lane.busy != Some(Busy::Write) && !lane.unsure);
         for key in self.pks.get(&row.id).cloned().unwrap_or_default() {
             let Some(sub) = self.subs.get_mut(&key) else { continue };
-            let before = (sub.view.last_error.clone(), sub.view.unanswered_until);
+            let before = sub.view.last_error.clone();
             also(sub);
-            let mut changed = before != (sub.view.last_error.clone(), sub.view.unanswered_until);
+            let mut changed = before != sub.view.last_error;
             changed |= sub.take_row(row, requested, calm, now);
             if changed {
                 self.changes.insert(Changed::Submission(key));
@@ -230,16 +222,11 @@ impl Queue {
                 sub.write_failed(silence.why, pause(sub.write_failures), now);
             });
         }
-        let hold = self.timing.hold;
         let lane = self.lanes.entry(subject.pk).or_default();
-        lane.hold_until = now.at + hold;
+        lane.hold_until = now.at + self.timing.hold;
         lane.unsure = true;
-        let until = SignedDuration::try_from(hold)
-            .ok()
-            .and_then(|hold| now.wall.checked_add(hold).ok());
         self.change(subject, |sub| {
             (sub.outdated, sub.wrote_at) = (true, now.at);
-            sub.view.unanswered_until = until;
             sub.view.last_error = Some(silence.why);
         });
     }
@@ -283,7 +270,6 @@ fn done(sub: &mut Sub, request: &Request, sent: Option<&Arc<Outline>>, now: &Now
         }
         Request::Partial(..) => {
             sub.wrote(Status::PartiallyEvaluated, now);
-            sub.view.partial_at = Some(now.wall);
             drop_partial(sub, request, sent);
         }
         Request::Final(_, outcome, _) => {

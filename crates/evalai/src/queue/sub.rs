@@ -119,7 +119,6 @@ impl Sub {
                 answered: old.answered,
                 // A file that named no image is read once more for each attempt.
                 image: old.image.filter(|image| matches!(image, ImageAnswer::Named(_))),
-                unanswered_until: old.unanswered_until,
                 ..fresh.view.clone()
             },
             ..fresh
