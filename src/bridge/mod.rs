@@ -15,9 +15,8 @@ use kube::runtime::watcher::Config;
 pub use crate::intake::leaderboards::Scope;
 use crate::intake::pollers::follow;
 use crate::intake::shared::{Problems, Shared};
-use crate::kubernetes::{Clients, Shape, recorder, spawn_watch};
+use crate::kubernetes::{Clients, recorder, spawn_watch};
 use crate::observability::Observability;
-use leaderboard_api::Leaderboard;
 use leaderboard_aws::clients::Aws;
 use leaderboard_base::tasks::TaskFailed;
 use leaderboard_policy::intake::route;
@@ -25,13 +24,8 @@ use sqs::{Connection, Pulse, SqsQueue, desired};
 
 fn shared(clients: Clients, scope: Scope, telemetry: Observability) -> Shared {
     let apis = scope.namespaces.apis(&clients.watch);
-    // The status changes often and means nothing here.
-    let shape = Shape {
-        trim: |leaderboard: &mut Leaderboard| leaderboard.status = None,
-        ..Shape::default()
-    };
     Shared {
-        leaderboards: spawn_watch(apis, Config::default(), shape, &telemetry),
+        leaderboards: spawn_watch(apis, Config::default(), |_| None, &telemetry),
         recorder: recorder(&clients.api, "bridge"),
         client: clients.api,
         scope,

@@ -53,6 +53,14 @@ impl Malformed {
     pub(super) fn key(&self) -> Box<str> {
         store::key(self.namespace.as_deref(), &self.name)
     }
+
+    /// Logs that it is left out of a watch.
+    pub(super) fn log(&self, watch: &str) {
+        let Self {
+            namespace, name, error, ..
+        } = self;
+        tracing::error!(watch, namespace, name, error, "skipped an object that can't be read");
+    }
 }
 
 /// An object as a list or a watch has it.

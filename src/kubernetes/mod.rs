@@ -30,7 +30,7 @@ pub use namespaces::Namespaces;
 pub use recorder::recorder;
 pub use store::{Index, Store};
 pub use uncached::spawn_uncached;
-pub use watch::{Shape, Synced, Unreadable, Watch, spawn_watch};
+pub use watch::{Synced, Watch, spawn_watch};
 pub use write::{Writer, Writes, Written};
 
 /// Longer than a watch may be silent: the server ends each after 290 s.

@@ -1,13 +1,10 @@
 //! One API of a watch: its events, its list under way, and how it stands. Used by `watch` alone.
 
-use std::collections::{BTreeSet, HashSet};
+use std::collections::HashSet;
 use std::pin::Pin;
-use std::sync::Arc;
 use std::time::Duration;
 
-use futures::future::ready;
-use futures::stream::{self, SelectAll};
-use futures::{Stream, StreamExt};
+use futures::{Stream, StreamExt, stream};
 use kube::Api;
 use kube::runtime::watcher::{Config, Error, Event};
 use kube::runtime::{WatchStreamExt, watcher};
@@ -20,22 +17,23 @@ use crate::observability::liveness::WatchProbe;
 const REFUSED_AGAIN: Duration = Duration::from_secs(10);
 
 /// How one API of a watch stands.
-pub(super) struct Source<K> {
+pub(super) struct Source {
     /// Its namespace, where it is one of several.
     namespace: Option<Box<str>>,
     pub probe: WatchProbe,
-    pub list: Listing<K>,
+    /// Keys that the list under way has shown. Its objects are cached at once, so that no second cache is needed.
+    pub shown: HashSet<Box<str>>,
     /// It has listed and was not refused since.
     pub is_synced: bool,
     pub has_listed: bool,
 }
 
-impl<K> Source<K> {
+impl Source {
     pub(super) fn new(namespace: Option<&str>, probe: WatchProbe) -> Self {
         Self {
             namespace: namespace.map(Into::into),
             probe,
-            list: Listing::default(),
+            shown: HashSet::new(),
             is_synced: false,
             has_listed: false,
         }
@@ -61,57 +59,17 @@ impl<K> Source<K> {
     }
 }
 
-/// A list under way. Its objects are cached at once, so that no second cache is needed. They become events once the list is complete.
-pub(super) struct Listing<K> {
-    /// Names that this list has shown.
-    pub shown: HashSet<Box<str>>,
-    /// Names that it has shown and that cannot be read.
-    pub unreadable: BTreeSet<Box<str>>,
-    /// Names that have changed since the last list that was complete.
-    pub changed: HashSet<Box<str>>,
-    /// Objects that another one of their name has replaced meanwhile.
-    pub replaced: Vec<Arc<K>>,
-}
-
-impl<K> Default for Listing<K> {
-    fn default() -> Self {
-        Self {
-            shown: HashSet::new(),
-            unreadable: BTreeSet::new(),
-            changed: HashSet::new(),
-            replaced: Vec::new(),
-        }
-    }
-}
-
-impl<K> Listing<K> {
-    pub(super) fn begins(&mut self) {
-        self.shown.clear();
-        self.unreadable.clear();
-    }
-
-    /// Notes an unreadable object. It stays as it was last read, because it has not been deleted.
-    pub(super) fn unreadable(&mut self, key: Box<str>) {
-        self.shown.insert(key.clone());
-        self.unreadable.insert(key);
-    }
-}
-
-type Events<K> = Pin<Box<dyn Stream<Item = Result<Event<Item<K>>, Error>> + Send>>;
-/// The number of a source, and what comes of it; None is its end.
-type Numbered<K> = (usize, Option<Result<Event<Item<K>>, Error>>);
-type AllEvents<K> = SelectAll<Pin<Box<dyn Stream<Item = Numbered<K>> + Send>>>;
+/// What comes of one API.
+type News<K> = Result<Event<Item<K>>, Error>;
+type Events<K> = Pin<Box<dyn Stream<Item = News<K>> + Send>>;
 
 /// Events of all APIs, each with its number.
-pub(super) fn all<K: Watchable>(apis: Vec<Api<Item<K>>>, config: &Config) -> AllEvents<K> {
-    stream::select_all(apis.into_iter().enumerate().map(|(number, api)| {
-        let events = lasting(api, config.clone()).map(Some);
-        let numbered = events
-            .chain(stream::once(ready(None)))
-            .map(move |event| (number, event));
-        let numbered: Pin<Box<dyn Stream<Item = Numbered<K>> + Send>> = Box::pin(numbered);
-        numbered
-    }))
+pub(super) fn all<K: Watchable>(
+    apis: Vec<Api<Item<K>>>,
+    config: &Config,
+) -> impl Stream<Item = (usize, News<K>)> + Send + Unpin + use<K> {
+    let apis = apis.into_iter().enumerate();
+    stream::select_all(apis.map(|(number, api)| lasting(api, config.clone()).map(move |event| (number, event))))
 }
 
 /// A list, then what changes; a list again after a refusal, because a watch without news does not show that the right is back.

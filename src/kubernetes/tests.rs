@@ -109,11 +109,12 @@ fn rig(answers: Vec<Answer>) -> Rig {
     let (stop, receiver) = Stop::new();
     let telemetry = Observability::new(receiver);
     telemetry.readiness.registered();
-    let shape = Shape {
-        trim: |board: &mut Leaderboard| board.metadata.annotations = None,
-        ..Shape::default()
-    };
-    let watch = spawn_watch(vec![guarded(client, Some("ns"))], Config::default(), shape, &telemetry);
+    let watch = spawn_watch(
+        vec![guarded(client, Some("ns"))],
+        Config::default(),
+        |_| None,
+        &telemetry,
+    );
     let events = watch.subscribe();
     Rig {
         watch,
@@ -312,7 +313,7 @@ async fn a_watch_on_a_half_open_connection_ends_by_the_read_timeout_and_begins_a
     let watch = spawn_watch::<Leaderboard>(
         vec![guarded(client, Some("ns"))],
         Config::default(),
-        Shape::default(),
+        |_| None,
         &telemetry,
     );
     for _ in 0..2 {

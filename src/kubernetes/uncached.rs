@@ -17,18 +17,7 @@ pub fn spawn_uncached<K: Watchable>(
     apis: Vec<Api<Item<K>>>,
     config: Config,
     telemetry: &Observability,
-    take: impl FnMut(K) + Send + 'static,
-) {
-    let work = hand_on(name, apis, config.page_size(PAGE), telemetry.clone(), take);
-    telemetry.tasks.until_stop(name, work);
-}
-
-async fn hand_on<K: Watchable>(
-    name: &'static str,
-    apis: Vec<Api<Item<K>>>,
-    config: Config,
-    telemetry: Observability,
-    mut take: impl FnMut(K),
+    mut take: impl FnMut(K) + Send + 'static,
 ) {
     let metrics = telemetry.metrics.watch(&K::kind(&()), &telemetry.clock);
     let of_namespace = |api: &Api<Item<K>>| match api.namespace() {
@@ -36,35 +25,31 @@ async fn hand_on<K: Watchable>(
         None => telemetry.liveness.watch(name),
     };
     let probes: Vec<_> = apis.iter().map(of_namespace).collect();
-    let mut events = source::all(apis, &config);
-    // None of them has an end; if one ends all the same, this task ends, and with it the process.
-    while let Some((source, Some(event))) = events.next().await {
-        let probe = &probes[source];
-        match event {
-            Ok(Event::Init) => probe.listing(),
-            Ok(Event::InitDone) => probe.listed(),
-            Ok(Event::Delete(_)) => probe.running(),
-            Ok(Event::InitApply(item) | Event::Apply(item)) => {
-                metrics.event();
-                match item.object {
-                    Ok(object) => take(object),
-                    Err(malformed) => tracing::error!(
-                        watch = name,
-                        namespace = malformed.namespace,
-                        name = malformed.name,
-                        error = malformed.error,
-                        "skipped an object that can't be read"
-                    ),
+    let mut events = source::all(apis, &config.page_size(PAGE));
+    // They have no end; if they end all the same, this task ends, and with it the process.
+    telemetry.tasks.until_stop(name, async move {
+        while let Some((source, event)) = events.next().await {
+            let probe = &probes[source];
+            match event {
+                Ok(Event::Init) => probe.listing(),
+                Ok(Event::InitDone) => probe.listed(),
+                Ok(Event::Delete(_)) => probe.running(),
+                Ok(Event::InitApply(item) | Event::Apply(item)) => {
+                    metrics.event();
+                    match item.object {
+                        Ok(object) => take(object),
+                        Err(malformed) => malformed.log(name),
+                    }
+                }
+                // Without news a watch stays where it was, until the server has forgotten that.
+                Err(error) if source::is_forgotten(&error) => probe.running(),
+                Err(error) => {
+                    metrics.errors.inc();
+                    source::report(probe, &error);
+                    let cause = client_errors::watch(&error);
+                    tracing::warn!(watch = name, error = cause, "a watch has failed and is retried");
                 }
             }
-            // Without news a watch stays where it was, until the server has forgotten that.
-            Err(error) if source::is_forgotten(&error) => probe.running(),
-            Err(error) => {
-                metrics.errors.inc();
-                source::report(probe, &error);
-                let cause = client_errors::watch(&error);
-                tracing::warn!(watch = name, error = cause, "a watch has failed and is retried");
-            }
         }
-    }
+    });
 }

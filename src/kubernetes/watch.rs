@@ -6,7 +6,7 @@
 
 use std::collections::{BTreeSet, HashSet};
 use std::sync::atomic::{AtomicBool, Ordering};
-use std::sync::{Arc, Mutex, MutexGuard};
+use std::sync::{Arc, Mutex};
 
 use futures::StreamExt;
 use kube::Api;
@@ -33,8 +33,8 @@ pub struct Watch<K: Watchable> {
     pub store: Store<K>,
     /// True while the store is in sync with the API server.
     pub synced: Synced,
-    /// Objects that exist and are not in the store, or only as they were before.
-    pub unreadable: Unreadable,
+    /// Objects that exist and are not in the store, or only as they were before, by namespace and name.
+    unreadable: Arc<Mutex<BTreeSet<Box<str>>>>,
     feed: Feed<K>,
 }
 
@@ -54,37 +54,6 @@ impl Synced {
     }
 }
 
-/// The objects that this program can't read now, by namespace and name. Clones are the same.
-#[derive(Clone, Debug, Default)]
-pub struct Unreadable(Arc<Mutex<BTreeSet<Box<str>>>>);
-
-impl Unreadable {
-    /// There is none.
-    pub fn is_empty(&self) -> bool {
-        self.keys().is_empty()
-    }
-
-    fn keys(&self) -> MutexGuard<'_, BTreeSet<Box<str>>> {
-        lock(&self.0)
-    }
-}
-
-/// Shape in which a kind is kept, and how it is found.
-pub struct Shape<K> {
-    /// Drops what is never read, before an object is cached.
-    pub trim: fn(&mut K),
-    pub index: Index<K>,
-}
-
-impl<K> Default for Shape<K> {
-    fn default() -> Self {
-        Self {
-            trim: |_| {},
-            index: |_| None,
-        }
-    }
-}
-
 impl<K: Watchable> Clone for Watch<K> {
     fn clone(&self) -> Self {
         Self {
@@ -99,7 +68,7 @@ impl<K: Watchable> Clone for Watch<K> {
 impl<K: Watchable> Watch<K> {
     /// True if the store holds every object, each as it is.
     pub fn is_complete(&self) -> bool {
-        self.synced.is_true() && self.unreadable.is_empty()
+        self.synced.is_true() && lock(&self.unreadable).is_empty()
     }
 
     /// All objects that exist now, then each that is added, changed or deleted. The store is at least as new as each event.
@@ -120,14 +89,14 @@ impl<K: Watchable> Watch<K> {
 pub fn spawn_watch<K: Watchable>(
     apis: Vec<Api<Item<K>>>,
     config: Config,
-    Shape { trim, index }: Shape<K>,
+    index: Index<K>,
     telemetry: &Observability,
 ) -> Watch<K> {
     let writer = Writer::<K>::new(index);
     let watch = Watch {
         store: writer.store().clone(),
         synced: Synced::default(),
-        unreadable: Unreadable::default(),
+        unreadable: Arc::default(),
         feed: Feed::new(),
     };
     let kind = K::kind(&()).into_owned();
@@ -143,14 +112,10 @@ pub fn spawn_watch<K: Watchable>(
         metrics: telemetry.metrics.watch(&kind, &telemetry.clock),
         readiness: telemetry.readiness.clone(),
         kind,
-        trim,
         texts: Texts::default(),
         writer,
-        feed: watch.feed.clone(),
-        synced: watch.synced.clone(),
-        unreadable: watch.unreadable.clone(),
+        watch: watch.clone(),
         pending: HashSet::new(),
-        is_complete: false,
     };
     task.missing("the first list has not come yet");
     let name = format!("watch of {}", K::plural(&()));
@@ -166,19 +131,14 @@ struct Task<K: Watchable> {
     /// Name of the check of readiness.
     check: String,
     /// One for each API, in their order.
-    sources: Vec<Source<K>>,
+    sources: Vec<Source>,
     metrics: WatchMetrics,
     readiness: Readiness,
-    trim: fn(&mut K),
     texts: Texts,
     writer: Writer<K>,
-    feed: Feed<K>,
-    synced: Synced,
-    unreadable: Unreadable,
-    /// Keys that have come before the cache was complete, and are events when it is.
+    watch: Watch<K>,
+    /// Keys that have come before every source has listed once, and are events when they have.
     pending: HashSet<Box<str>>,
-    /// Every source has listed once.
-    is_complete: bool,
 }
 
 impl<K: Watchable> Task<K> {
@@ -191,13 +151,13 @@ impl<K: Watchable> Task<K> {
                 event = events.next() => event,
             };
             match event {
-                Some((source, Some(Ok(event)))) => self.event(source, event),
-                Some((source, Some(Err(error)))) => self.error(source, &error),
-                // None of them has an end; if one ends all the same, this task ends, and with it the process.
-                Some((_, None)) | None => break,
+                Some((source, Ok(event))) => self.event(source, event),
+                Some((source, Err(error))) => self.error(source, &error),
+                // They have no end; if they end all the same, this task ends, and with it the process.
+                None => break,
             }
         }
-        self.feed.close();
+        self.watch.feed.close();
     }
 
     fn event(&mut self, source: usize, event: Event<Item<K>>) {
@@ -205,7 +165,7 @@ impl<K: Watchable> Task<K> {
         if matches!(event, Event::Init) {
             // The beginning of a list is a request, not an answer.
             from.probe.listing();
-            return from.list.begins();
+            return from.shown.clear();
         }
         self.metrics.event();
         match event {
@@ -217,100 +177,85 @@ impl<K: Watchable> Task<K> {
                 from.probe.running();
                 self.delete(item);
             }
-            Event::InitApply(item) => self.listed(source, item),
+            Event::InitApply(item) => {
+                let key = self.apply(item);
+                self.sources[source].shown.insert(key);
+            }
             Event::Init | Event::InitDone => self.list_done(source),
         }
     }
 
-    fn apply(&mut self, item: Item<K>) {
-        let object = match self.read(item) {
+    /// Takes an object in, and returns its key. One that can't be read stays as it was last read, because it has not been deleted.
+    fn apply(&mut self, item: Item<K>) -> Box<str> {
+        let mut object = match item.object {
             Ok(object) => object,
-            Err(key) => return self.note_unreadable(|keys| keys.extend([key])),
+            Err(malformed) => {
+                malformed.log(&self.kind);
+                let key = malformed.key();
+                self.note_unreadable(|keys| _ = keys.insert(key.clone()));
+                return key;
+            }
         };
         let key = key_of(&object);
         self.note_unreadable(|keys| _ = keys.remove(&key));
+        let is_as = |old: Arc<K>| old.uid() == object.uid() && old.resource_version() == object.resource_version();
+        // A list shows again what is known.
+        if self.watch.store.by_key(&key).is_some_and(is_as) {
+            return key;
+        }
+        object.share(&mut self.texts);
         let (after, before) = self.writer.put(object);
         match before {
             // The end of an object that was replaced by another one of its name between two reads.
             Some(before) if before.uid() != after.uid() => self.tell(&before, true),
             // No code here reads most fields of a Pod that its kubelet and the Job controller write.
-            Some(before) if after.is_same(&before) => return,
+            Some(before) if after.is_same(&before) => return key,
             _ => {}
         }
         self.tell(&after, false);
+        key
     }
 
     fn delete(&mut self, item: Item<K>) {
         let (key, last) = match item.object {
-            Ok(object) => (key_of(&object), Some(self.trimmed(object))),
+            Ok(object) => (key_of(&object), Some(Arc::new(object))),
             Err(malformed) => (malformed.key(), None),
         };
         self.note_unreadable(|keys| _ = keys.remove(&key));
         let known = self.writer.remove(&key);
         // No event was sent for an object that never could be read.
-        if let Some(last) = last.map(Arc::new).or(known) {
+        if let Some(last) = last.or(known) {
             self.tell(&last, true);
         }
     }
 
     /// Sends an event once the cache is complete. Before that it keeps the name for the end of the list, unless the object is gone.
     fn tell(&mut self, object: &Arc<K>, is_gone: bool) {
-        if self.is_complete {
-            self.feed.push(object, is_gone);
+        if self.watch.store.is_ready() {
+            self.watch.feed.push(object, is_gone);
         } else if !is_gone {
             self.pending.insert(key_of(object.as_ref()));
         }
     }
 
-    fn listed(&mut self, source: usize, item: Item<K>) {
-        let object = match self.read(item) {
-            Ok(object) => object,
-            Err(key) => return self.sources[source].list.unreadable(key),
-        };
-        let key = key_of(&object);
-        let known = self.writer.store().by_key(&key);
-        let is_known = known
-            .is_some_and(|known| known.uid() == object.uid() && known.resource_version() == object.resource_version());
-        let list = &mut self.sources[source].list;
-        list.shown.insert(key.clone());
-        if is_known {
-            return;
-        }
-        let (after, before) = self.writer.put(object);
-        list.changed.insert(key);
-        list.replaced
-            .extend(before.filter(|before| before.uid() != after.uid()));
-    }
-
     fn list_done(&mut self, source: usize) {
         let from = &mut self.sources[source];
-        let list = std::mem::take(&mut from.list);
-        from.is_synced = true;
-        from.has_listed = true;
-        let from = &self.sources[source];
-        let mut gone = list.replaced;
-        for key in self
-            .writer
-            .keys_without(|key| !from.has(key) || list.shown.contains(key))
-        {
-            gone.extend(self.writer.remove(&key));
-        }
-        self.note_unreadable(|keys| {
-            keys.retain(|key| !from.has(key));
-            keys.extend(list.unreadable);
-        });
+        let shown = std::mem::take(&mut from.shown);
+        (from.is_synced, from.has_listed) = (true, true);
         from.probe.listed();
-        let (changed, left) = (list.changed.len(), gone.len());
-        self.pending.extend(list.changed);
+        let from = &self.sources[source];
+        let is_there = |key: &str| !from.has(key) || shown.contains(key);
+        self.note_unreadable(|keys| keys.retain(|key| is_there(key)));
+        let lost = self.writer.keys_without(is_there);
+        let gone: Vec<Arc<K>> = lost.iter().filter_map(|key| self.writer.remove(key)).collect();
         if self.sources.iter().all(|source| source.has_listed) {
             self.complete(&gone);
         }
         tracing::info!(
             kind = self.kind,
             namespace = self.sources[source].namespace(),
-            objects = self.writer.store().len(),
-            changed,
-            gone = left,
+            objects = self.watch.store.len(),
+            gone = gone.len(),
             "listed"
         );
     }
@@ -319,46 +264,25 @@ impl<K: Watchable> Task<K> {
     fn complete(&mut self, gone: &[Arc<K>]) {
         // Before anyone is woken by what was listed.
         self.writer.is_complete();
-        self.is_complete = true;
-        if !self.synced.is_true() && self.sources.iter().all(|source| source.is_synced) {
-            self.synced.set(true);
+        if !self.watch.synced.is_true() && self.sources.iter().all(|source| source.is_synced) {
+            self.watch.synced.set(true);
             self.readiness.set(&self.check, Ok(()));
         }
+        let Watch { store, feed, .. } = &self.watch;
         for gone in gone {
-            self.feed.push(gone, true);
+            feed.push(gone, true);
         }
-        let store = self.writer.store();
         for object in self.pending.drain().filter_map(|key| store.by_key(&key)) {
-            self.feed.push(&object, false);
+            feed.push(&object, false);
         }
     }
 
     fn note_unreadable(&self, change: impl FnOnce(&mut BTreeSet<Box<str>>)) {
-        let mut keys = self.unreadable.keys();
+        let mut keys = lock(&self.watch.unreadable);
         change(&mut keys);
         self.metrics
             .unreadable
             .set(i64::try_from(keys.len()).unwrap_or(i64::MAX));
-    }
-
-    /// The object, trimmed; if it can't be read, its key, and its name is logged.
-    fn read(&mut self, item: Item<K>) -> Result<K, Box<str>> {
-        item.object.map(|object| self.trimmed(object)).map_err(|malformed| {
-            tracing::error!(
-                kind = self.kind,
-                namespace = malformed.namespace,
-                name = malformed.name,
-                error = malformed.error,
-                "skipped an object that can't be read"
-            );
-            malformed.key()
-        })
-    }
-
-    fn trimmed(&mut self, mut object: K) -> K {
-        (self.trim)(&mut object);
-        object.share(&mut self.texts);
-        object
     }
 
     fn error(&mut self, source: usize, error: &Error) {
@@ -367,7 +291,7 @@ impl<K: Watchable> Task<K> {
         source::report(&from.probe, error);
         if is_refusal(error) {
             from.is_synced = false;
-            self.synced.set(false);
+            self.watch.synced.set(false);
         }
         let cause = from.cause(client_errors::watch(error));
         if source::is_forgotten(error) {
@@ -375,7 +299,7 @@ impl<K: Watchable> Task<K> {
         } else {
             tracing::warn!(kind = self.kind, error = cause, "a watch has failed and is retried");
         }
-        if !self.synced.is_true() {
+        if !self.watch.synced.is_true() {
             self.missing(&cause);
         }
     }

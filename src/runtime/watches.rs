@@ -9,7 +9,7 @@ use kube::{Api, Client};
 
 use super::leader::Leader;
 use crate::kubernetes::objects::{Job, Node, Pod};
-use crate::kubernetes::{Namespaces, Shape, Watch, Watchable, spawn_watch};
+use crate::kubernetes::{Index, Namespaces, Watch, Watchable, spawn_watch};
 use crate::observability::Observability;
 use crate::page::Reads;
 use crate::runtime::objects::children_selector;
@@ -25,10 +25,10 @@ fn all<K: Watchable<Scope = NamespaceResourceScope>>(
     namespaces: &Namespaces,
     client: &Client,
     config: Config,
-    shape: Shape<K>,
+    index: Index<K>,
     telemetry: &Observability,
 ) -> Watch<K> {
-    spawn_watch(namespaces.apis(client), config, shape, telemetry)
+    spawn_watch(namespaces.apis(client), config, index, telemetry)
 }
 
 /// The caches, and what they are filled from.
@@ -46,19 +46,15 @@ impl Watches {
     pub(super) fn start(client: &Client, settings: &Settings, telemetry: &Observability) -> Self {
         let namespaces = &settings.namespaces;
         let children = || Config::default().labels(&children_selector());
-        let pods = Shape {
-            index: owner_uid,
-            ..Shape::default()
-        };
         Self {
-            leaderboards: all(namespaces, client, Config::default(), Shape::default(), telemetry),
-            submissions: all(namespaces, client, Config::default(), Shape::default(), telemetry),
-            jobs: all(namespaces, client, children(), Shape::default(), telemetry),
-            pods: all(namespaces, client, children(), pods, telemetry),
-            policies: all(namespaces, client, children(), Shape::default(), telemetry),
+            leaderboards: all(namespaces, client, Config::default(), |_| None, telemetry),
+            submissions: all(namespaces, client, Config::default(), |_| None, telemetry),
+            jobs: all(namespaces, client, children(), |_| None, telemetry),
+            pods: all(namespaces, client, children(), owner_uid, telemetry),
+            policies: all(namespaces, client, children(), |_| None, telemetry),
             nodes: settings.has_cluster_rights.then(|| {
                 let nodes = vec![Api::all(client.clone())];
-                spawn_watch(nodes, Config::default(), Shape::default(), telemetry)
+                spawn_watch(nodes, Config::default(), |_| None, telemetry)
             }),
         }
     }

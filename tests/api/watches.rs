@@ -10,7 +10,7 @@ use kube::{Api, ResourceExt};
 use leaderboard_api::Submission;
 use leaderboard_base::shutdown::Stop;
 use leaderboard_operator::kubernetes::preflight::{Need, access_missing, await_kinds};
-use leaderboard_operator::kubernetes::{Shape, WatchEvents, guarded, objects, spawn_uncached, spawn_watch};
+use leaderboard_operator::kubernetes::{WatchEvents, guarded, objects, spawn_uncached, spawn_watch};
 use leaderboard_operator::observability::Observability;
 use leaderboard_operator::submissions::observe::causes::OF_PODS;
 use serde_json::json;
@@ -44,7 +44,7 @@ async fn creations_changes_and_deletions_are_events() {
     let watch = spawn_watch::<Submission>(
         vec![guarded(client.clone(), Some(&namespace))],
         Config::default(),
-        Shape::default(),
+        |_| None,
         &telemetry,
     );
     let mut events = watch.subscribe();

@@ -20,7 +20,7 @@ fn two(a: Vec<Answer>, b: Vec<Answer>) -> Two {
     let telemetry = Observability::new(receiver);
     telemetry.readiness.registered();
     let apis = vec![guarded(of_a, Some("a")), guarded(of_b, Some("b"))];
-    let watch = spawn_watch(apis, Config::default(), Shape::default(), &telemetry);
+    let watch = spawn_watch(apis, Config::default(), |_| None, &telemetry);
     let rig = Rig {
         events: watch.subscribe(),
         watch,

@@ -19,7 +19,7 @@ async fn what_nobody_reads_is_cached_and_is_no_event() {
     let (_stop, receiver) = Stop::new();
     let telemetry = Observability::new(receiver);
     let apis = vec![guarded::<Pod>(client, Some("ns"))];
-    let watch = spawn_watch(apis, Config::default(), Shape::default(), &telemetry);
+    let watch = spawn_watch(apis, Config::default(), |_| None, &telemetry);
     let mut events = watch.subscribe();
     let mut next = async || {
         let event = timeout(LIMIT, events.next()).await.unwrap().unwrap();
