@@ -7,7 +7,7 @@ use k8s_openapi::apimachinery::pkg::apis::meta::v1::Time;
 
 use super::end;
 use super::failure::{self, charged, for_both, participant};
-use super::gates::{self, Gate};
+use super::gates;
 use super::plan::{Action, Question};
 use super::status::PlanBuilder;
 use super::waits::Wait;
@@ -44,7 +44,7 @@ pub(super) fn decide(draft: &mut PlanBuilder<'_>) -> bool {
         return false;
     };
     draft.status.track = Some(track.name.clone());
-    if gates::closed(draft, &[Gate::OtherProgram, Gate::Phase]).is_some() {
+    if gates::waits_for_other_program(draft) || gates::waits_for_phase(draft) {
         return false;
     }
     let image = match brought(draft, leaderboard) {
@@ -54,7 +54,7 @@ pub(super) fn decide(draft: &mut PlanBuilder<'_>) -> bool {
             return false;
         }
     };
-    if gates::closed(draft, &[Gate::Leaderboard, Gate::Policy]).is_some() {
+    if gates::waits_for_leaderboard(draft) || gates::waits_for_policy(draft) {
         return false;
     }
     if !pin(draft, leaderboard, track, image) {

@@ -1,7 +1,7 @@
 //! The gates between acceptance and a Job: another program's run, a Leaderboard that is ready, its NetworkPolicy, a slot, the submitted file.
 
 pub(super) mod input;
-mod slot;
+pub(super) mod slot;
 
 use std::fmt;
 
@@ -18,43 +18,8 @@ use leaderboard_api::text::{LONGEST_NAME, one_line, sentence};
 use leaderboard_api::{PolicySource, Reason, names};
 use leaderboard_contract::verdict::WorkspaceReason;
 
-/// A condition that a submission passes on its way to a Job.
-#[derive(Clone, Copy, PartialEq, Eq)]
-pub(super) enum Gate {
-    /// No other program runs it.
-    OtherProgram,
-    /// Its row in EvalAI is of the phase that it was submitted to.
-    Phase,
-    /// Its Leaderboard can make Jobs.
-    Leaderboard,
-    /// The NetworkPolicy of its Leaderboard is in place.
-    Policy,
-    /// The pause after a failure that is not the participant's is over.
-    NextTry,
-    /// What is known of the copy of its submitted file is no failure.
-    InputAnswer,
-    /// It has a slot.
-    Slot,
-    /// Its submitted file is in the bucket.
-    Input,
-}
-
-/// The first of these gates that is closed, which has shown why.
-pub(super) fn closed(draft: &mut PlanBuilder<'_>, gates: &[Gate]) -> Option<Gate> {
-    gates.iter().copied().find(|gate| match gate {
-        Gate::OtherProgram => waits_for_other_program(draft),
-        Gate::Phase => waits_for_phase(draft),
-        Gate::Leaderboard => waits_for_leaderboard(draft),
-        Gate::Policy => waits_for_policy(draft),
-        Gate::NextTry => waits_for_next_try(draft),
-        Gate::InputAnswer => input::has_failed(draft),
-        Gate::Slot => slot::waits(draft),
-        Gate::Input => input::waits(draft),
-    })
-}
-
 /// Faults of the Leaderboard with which no Job can be made, or none may. The others speak for themselves where they hurt.
-fn waits_for_leaderboard(draft: &mut PlanBuilder<'_>) -> bool {
+pub(super) fn waits_for_leaderboard(draft: &mut PlanBuilder<'_>) -> bool {
     const BLOCKS: [Reason; 4] = [
         Reason::ClaimsNotServed,
         Reason::ClaimTemplateMissing,
@@ -83,7 +48,7 @@ pub(super) fn leaderboard_not_ready(draft: &PlanBuilder<'_>, reason: impl fmt::D
 }
 
 /// A Leaderboard and its first submission may come together: that the policy takes a moment then is no news.
-fn waits_for_policy(draft: &mut PlanBuilder<'_>) -> bool {
+pub(super) fn waits_for_policy(draft: &mut PlanBuilder<'_>) -> bool {
     let Some(missing) = missing_policy(draft) else {
         return false;
     };
@@ -114,7 +79,7 @@ fn foreign_phase(draft: &PlanBuilder<'_>) -> Option<String> {
 
 /// True if the row is of another phase, and has to be of ours again. The object may have been applied with a wrong phase, so nothing
 /// is reported at once; but the participant's submission does not wait for an end without limit.
-fn waits_for_phase(draft: &mut PlanBuilder<'_>) -> bool {
+pub(super) fn waits_for_phase(draft: &mut PlanBuilder<'_>) -> bool {
     let Some(what) = foreign_phase(draft) else {
         return false;
     };
@@ -193,7 +158,7 @@ pub(super) const NOT_WRITTEN: &str = "Nothing is written of this end, because an
                                       cancel it in EvalAI.";
 
 /// True if the submission is held back, or that is not known yet.
-fn waits_for_other_program(draft: &mut PlanBuilder<'_>) -> bool {
+pub(super) fn waits_for_other_program(draft: &mut PlanBuilder<'_>) -> bool {
     if draft.is_adopted() {
         return false;
     }
@@ -343,7 +308,8 @@ pub(super) fn holds_back(draft: &mut PlanBuilder<'_>, job: &JobView) -> bool {
     true
 }
 
-fn waits_for_next_try(draft: &mut PlanBuilder<'_>) -> bool {
+/// True until the pause after a failure that is not the participant's is over.
+pub(super) fn waits_for_next_try(draft: &mut PlanBuilder<'_>) -> bool {
     let Some(at) = draft.status.next_retry_time.as_ref().map(|t| t.0) else {
         return false;
     };

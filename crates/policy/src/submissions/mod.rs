@@ -38,7 +38,7 @@ use std::time::Duration;
 
 use crate::report_digest::ReportDigest;
 use crate::view::{JobView, ObservedJob, Stage, View};
-use gates::Gate;
+use gates::{input, slot};
 use leaderboard_api::{JOB_SECONDS, LeaderboardSpec, Reason};
 pub use plan::{Action, EvalaiUpdate, Event, Plan, Question, SlotUse, StatusWrite, TableUpdate, job_name};
 pub use run::pinned;
@@ -106,11 +106,13 @@ fn in_line(draft: &mut PlanBuilder<'_>) {
     if !accept::decide(draft) {
         return draft.look_again(Wait::SLOT);
     }
-    match gates::closed(draft, &[Gate::NextTry, Gate::InputAnswer, Gate::Slot, Gate::Input]) {
-        None => start::start_job(draft),
-        Some(Gate::NextTry) => {}
-        Some(_) => draft.look_again(Wait::SLOT),
+    if gates::waits_for_next_try(draft) {
+        return;
     }
+    if input::has_failed(draft) || slot::waits(draft) || input::waits(draft) {
+        return draft.look_again(Wait::SLOT);
+    }
+    start::start_job(draft);
 }
 
 /// The Job is there: the submission starts, runs, is stopped, or has ended.
@@ -185,7 +187,7 @@ fn without_its_job(draft: &mut PlanBuilder<'_>) {
         return draft.requeue_in(left);
     }
     // Somebody has removed the status, and with it the file's size and digest.
-    if gates::closed(draft, &[Gate::Input]).is_some() {
+    if input::waits(draft) {
         return draft.look_again(Wait::SLOT);
     }
     if draft.was_job_seen() {

@@ -12,14 +12,14 @@ use leaderboard_api::text::sentence;
 use leaderboard_api::{Agents, Evalai, Failure, Reason};
 
 /// True if the copy has failed. The next try needs no slot, and a failure that is final waits for none.
-pub(super) fn has_failed(draft: &mut PlanBuilder<'_>) -> bool {
+pub(in super::super) fn has_failed(draft: &mut PlanBuilder<'_>) -> bool {
     let is_answered = question(draft).is_some_and(|question| draft.view.input.answer_to(&question).is_some());
     is_answered && waits(draft)
 }
 
 /// True if the file is not in the bucket yet. The submission keeps its slot for the first try alone: what is not served now may not be for
 /// long.
-pub(super) fn waits(draft: &mut PlanBuilder<'_>) -> bool {
+pub(in super::super) fn waits(draft: &mut PlanBuilder<'_>) -> bool {
     let Some(question) = question(draft) else {
         return false;
     };

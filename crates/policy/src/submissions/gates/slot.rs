@@ -8,7 +8,7 @@ use crate::slots::turns::{InLine, Turn};
 use leaderboard_api::{Eta, Reason, ResourceExt, Waiting};
 
 /// A submission that waits for nothing but a slot joins the line, and shows its place there.
-pub(super) fn waits(draft: &mut PlanBuilder<'_>) -> bool {
+pub(in super::super) fn waits(draft: &mut PlanBuilder<'_>) -> bool {
     let (position, eta, reason, message) = match draft.view.turn.clone() {
         Turn::Go => return false,
         Turn::NotInLine => {
