@@ -2,6 +2,7 @@
 //!
 //! Called by `why`, `overview` and `change`. Pure.
 
+use super::text::Page;
 use leaderboard_api::conditions;
 use leaderboard_api::text::sentence;
 use leaderboard_api::{Leaderboard, Reason};
@@ -63,6 +64,13 @@ pub(super) fn problems(name: &str, observed: Observed<'_>) -> Vec<Problem> {
     }
     found.extend(not_ready(name, leaderboard));
     found
+}
+
+/// Writes a paragraph for each thing that is wrong with the Leaderboard of this name.
+pub(super) fn show_problems(page: &mut Page, name: &str, observed: Observed<'_>) {
+    for problem in problems(name, observed) {
+        page.paragraph(&problem.text);
+    }
 }
 
 fn not_ready(name: &str, leaderboard: &Leaderboard) -> Option<Problem> {

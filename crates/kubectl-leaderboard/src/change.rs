@@ -6,9 +6,9 @@ use kube::ResourceExt;
 use serde_json::{Value, json};
 
 use super::board::{self, Observed};
-use super::facts::{command, has_ended, is_attempt_requested, is_run, shown};
+use super::facts::{command, has_ended, is_attempt_requested, is_run, shown, status};
 use super::text::{Frame, span, when, wrap};
-use leaderboard_api::{Attempt, Deadlines, Reason, State, Submission, SubmissionStatus};
+use leaderboard_api::{Attempt, Deadlines, Reason, State, Submission};
 
 /// The change that a person requests.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
@@ -49,17 +49,13 @@ pub fn plan(
 
 fn cancel(submission: &Submission, leaderboard: Observed<'_>, frame: Frame) -> Result<Change, String> {
     let name = submission.name_any();
-    let status = submission.status.as_ref();
     if has_ended(submission) {
-        let shown = status
-            .and_then(SubmissionStatus::known_state)
-            .map_or("ended", State::as_str);
-        let at = status.and_then(|s| s.times.finished.as_ref());
-        let at = at
-            .map(|at| format!(" since {}", when(at.0, frame.now)))
-            .unwrap_or_default();
+        let at = status(submission).times.finished.as_ref();
+        let at = at.map(|at| format!(" since {}", when(at.0, frame.now)));
         return Err(format!(
-            "{name} is {shown}{at}, so there is nothing to cancel. See `{}`",
+            "{name} is {}{}, so there is nothing to cancel. See `{}`",
+            shown(submission),
+            at.unwrap_or_default(),
             command("why", submission)
         ));
     }
@@ -90,8 +86,7 @@ fn cancel(submission: &Submission, leaderboard: Observed<'_>, frame: Frame) -> R
 
 /// One sentence on how the operator stops the run at its present stage; docs/states.md has the details.
 fn how_it_stops(submission: &Submission, leaderboard: Observed<'_>) -> String {
-    let status = submission.status.as_ref().filter(|status| !status.has_ended());
-    if status.is_none_or(|s| s.job_name.is_none()) {
+    if !is_run(submission) {
         return "It has no Job, so it ends at once.".to_owned();
     }
     let seconds = match leaderboard {
@@ -101,7 +96,7 @@ fn how_it_stops(submission: &Submission, leaderboard: Observed<'_>) -> String {
         Observed::Forbidden => None,
     };
     let grace = seconds.map_or_else(|| "deadlines.cancelSeconds".to_owned(), span);
-    if status.is_none_or(|s| s.times.started.is_none()) {
+    if status(submission).times.started.is_none() {
         return format!(
             "Its run has not begun, so the Job is deleted at once; a Pod that is already running is first asked to stop and \
              has {grace}."
@@ -142,17 +137,14 @@ fn restart(submission: &Submission, frame: Frame) -> Result<Change, String> {
 fn resume(submission: &Submission, leaderboard: Observed<'_>, frame: Frame) -> Result<Change, String> {
     let attempt = next_attempt(submission)?;
     let mut page = frame.page();
-    let results = submission.status.as_ref().and_then(|s| s.results_url.as_deref());
     page.paragraph(&format!("Requested attempt {attempt} of {}.", submission.name_any()));
-    match results {
+    match &status(submission).results_url {
         Some(results) => page.paragraph(&format!(
             "It continues from the results in {results} and does what is missing."
         )),
         None => page.paragraph("Its status names no stored results, so it starts from the beginning."),
     }
-    for problem in board::problems(&submission.spec.leaderboard_name, leaderboard) {
-        page.paragraph(&problem.text);
-    }
+    board::show_problems(&mut page, &submission.spec.leaderboard_name, leaderboard);
     if let Some(evalai) = submission.spec.evalai {
         page.paragraph(&format!(
             "The operator asks EvalAI first. If EvalAI shows submission {} as archived, deleted or finished, the attempt ends \
@@ -210,8 +202,7 @@ fn not_resumable(submission: &Submission) -> Option<String> {
     }
     let name = submission.name_any();
     let see = command("why", submission);
-    let found = submission.status.as_ref().and_then(SubmissionStatus::known_state);
-    match found.filter(|_| has_ended(submission)) {
+    match status(submission).known_state().filter(|_| has_ended(submission)) {
         Some(State::Failed | State::Cancelled) => None,
         Some(State::Finished) => Some(format!(
             "{name} has finished and cannot be resumed. Submit again to run it once more"

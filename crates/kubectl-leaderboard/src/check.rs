@@ -9,18 +9,16 @@ use clap::Args;
 use kube::ResourceExt;
 use leaderboard_api::conditions::{self, Condition};
 use leaderboard_api::text::sentence;
-use leaderboard_api::{Evaluation, Leaderboard, State, Submission, SubmissionStatus, reasons};
+use leaderboard_api::{Evaluation, Leaderboard, State, Submission, reasons};
 use serde_json::{Value, json};
 
 use crate::board::Observed;
 use crate::cluster::{Cluster, Fetched};
 use crate::commands::{follow, frame};
 use crate::error::Error;
-use crate::facts::command;
 use crate::output::{note, print};
-use crate::submit;
 use crate::text::Frame;
-use crate::why;
+use crate::{facts, submit, why};
 
 /// Start of a check's name. The API server takes no other, so that its prefix in the bucket is never a team's.
 const NAME_PREFIX: &str = "check-";
@@ -63,7 +61,7 @@ pub async fn check(cluster: &Cluster, wanted: &Check) -> Result<ExitCode, Error>
         ))),
     };
     if wanted.keep {
-        note(&format!("{name} is kept, for `{}`.", command("why", &created)));
+        note(&format!("{name} is kept, for `{}`.", facts::command("why", &created)));
     } else {
         cluster.delete(&name).await?;
     }
@@ -120,11 +118,10 @@ pub(super) fn lines(submission: &Submission, leaderboard: Observed<'_>, frame: F
 
 /// True if the check is Finished, its condition Logged is not False, and the Leaderboard is Ready.
 pub(super) fn has_passed(submission: &Submission, leaderboard: Observed<'_>) -> bool {
-    let is_well = |status: &SubmissionStatus| {
-        let logged = conditions::get(&status.conditions, conditions::LOGGED);
-        status.state_of_conditions() == State::Finished && logged.is_none_or(|logged| logged.status != "False")
-    };
-    submission.status.as_ref().is_some_and(is_well)
+    let status = facts::status(submission);
+    let logged = status.condition(conditions::LOGGED);
+    status.state_of_conditions() == State::Finished
+        && logged.is_none_or(|logged| logged.status != "False")
         && conditions::is_true(conditions_of(leaderboard), conditions::READY)
 }
 

@@ -23,9 +23,10 @@ use serde_json::Value;
 use super::board::Observed;
 use super::error::{Error, of_kubeconfig, of_log};
 use super::help::GLOBAL;
-use super::{lines, near};
+use super::{facts, lines, near};
 use leaderboard_api::names::LABEL_SUBMISSION;
-use leaderboard_api::{Leaderboard, State, Submission, SubmissionStatus};
+use leaderboard_api::standings::track_of;
+use leaderboard_api::{Leaderboard, State, Submission};
 
 /// Field manager of what people change.
 const MANAGER: &str = "kubectl-leaderboard";
@@ -90,20 +91,17 @@ impl Filter {
     fn takes(&self, one: &Submission) -> bool {
         let is =
             |wanted: &Option<String>, known: Option<&str>| wanted.as_deref().is_none_or(|wanted| known == Some(wanted));
-        let status = one.status.as_ref();
-        let track = status
-            .and_then(|status| status.track.as_deref())
-            .or(one.spec.track.as_deref());
+        let (given, accepted) = (one.spec.team.as_ref(), facts::status(one).team.as_ref());
         let ids = [
-            one.spec.team.as_ref().and_then(|team| team.id.as_ref()),
-            status.and_then(|status| status.team.as_ref()?.id.as_ref()),
+            given.and_then(|team| team.id.as_ref()),
+            accepted.and_then(|team| team.id.as_ref()),
         ];
         let is_team = |wanted: &String| {
             let has_name = one.team_name().is_some_and(|name| name.eq_ignore_ascii_case(wanted));
             has_name || ids.contains(&Some(wanted))
         };
         is(&self.leaderboard, Some(&one.spec.leaderboard_name))
-            && is(&self.track, track)
+            && is(&self.track, track_of(one))
             && self.team.as_ref().is_none_or(is_team)
     }
 }
@@ -111,11 +109,7 @@ impl Filter {
 impl Scope {
     /// True if the state and the filter take a submission; a new one counts as Pending.
     fn takes(&self, one: &Submission) -> bool {
-        let state = one
-            .status
-            .as_ref()
-            .and_then(SubmissionStatus::known_state)
-            .unwrap_or(State::Pending);
+        let state = facts::status(one).known_state().unwrap_or(State::Pending);
         let is_state = |wanted: &String| wanted.eq_ignore_ascii_case(state.as_str());
         (self.state.is_empty() || self.state.iter().any(is_state)) && self.filter.takes(one)
     }

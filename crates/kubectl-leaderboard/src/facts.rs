@@ -2,24 +2,39 @@
 //!
 //! Called by every module that shows or changes submissions. Pure: the time is handed in.
 
+use std::sync::LazyLock;
+
 use jiff::Timestamp;
 use k8s_openapi::apimachinery::pkg::apis::meta::v1::Time;
 use kube::ResourceExt;
 
 use super::text::{Frame, join, size, span, when};
+use leaderboard_api::standings::track_of;
 use leaderboard_api::{
-    Agents, Attempt, FailureClass, RunPlan, State, Submission, SubmissionStatus, Waiting, conditions,
+    Agents, Attempt, FailureClass, RunPlan, S3Bucket, State, Submission, SubmissionStatus, Waiting, conditions,
 };
+
+/// The status; an empty one before the operator has written one.
+pub(super) fn status(submission: &Submission) -> &SubmissionStatus {
+    static NOTHING: LazyLock<SubmissionStatus> = LazyLock::new(SubmissionStatus::default);
+    submission.status.as_ref().unwrap_or(&NOTHING)
+}
 
 /// The state as people read it.
 pub(super) fn shown(submission: &Submission) -> &'static str {
-    let known = submission.status.as_ref().and_then(SubmissionStatus::known_state);
-    known.map_or("new", State::as_str)
+    status(submission).known_state().map_or("new", State::as_str)
+}
+
+/// The name with its state and the reason, such as `submission-42 is Failed (NodeLost)`.
+pub(super) fn named(submission: &Submission) -> String {
+    let reason = status(submission).reason.as_ref();
+    let reason = reason.map(|reason| format!(" ({reason})")).unwrap_or_default();
+    format!("{} is {}{reason}", submission.name_any(), shown(submission))
 }
 
 /// Since when a submission is in its state.
 pub(super) fn since(submission: &Submission) -> Option<Timestamp> {
-    let status = submission.status.as_ref()?;
+    let status = status(submission);
     let moved = |type_: &str, truth: &str| {
         let found = conditions::get(&status.conditions, type_).filter(|c| c.status == truth);
         found.map(|c| c.last_transition_time.0)
@@ -66,10 +81,7 @@ pub(super) fn eta(waiting: &Waiting) -> Option<String> {
 pub(super) fn headline(submission: &Submission, now: Timestamp) -> String {
     let name = submission.name_any();
     let since = since(submission).map(|at| when(at, now));
-    match (
-        submission.status.as_ref().and_then(SubmissionStatus::known_state),
-        since,
-    ) {
+    match (status(submission).known_state(), since) {
         (Some(state), Some(since)) => format!("{name} is {} since {since}.", state.as_str()),
         (Some(state), None) => format!("{name} is {}.", state.as_str()),
         (None, _) => {
@@ -84,10 +96,7 @@ pub(super) fn headline(submission: &Submission, now: Timestamp) -> String {
 /// too. None before the attempt has begun.
 pub(super) fn transition(submission: &Submission, attempt: Attempt, frame: Frame) -> Option<(String, Vec<String>)> {
     let status = submission.status.as_ref().filter(|s| s.attempt >= Some(attempt))?;
-    let shown = status.state_of_conditions().as_str();
-    let reason = status.reason.as_ref().map(|reason| format!(" ({reason})"));
-    let reason = reason.unwrap_or_default();
-    let state = format!("{} is {shown}{reason}", submission.name_any());
+    let state = named(submission);
     let text = format!("{state}: {}", status.message.as_deref().unwrap_or_default());
     let mut page = frame.page();
     page.row(
@@ -100,8 +109,7 @@ pub(super) fn transition(submission: &Submission, attempt: Attempt, frame: Frame
 /// Track, Leaderboard, team, the submitted file and the submission in EvalAI.
 pub(super) fn track(submission: &Submission) -> String {
     let spec = &submission.spec;
-    let found = submission.status.as_ref().and_then(|status| status.track.as_deref());
-    let mut text = match found.or(spec.track.as_deref()) {
+    let mut text = match track_of(submission) {
         Some(track) => format!("{track} of Leaderboard {}", spec.leaderboard_name),
         None => format!("not known yet; Leaderboard {}", spec.leaderboard_name),
     };
@@ -122,8 +130,7 @@ pub(super) fn track(submission: &Submission) -> String {
 
 /// The submitted file as `file (12 KiB)`, if the submission is one.
 fn file(submission: &Submission) -> Option<String> {
-    let known = submission.status.as_ref().and_then(|status| status.input.as_ref());
-    let file = known.or(submission.spec.input.as_ref())?;
+    let file = status(submission).input.as_ref().or(submission.spec.input.as_ref())?;
     let quantity = size(u64::try_from(file.size).unwrap_or_default());
     let number = quantity.trim_end_matches(|c: char| c.is_ascii_alphabetic());
     let unit = quantity.strip_prefix(number).unwrap_or_default();
@@ -132,7 +139,12 @@ fn file(submission: &Submission) -> Option<String> {
 
 /// The plan of a run, if there is one yet.
 pub(super) fn plan(submission: &Submission) -> Option<&RunPlan> {
-    submission.status.as_ref()?.plan.as_ref()
+    status(submission).plan.as_ref()
+}
+
+/// The bucket of a run's results, if its plan is known.
+pub(super) fn storage(submission: &Submission) -> Option<&S3Bucket> {
+    Some(&plan(submission)?.storage.s3)
 }
 
 /// True if an agent runs, as far as the plan is known.
@@ -142,20 +154,18 @@ pub(super) fn has_agent(plan: Option<&RunPlan>) -> bool {
 
 /// True if the attempt has ended and no higher one is requested.
 pub(super) fn has_ended(submission: &Submission) -> bool {
-    let status = submission.status.as_ref();
-    status.is_some_and(SubmissionStatus::has_ended) && !is_attempt_requested(submission)
+    status(submission).has_ended() && !is_attempt_requested(submission)
 }
 
 /// True if the submission has a Job and has not ended.
 pub(super) fn is_run(submission: &Submission) -> bool {
-    let status = submission.status.as_ref();
-    status.is_some_and(|status| status.job_name.is_some() && !status.has_ended())
+    let status = status(submission);
+    status.job_name.is_some() && !status.has_ended()
 }
 
 /// True if a higher attempt is requested than the operator has started.
 pub(super) fn is_attempt_requested(submission: &Submission) -> bool {
-    let status = submission.status.as_ref();
-    status.is_some_and(|status| status.is_followed_by(submission.spec.attempt))
+    status(submission).is_followed_by(submission.spec.attempt)
 }
 
 /// A command of this plugin for a submission, to be copied.

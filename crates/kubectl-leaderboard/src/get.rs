@@ -15,7 +15,7 @@ use crate::commands::frame;
 use crate::error::{Error, of_bucket};
 use crate::output::{ask, print};
 use crate::table::table;
-use crate::text::{Frame, clean, size, span, wrap};
+use crate::text::{Frame, age, clean, size, wrap};
 use crate::{bucket, facts, foreign};
 
 /// Arguments of `get`: the submission, and the folder for its files.
@@ -38,8 +38,7 @@ pub(super) struct Stored(pub(super) String, pub(super) u64, pub(super) Timestamp
 /// Lists or copies the objects.
 pub async fn get(cluster: &Cluster, wanted: &Get) -> Result<ExitCode, Error> {
     let submission = cluster.submission(&wanted.name).await?;
-    let status = submission.status.as_ref();
-    let Some(results) = status.and_then(|status| status.results_url.as_deref()) else {
+    let Some(results) = facts::status(&submission).results_url.as_deref() else {
         return Err(Error::Unfit(format!(
             "{} is {} and has stored nothing yet. See `{}`",
             wanted.name,
@@ -47,9 +46,7 @@ pub async fn get(cluster: &Cluster, wanted: &Get) -> Result<ExitCode, Error> {
             facts::command("why", &submission)
         )));
     };
-    let storage = status
-        .and_then(|status| status.plan.as_ref())
-        .map(|plan| &plan.storage.s3);
+    let storage = facts::storage(&submission);
     if let Some(folder) = &wanted.download {
         is_free(folder).map_err(Error::Unfit)?;
     }
@@ -167,10 +164,9 @@ pub(super) fn lines(submission: &Submission, stored: &[Stored], frame: Frame) ->
         );
         return wrap(&text, frame.width);
     }
-    let age = |time: Timestamp| span(frame.now.duration_since(time).as_secs());
     let rows = stored
         .iter()
-        .map(|Stored(key, bytes, time)| vec![size(*bytes), age(*time), clean(key)]);
+        .map(|Stored(key, bytes, time)| vec![size(*bytes), age(*time, frame.now), clean(key)]);
     let mut lines = table(&["SIZE", "AGE", "NAME"], &rows.collect::<Vec<_>>(), frame.width);
     let next = format!(
         "{}. `{} --download DIR` copies all.",

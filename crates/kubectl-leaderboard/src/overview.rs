@@ -11,22 +11,13 @@ use serde_json::Value;
 use super::board::{self, Observed};
 use super::facts;
 use super::table::table;
-use super::text::{Frame, clean, join, span, wrap};
+use super::text::{Frame, age, join, wrap};
 use super::why;
 use leaderboard_api::conditions::{self, Condition};
 use leaderboard_api::{Leaderboard, Reason, ReasonName, State, Submission, SubmissionStatus};
 
 /// How long an end may wait for another system before that is a problem.
 const PATIENCE_SECONDS: i64 = 300;
-
-/// A line of the table.
-struct Row {
-    order: (u8, i64),
-    name: String,
-    state: &'static str,
-    since: String,
-    why: String,
-}
 
 /// Where submissions were listed.
 #[derive(Clone, Copy, Debug)]
@@ -83,8 +74,9 @@ pub fn lines(
         page.paragraph(&text);
     }
     page.gap();
-    let mut rows: Vec<Row> = submissions.iter().filter_map(|s| row(place, s, now)).collect();
-    rows.sort_by(|a, b| a.order.cmp(&b.order).then_with(|| a.name.cmp(&b.name)));
+    let mut ordered: Vec<&Submission> = submissions.iter().collect();
+    ordered.sort_by_cached_key(|one| (order(one, now), place.name_of(*one)));
+    let rows: Vec<Vec<String>> = ordered.into_iter().filter_map(|one| row(place, one, now)).collect();
     if rows.is_empty() {
         let here = if place.is_all {
             "The cluster".to_owned()
@@ -98,10 +90,6 @@ pub fn lines(
         return page.into_lines();
     }
     let mut lines = page.into_lines();
-    let rows: Vec<Vec<String>> = rows
-        .into_iter()
-        .map(|row| vec![row.name, row.state.to_owned(), row.since, row.why])
-        .collect();
     lines.extend(table(&["NAME", "STATE", "SINCE", "WHY"], &rows, frame.width));
     lines.push(String::new());
     let namespace = if place.is_all { "NAMESPACE" } else { place.namespace };
@@ -146,10 +134,20 @@ fn of_leaderboards(place: Place<'_>, submissions: &[Submission], leaderboards: O
     problems.map(|problem| problem.text).collect()
 }
 
+/// Running ones first, then waiting ones by their position, then ended ones, the latest first.
+fn order(submission: &Submission, now: Timestamp) -> (u8, i64) {
+    let status = facts::status(submission);
+    let age = facts::since(submission).map_or(0, |at| now.duration_since(at).as_secs());
+    match status.known_state() {
+        Some(State::Running | State::Resumed) => (0, age),
+        None | Some(State::Pending) => (1, status.waiting.as_ref().map_or(0, |waiting| waiting.position.into())),
+        Some(State::Finished | State::Failed | State::Cancelled) => (2, age),
+    }
+}
+
 /// The line of a submission, unless it has no problem.
-fn row(place: Place<'_>, submission: &Submission, now: Timestamp) -> Option<Row> {
-    let empty = SubmissionStatus::default();
-    let status = submission.status.as_ref().unwrap_or(&empty);
+fn row(place: Place<'_>, submission: &Submission, now: Timestamp) -> Option<Vec<String>> {
+    let status = facts::status(submission);
     let others = other_systems(status, now);
     let doubt = is_false(status, conditions::PLAUSIBLE);
     let is_deleting = submission.metadata.deletion_timestamp.is_some();
@@ -159,20 +157,12 @@ fn row(place: Place<'_>, submission: &Submission, now: Timestamp) -> Option<Row>
     }
     let deleting = if is_deleting { "Being deleted." } else { "" };
     let doubt = doubt.map(|c| format!("{}.", c.reason)).unwrap_or_default();
-    let since = facts::since(submission);
-    let age = since.map_or(0, |at| now.duration_since(at).as_secs());
-    let position = status.waiting.as_ref().map(|w| i64::from(w.position));
-    Some(Row {
-        order: match status.known_state() {
-            Some(State::Running | State::Resumed) => (0, age),
-            None | Some(State::Pending) => (1, position.unwrap_or(0)),
-            Some(State::Finished | State::Failed | State::Cancelled) => (2, age),
-        },
-        name: clean(&place.name_of(submission)),
-        state: status.known_state().map_or("(new)", State::as_str),
-        since: since.map(|_| span(age)).unwrap_or_default(),
-        why: join(&[deleting, &others.unwrap_or_default(), &doubt, &own.unwrap_or_default()]),
-    })
+    Some(vec![
+        place.name_of(submission),
+        status.known_state().map_or("(new)", State::as_str).to_owned(),
+        facts::since(submission).map(|at| age(at, now)).unwrap_or_default(),
+        join(&[deleting, &others.unwrap_or_default(), &doubt, &own.unwrap_or_default()]),
+    ])
 }
 
 /// Why a submission is in its state; nothing if it is running, has finished, or was cancelled as requested.

@@ -53,9 +53,7 @@ pub(super) fn lines(board: &Leaderboard, is_same: bool, frame: Frame) -> Vec<Str
             "Leaderboard {name} {how}: what waits starts as slots come free."
         ));
         page.row("Waiting", &waiting);
-        for problem in board::problems(&name, Observed::Found(board)) {
-            page.paragraph(&problem.text);
-        }
+        board::show_problems(&mut page, &name, Observed::Found(board));
         return page.into_lines();
     }
     let how = if is_same { "was paused already" } else { "is paused" };

@@ -3,13 +3,13 @@
 use clap::{ArgGroup, Args};
 use jiff::Timestamp;
 use kube::ResourceExt;
-use leaderboard_api::{FailureClass, PlannedEvaluation, State, Submission, SubmissionStatus};
+use leaderboard_api::{FailureClass, PlannedEvaluation, State, Submission};
 
 use crate::change::Request;
 use crate::cluster::Filter;
 use crate::facts;
 use crate::table::table;
-use crate::text::{Frame, span, wrap};
+use crate::text::{Frame, age, wrap};
 
 /// Which submissions.
 #[derive(Args, Debug)]
@@ -81,10 +81,9 @@ impl Resume {
     }
 
     fn is_failure(&self, one: &Submission) -> bool {
-        let status = one.status.as_ref();
-        let is_failed = status.and_then(SubmissionStatus::known_state) == Some(State::Failed);
-        let failure = status.and_then(|status| status.failure.as_ref()).filter(|_| is_failed);
-        failure.is_some_and(|failure| {
+        let status = facts::status(one);
+        let is_failed = status.known_state() == Some(State::Failed);
+        status.failure.as_ref().filter(|_| is_failed).is_some_and(|failure| {
             let is_class = !self.infrastructure || failure.class == FailureClass::Infrastructure;
             is_class && (self.reason.is_empty() || self.reason.iter().any(|name| *name == failure.reason.as_str()))
         })
@@ -139,30 +138,26 @@ pub fn dry_run(verb: &str, chosen: &[&Submission], frame: Frame) -> Vec<String> 
 }
 
 fn evaluation(one: &Submission) -> Option<&PlannedEvaluation> {
-    Some(&one.status.as_ref()?.plan.as_ref()?.evaluation)
+    facts::plan(one).map(|plan| &plan.evaluation)
 }
 
 fn row(one: &Submission, now: Timestamp) -> Vec<String> {
-    let status = one.status.as_ref();
-    let failure = status.and_then(|status| status.failure.as_ref());
-    let class = failure.map_or("", |failure| failure.class.as_str());
+    let status = facts::status(one);
+    let class = status.failure.as_ref().map_or("", |failure| failure.class.as_str());
     let image = evaluation(one).map(|evaluation| match evaluation {
         PlannedEvaluation::Carla(carla) => &carla.simulator_image,
         PlannedEvaluation::Container(container) => &container.image,
     });
     // The registry is the same for all, and the tag is what differs.
     let image = image.and_then(|image| image.rsplit('/').next());
-    let since = facts::since(one).map(|at| span(now.duration_since(at).as_secs()));
+    let reason = status.present_reason().map(|reason| reason.to_string());
     vec![
         one.name_any(),
         one.team_name().unwrap_or_default(),
-        status
-            .and_then(SubmissionStatus::present_reason)
-            .map(|reason| reason.to_string())
-            .unwrap_or_default(),
+        reason.unwrap_or_default(),
         class.to_owned(),
-        since.unwrap_or_default(),
-        status.and_then(|status| status.node_name.clone()).unwrap_or_default(),
+        facts::since(one).map(|at| age(at, now)).unwrap_or_default(),
+        status.node_name.clone().unwrap_or_default(),
         image.unwrap_or_default().to_owned(),
     ]
 }

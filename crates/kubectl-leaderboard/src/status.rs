@@ -2,6 +2,7 @@
 
 use jiff::Timestamp;
 use kube::ResourceExt;
+use leaderboard_api::standings::track_of;
 use leaderboard_api::text::sentence;
 use leaderboard_api::{State, Submission, SubmissionStatus, Times, Waiting, WorkerState, WorkerStatus, conditions};
 use serde_json::{Value, json};
@@ -9,21 +10,18 @@ use serde_json::{Value, json};
 use super::board::{self, Observed};
 use super::facts;
 use super::table::{bar, table};
-use super::text::{Frame, Page, join, span};
+use super::text::{Frame, Page, age, join, span};
 
 /// Columns of the bar of a run, and of one worker's.
 const BAR: usize = 20;
 
 /// One screen of a submission.
 pub fn screen(submission: &Submission, leaderboard: Observed<'_>, frame: Frame) -> Vec<String> {
-    let nothing = SubmissionStatus::default();
-    let status = submission.status.as_ref().unwrap_or(&nothing);
+    let status = facts::status(submission);
     let now = frame.now;
     let mut page = frame.page();
     page.paragraph(&facts::headline(submission, now));
-    for problem in board::problems(&submission.spec.leaderboard_name, leaderboard) {
-        page.paragraph(&problem.text);
-    }
+    board::show_problems(&mut page, &submission.spec.leaderboard_name, leaderboard);
     page.gap();
     page.row("Track", &facts::track(submission));
     let message = sentence(status.message.as_deref().unwrap_or_default());
@@ -102,10 +100,7 @@ fn worker(worker: &WorkerStatus, has_ended: bool, now: Timestamp) -> String {
         count => format!(", {count} crashes"),
     };
     let last = worker.last.as_ref().filter(|_| worker.crashes > 0).map(|last| {
-        let ago = last
-            .time
-            .as_ref()
-            .map(|time| format!(" {} ago", span(now.duration_since(time.0).as_secs())));
+        let ago = last.time.as_ref().map(|time| format!(" {} ago", age(time.0, now)));
         format!("; last end {}{}", last.reason, ago.unwrap_or_default())
     });
     let bar = bar(worker.done, worker.total, BAR);
@@ -170,8 +165,7 @@ pub fn lines(submissions: &[Submission], is_qualified: bool, is_wide: bool, fram
 }
 
 fn order(submission: &Submission, now: Timestamp) -> (u8, i64, String) {
-    let nothing = SubmissionStatus::default();
-    let status = submission.status.as_ref().unwrap_or(&nothing);
+    let status = facts::status(submission);
     let since = facts::since(submission).map_or(0, |at| now.duration_since(at).as_secs());
     let place = status
         .waiting
@@ -186,11 +180,10 @@ fn order(submission: &Submission, now: Timestamp) -> (u8, i64, String) {
 }
 
 fn row(submission: &Submission, is_qualified: bool, is_wide: bool, now: Timestamp) -> Vec<String> {
-    let nothing = SubmissionStatus::default();
-    let status = submission.status.as_ref().unwrap_or(&nothing);
+    let status = facts::status(submission);
     let text = |text: Option<&str>| text.unwrap_or_default().to_owned();
     let since = facts::since(submission).or_else(|| submission.creation_timestamp().map(|made| made.0));
-    let since = since.map(|at| span(now.duration_since(at).as_secs()));
+    let since = since.map(|at| age(at, now));
     let mut row = vec![
         submission.name_any(),
         status.known_state().map_or("(new)", State::as_str).to_owned(),
@@ -198,11 +191,7 @@ fn row(submission: &Submission, is_qualified: bool, is_wide: bool, now: Timestam
         text(status.progress.as_ref().map(|progress| progress.text.as_str())),
         text(status.score.as_ref().map(|score| score.text.as_str())),
         since.unwrap_or_default(),
-        status
-            .waiting
-            .as_ref()
-            .map(|waiting| place(waiting))
-            .unwrap_or_default(),
+        status.waiting.as_deref().map(place).unwrap_or_default(),
     ];
     if is_qualified {
         row.insert(0, submission.namespace().unwrap_or_default());
@@ -211,7 +200,7 @@ fn row(submission: &Submission, is_qualified: bool, is_wide: bool, now: Timestam
         let crashes: i32 = status.workers.iter().map(|worker| worker.crashes).sum();
         row.extend([
             submission.spec.leaderboard_name.clone(),
-            text(status.track.as_deref().or(submission.spec.track.as_deref())),
+            text(track_of(submission)),
             submission.team_name().unwrap_or_default(),
             status.attempt.map(|attempt| attempt.to_string()).unwrap_or_default(),
             crashes.to_string(),

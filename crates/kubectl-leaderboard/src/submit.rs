@@ -85,9 +85,7 @@ pub fn lines(created: &Submission, leaderboard: Observed<'_>, frame: Frame) -> V
         spec.track.as_deref().unwrap_or_default(),
         spec.leaderboard_name
     ));
-    for problem in board::problems(&spec.leaderboard_name, leaderboard) {
-        page.paragraph(&problem.text);
-    }
+    board::show_problems(&mut page, &spec.leaderboard_name, leaderboard);
     page.paragraph(&format!("To follow it: `{} -w`.", command("status", created)));
     page.into_lines()
 }

@@ -198,13 +198,18 @@ pub(super) fn join(parts: &[&str]) -> String {
 /// `2026-11-01 10:00:00 UTC (3m20s ago)`.
 pub(super) fn when(at: Timestamp, now: Timestamp) -> String {
     let seconds = now.duration_since(at).as_secs();
-    let distance = span(seconds);
+    let distance = age(at, now);
     let time = at.strftime("%Y-%m-%d %H:%M:%S UTC");
     if seconds >= 0 {
         format!("{time} ({distance} ago)")
     } else {
         format!("{time} (in {distance})")
     }
+}
+
+/// How long ago something was.
+pub(super) fn age(at: Timestamp, now: Timestamp) -> String {
+    span(now.duration_since(at).as_secs())
 }
 
 /// A length of time as kubectl writes ages: `18s`, `2m5s`, `60m`, `3h20m`, `4d`.

@@ -3,9 +3,10 @@
 use std::collections::{BTreeMap, BTreeSet};
 
 use kube::ResourceExt;
-use leaderboard_api::{Leaderboard, State, Submission, SubmissionStatus};
+use leaderboard_api::{Leaderboard, State, Submission};
 use serde_json::{Value, json};
 
+use super::facts;
 use super::table::table;
 use super::text::Frame;
 
@@ -39,22 +40,19 @@ fn uses(submissions: &[Submission]) -> Vec<(Key, Use)> {
             team,
         );
         let each = uses.entry(key).or_default();
-        let status = one.status.as_ref();
-        match status.and_then(SubmissionStatus::known_state) {
+        let status = facts::status(one);
+        match status.known_state() {
             Some(State::Running | State::Resumed) => each.running += 1,
-            Some(State::Pending) if status.is_some_and(SubmissionStatus::has_slot) => each.running += 1,
+            Some(State::Pending) if status.has_slot() => each.running += 1,
             None | Some(State::Pending) => each.waiting += 1,
             Some(State::Finished) => each.finished += 1,
             Some(State::Failed) => each.failed += 1,
             Some(State::Cancelled) => each.cancelled += 1,
         }
-        let place = status
-            .and_then(|status| status.waiting.as_ref())
-            .map(|waiting| waiting.position);
+        let place = status.waiting.as_ref().map(|waiting| waiting.position);
         each.first_in_line = [each.first_in_line, place].into_iter().flatten().min();
-        each.crashes += status.map_or(0, |status| {
-            status.workers.iter().map(|worker| i64::from(worker.crashes)).sum()
-        });
+        let crashes = status.workers.iter().map(|worker| i64::from(worker.crashes));
+        each.crashes += crashes.sum::<i64>();
     }
     let mut all: Vec<(Key, Use)> = uses.into_iter().collect();
     let within = |each: &Use| {

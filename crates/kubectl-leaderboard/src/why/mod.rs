@@ -13,7 +13,7 @@ use self::next::{next_steps, of_worker, verb};
 use super::board::{self, Observed};
 use super::bucket;
 use super::facts::{self, class, command, has_ended, headline, is_attempt_requested, track};
-use super::text::{Frame, Page, join, span, when};
+use super::text::{Frame, Page, age, join, when};
 use leaderboard_api::conditions::{self, Condition};
 use leaderboard_api::names::FAILURE_LOG_KEY;
 use leaderboard_api::reasons::Class;
@@ -35,8 +35,7 @@ struct Explanation<'a> {
 
 /// The explanation as JSON.
 pub fn value(submission: &Submission, leaderboard: Observed<'_>) -> Value {
-    let empty = SubmissionStatus::default();
-    let status = submission.status.as_ref().unwrap_or(&empty);
+    let status = facts::status(submission);
     let problems = board::problems(&submission.spec.leaderboard_name, leaderboard);
     json!({
         "name": submission.name_any(),
@@ -48,22 +47,20 @@ pub fn value(submission: &Submission, leaderboard: Observed<'_>) -> Value {
         "failure": status.failure,
         "waiting": status.waiting,
         "leaderboardProblems": problems.iter().map(|problem| problem.text.as_str()).collect::<Vec<_>>(),
-        "nextSteps": next_steps(submission, status, leaderboard),
+        "nextSteps": next_steps(submission, leaderboard),
     })
 }
 
 /// All that is known of a submission.
 pub fn explain(submission: &Submission, leaderboard: Observed<'_>, frame: Frame) -> Vec<String> {
-    let empty = SubmissionStatus::default();
     let mut explanation = Explanation {
         submission,
-        status: submission.status.as_ref().unwrap_or(&empty),
+        status: facts::status(submission),
         leaderboard,
         now: frame.now,
         page: frame.page(),
-        steps: Vec::new(),
+        steps: next_steps(submission, leaderboard),
     };
-    explanation.steps = next_steps(submission, explanation.status, leaderboard);
     explanation.headline();
     explanation.page.gap();
     explanation.page.row("Track", &track(submission));
@@ -87,9 +84,7 @@ impl Explanation<'_> {
                 "It was deleted {asked}; the object is kept until every system has the result."
             ));
         }
-        for problem in board::problems(&self.submission.spec.leaderboard_name, self.leaderboard) {
-            self.page.paragraph(&problem.text);
-        }
+        board::show_problems(&mut self.page, &self.submission.spec.leaderboard_name, self.leaderboard);
     }
 
     fn reason(&mut self) {
@@ -262,8 +257,8 @@ impl Explanation<'_> {
         };
         let text = format!("the last 10,000 characters of {log}. Hosts only: it may reveal private data.");
         self.page.row("Log", &text);
-        let storage = self.status.plan.as_ref().map(|plan| &plan.storage.s3);
-        let command = bucket::print(&format!("{results}/{FAILURE_LOG_KEY}"), storage);
+        let object = format!("{results}/{FAILURE_LOG_KEY}");
+        let command = bucket::print(&object, facts::storage(self.submission));
         self.page.whole("", &command);
     }
 
@@ -274,7 +269,7 @@ impl Explanation<'_> {
             self.page.row(label, text);
             label = "";
         }
-        if let Some(verb) = verb(self.submission, self.status) {
+        if let Some(verb) = verb(self.submission) {
             self.page.whole(label, &command(verb, self.submission));
         }
     }
@@ -297,10 +292,7 @@ fn crashes(worker: &WorkerStatus, is_failed: bool, now: Timestamp) -> String {
     let known = worker.last.as_deref().filter(is_known);
     let last = known.map(|last| {
         let code = last.exit_code.map(|code| format!(" (exit code {code})"));
-        let ago = last.time.as_ref().map(|time| {
-            let seconds = now.duration_since(time.0).as_secs();
-            format!(", {} ago", span(seconds))
-        });
+        let ago = last.time.as_ref().map(|time| format!(", {} ago", age(time.0, now)));
         let (code, ago) = (code.unwrap_or_default(), ago.unwrap_or_default());
         format!("; last end: {}{code}{ago}", last.reason)
     });

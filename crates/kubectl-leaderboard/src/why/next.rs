@@ -1,9 +1,9 @@
 //! The next steps of one submission: those of the table of reasons, and the command of this plugin that takes one.
 
-use leaderboard_api::{Failure, FailureClass, Reason, Submission, SubmissionStatus, conditions, reasons};
+use leaderboard_api::{Failure, FailureClass, Reason, Submission, conditions, reasons};
 
 use crate::board::{self, Observed};
-use crate::facts::has_ended;
+use crate::facts::{self, has_ended};
 
 /// A text of the table of reasons about the worker that failed.
 pub(super) fn of_worker(text: &str, worker: Option<i32>) -> String {
@@ -12,7 +12,8 @@ pub(super) fn of_worker(text: &str, worker: Option<i32>) -> String {
 }
 
 /// The next steps; that of the present reason comes first.
-pub(super) fn next_steps(submission: &Submission, status: &SubmissionStatus, leaderboard: Observed<'_>) -> Vec<String> {
+pub(super) fn next_steps(submission: &Submission, leaderboard: Observed<'_>) -> Vec<String> {
+    let status = facts::status(submission);
     let mut reasons: Vec<Reason> = status
         .present_reason()
         .and_then(|reason| reason.known())
@@ -58,7 +59,8 @@ fn next_step(failure: Option<&Failure>, reason: Reason) -> &'static str {
 }
 
 /// The command of this plugin for the next step.
-pub(super) fn verb(submission: &Submission, status: &SubmissionStatus) -> Option<&'static str> {
+pub(super) fn verb(submission: &Submission) -> Option<&'static str> {
+    let status = facts::status(submission);
     // A check is run again, not resumed.
     if submission.metadata.deletion_timestamp.is_some() || submission.spec.check {
         return None;
