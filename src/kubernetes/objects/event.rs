@@ -10,7 +10,7 @@ use super::texts::{Texts, cut};
 use super::watchable;
 
 /// Part of an event that is read.
-#[derive(Deserialize, Clone, Debug, Default)]
+#[derive(Deserialize, Clone, Debug, Default, PartialEq)]
 #[serde(rename_all = "camelCase", default)]
 pub struct Event {
     pub metadata: Meta,
@@ -37,13 +37,13 @@ pub struct Involved {
     pub uid: Box<str>,
 }
 
-#[derive(Deserialize, Clone, Debug, Default)]
+#[derive(Deserialize, Clone, Debug, Default, PartialEq)]
 #[serde(default)]
 struct Source {
     component: Option<Box<str>>,
 }
 
-#[derive(Deserialize, Clone, Debug, Default)]
+#[derive(Deserialize, Clone, Debug, Default, PartialEq)]
 #[serde(rename_all = "camelCase", default)]
 struct Series {
     last_observed_time: Option<Time>,
@@ -73,10 +73,6 @@ impl Event {
 
     fn share_texts(&mut self, texts: &mut Texts) {
         self.metadata.share_texts(texts);
-    }
-
-    fn is_same_as(&self, other: &Self) -> bool {
-        self.metadata.resource_version == other.metadata.resource_version
     }
 }
 

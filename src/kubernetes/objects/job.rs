@@ -44,10 +44,6 @@ pub struct JobCondition {
 }
 
 impl Job {
-    fn is_same_as(&self, other: &Self) -> bool {
-        self.metadata.is_same(&other.metadata) && self.spec == other.spec && self.status == other.status
-    }
-
     fn share_texts(&mut self, texts: &mut Texts) {
         self.metadata.share_texts(texts);
         for condition in &mut self.status.conditions {

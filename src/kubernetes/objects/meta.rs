@@ -6,7 +6,7 @@ use serde::Deserialize;
 use super::texts::{Text, Texts};
 
 /// Part of a child's metadata that is read.
-#[derive(Deserialize, Clone, Debug, Default, PartialEq)]
+#[derive(Deserialize, Clone, Debug, Default)]
 #[serde(rename_all = "camelCase", default)]
 pub struct Meta {
     pub name: Box<str>,
@@ -50,19 +50,9 @@ pub struct Annotations {
     pub leaderboard_generation: Option<Text>,
 }
 
-impl Meta {
-    /// The namespace; empty for an object without one.
-    pub fn namespace(&self) -> &str {
-        self.namespace.as_deref().unwrap_or_default()
-    }
-
-    /// True if it belongs to the object with this UID.
-    pub fn is_owned_by(&self, uid: &str) -> bool {
-        self.owner_references.iter().any(|owner| *owner.uid == *uid)
-    }
-
-    /// True if the objects differ in their version alone.
-    pub(super) fn is_same(&self, other: &Self) -> bool {
+/// Two objects that differ in their version alone are the same.
+impl PartialEq for Meta {
+    fn eq(&self, other: &Self) -> bool {
         let Self {
             name,
             namespace,
@@ -79,6 +69,18 @@ impl Meta {
             && (creation_timestamp, deletion_timestamp) == (&other.creation_timestamp, &other.deletion_timestamp)
             && *deletion_grace_period_seconds == other.deletion_grace_period_seconds
             && (owner_references, labels, annotations) == (&other.owner_references, &other.labels, &other.annotations)
+    }
+}
+
+impl Meta {
+    /// The namespace; empty for an object without one.
+    pub fn namespace(&self) -> &str {
+        self.namespace.as_deref().unwrap_or_default()
+    }
+
+    /// True if it belongs to the object with this UID.
+    pub fn is_owned_by(&self, uid: &str) -> bool {
+        self.owner_references.iter().any(|owner| *owner.uid == *uid)
     }
 
     pub(super) fn share_texts(&mut self, texts: &mut Texts) {

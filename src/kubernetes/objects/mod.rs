@@ -73,7 +73,7 @@ macro_rules! watchable {
             }
 
             fn is_same(&self, other: &Self) -> bool {
-                self.is_same_as(other)
+                self == other
             }
         }
     };

@@ -53,10 +53,6 @@ fn ready<'de, D: serde::Deserializer<'de>>(deserializer: D) -> Result<Option<Nod
 }
 
 impl Node {
-    fn is_same_as(&self, other: &Self) -> bool {
-        self.metadata.is_same(&other.metadata) && self.spec == other.spec && self.status == other.status
-    }
-
     fn share_texts(&mut self, texts: &mut Texts) {
         for taint in &mut self.spec.taints {
             texts.share(&mut taint.key);

@@ -236,10 +236,6 @@ impl ContainerStatus {
 }
 
 impl Pod {
-    fn is_same_as(&self, other: &Self) -> bool {
-        self.metadata.is_same(&other.metadata) && self.spec == other.spec && self.status == other.status
-    }
-
     fn share_texts(&mut self, texts: &mut Texts) {
         self.metadata.share_texts(texts);
         let Self { spec, status, .. } = self;
