@@ -26,11 +26,8 @@ pub(super) fn waits_for_leaderboard(draft: &mut PlanBuilder<'_>) -> bool {
         Reason::InvalidPod,
         Reason::PrefixConflict,
     ];
-    let ready = draft
-        .view
-        .leaderboard
-        .as_ref()
-        .and_then(|board| board.condition(conditions::READY));
+    let board = draft.view.leaderboard.as_ref();
+    let ready = board.and_then(|board| board.condition(conditions::READY));
     let blocks = ready.filter(|c| c.status == "False" && c.reason.is_one_of(&BLOCKS));
     let Some(why) = blocks.map(|c| leaderboard_not_ready(draft, &c.reason, &c.message)) else {
         return false;
@@ -49,12 +46,12 @@ pub(super) fn leaderboard_not_ready(draft: &PlanBuilder<'_>, reason: impl fmt::D
 
 /// A Leaderboard and its first submission may come together: that the policy takes a moment then is no news.
 pub(super) fn waits_for_policy(draft: &mut PlanBuilder<'_>) -> bool {
-    let Some(missing) = missing_policy(draft) else {
+    let Some((missing, is_refused)) = missing_policy(draft) else {
         return false;
     };
     let created = draft.submission().metadata.creation_timestamp.as_ref();
     let until = Wait::POLICY.shown_at(created.map_or(draft.now(), |time| time.0));
-    let is_silent = draft.now() < until && !missing.is_refused;
+    let is_silent = draft.now() < until && !is_refused;
     if is_silent {
         draft.requeue_at(until);
     }
@@ -63,7 +60,7 @@ pub(super) fn waits_for_policy(draft: &mut PlanBuilder<'_>) -> bool {
     } else {
         Reason::NotIsolated
     };
-    draft.refuse(reason, &missing.message);
+    draft.refuse(reason, &missing);
     true
 }
 
@@ -101,17 +98,9 @@ pub(super) fn waits_for_phase(draft: &mut PlanBuilder<'_>) -> bool {
     true
 }
 
-/// A policy that is not in place.
-pub(super) struct Missing {
-    /// Why no Job may be made.
-    pub(super) message: String,
-    /// It could not be applied, so waiting alone does not help.
-    pub(super) is_refused: bool,
-}
-
-/// Why no Job may be made, if the policy is not in place. It is restored by the Leaderboard's reconcile, which wakes the
-/// submission.
-pub(super) fn missing_policy(draft: &PlanBuilder<'_>) -> Option<Missing> {
+/// Why no Job may be made, if the policy is not in place; true if it could not be applied, so that waiting alone does not help. It is restored
+/// by the Leaderboard's reconcile, which wakes the submission.
+fn missing_policy(draft: &PlanBuilder<'_>) -> Option<(String, bool)> {
     let leaderboard = draft.view.leaderboard.as_ref()?;
     let is_managed = leaderboard.spec.network.policy == PolicySource::Managed;
     if !is_managed || draft.view.is_policy_in_place {
@@ -120,7 +109,6 @@ pub(super) fn missing_policy(draft: &PlanBuilder<'_>) -> Option<Missing> {
     let name = &draft.spec().leaderboard_name;
     let isolated = leaderboard.condition(conditions::ISOLATED);
     let why = isolated.filter(|c| c.status == "False" && c.observed_generation == leaderboard.metadata.generation);
-    let is_refused = why.is_some();
     let message = match why {
         Some(c) => format!(
             "The NetworkPolicy of Leaderboard {name} is not in place ({}): {} The submission goes on once it is.",
@@ -132,7 +120,7 @@ pub(super) fn missing_policy(draft: &PlanBuilder<'_>) -> Option<Missing> {
              at the Leaderboard's condition Isolated; `helm test` names a missing right."
         ),
     };
-    Some(Missing { message, is_refused })
+    Some((message, why.is_some()))
 }
 
 /// True if no Job may be made at the moment, because of its Leaderboard.
@@ -144,9 +132,9 @@ pub(super) fn is_held_up(draft: &mut PlanBuilder<'_>) -> bool {
         draft.look_again(Wait::SLOT);
         return true;
     }
-    if let Some(missing) = missing_policy(draft) {
-        draft.stall_with(Reason::NotIsolated, &missing.message);
-        draft.show(Reason::NotIsolated, missing.message);
+    if let Some((missing, _)) = missing_policy(draft) {
+        draft.stall_with(Reason::NotIsolated, &missing);
+        draft.show(Reason::NotIsolated, missing);
         draft.look_again(Wait::SLOT);
         return true;
     }
@@ -174,11 +162,11 @@ pub(super) fn waits_for_other_program(draft: &mut PlanBuilder<'_>) -> bool {
         Some((answer, Ok(None))) => return awaits_evalai(draft, answer),
         Some((_, Ok(Some(run)))) => {
             draft.moves();
-            hold(draft, &message_of(run));
+            draft.refuse(Reason::Foreign, &message_of(run));
         }
         Some((_, Err(failure))) => {
             let message = not_known(draft, failure);
-            hold(draft, &message);
+            draft.refuse(Reason::Foreign, &message);
         }
         None => show_reading(draft),
     }
@@ -220,11 +208,6 @@ fn awaits_evalai(draft: &mut PlanBuilder<'_>, answer: &Answered<Row>) -> bool {
     draft.act(Action::Ask(Question::EvalaiAnew));
     draft.look_again(Wait::ROW);
     true
-}
-
-fn hold(draft: &mut PlanBuilder<'_>, message: &str) {
-    draft.condition(conditions::ACCEPTED, Truth::False, Reason::Foreign, message);
-    draft.show(Reason::Foreign, message);
 }
 
 /// While that cannot be known nothing starts: a second run would write over the results of the first.
@@ -297,7 +280,7 @@ pub(super) fn holds_back(draft: &mut PlanBuilder<'_>, job: &JobView) -> bool {
         draft.status.node_name = None;
         draft.condition(conditions::RUNNING, Truth::False, Reason::Foreign, "");
         draft.stall_with(Reason::Foreign, &message);
-        hold(draft, &message);
+        draft.refuse(Reason::Foreign, &message);
     }
     // The next Job has the name of this one, so it waits until this one is gone.
     draft.status.job_name = None;

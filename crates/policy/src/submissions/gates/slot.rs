@@ -59,10 +59,6 @@ pub(super) fn join(draft: &mut PlanBuilder<'_>) {
 
 /// The wait that is shown of this place. One that is only estimated anew is not worth a write; it follows the place.
 fn known_eta(draft: &PlanBuilder<'_>, position: i32) -> Option<Eta> {
-    let known = draft
-        .status
-        .waiting
-        .as_deref()
-        .filter(|known| known.position == position);
-    known.and_then(Waiting::eta)
+    let known = draft.status.waiting.as_deref();
+    known.filter(|known| known.position == position)?.eta()
 }
