@@ -5,107 +5,70 @@
 
 use std::collections::BTreeMap;
 
-use serde::{Deserialize, Serialize};
+use serde::Deserialize;
+use serde_json::Value;
 use serde_json::value::RawValue;
-use serde_json::{Map, Value};
 
 use super::row::Split;
-use super::types::Payload;
 
-/// One entry of the list in `result`.
+/// One entry of the list in `result`. Its numbers stay as they are written: one that is read and written again may have other digits.
 #[derive(Deserialize)]
-struct Entry {
+struct Entry<'a> {
     split: String,
-    accuracies: Map<String, Value>,
-}
-
-/// The same with its numbers as they are written: one that is read and written again may have other digits.
-#[derive(Deserialize, Serialize)]
-struct Raw<'a> {
-    split: String,
+    #[serde(default)]
     show_to_participant: bool,
     #[serde(borrow)]
     accuracies: BTreeMap<String, &'a RawValue>,
 }
 
-/// Results for this split. A Pod does not know it: what it stores names the original's, in S3 for good.
-pub fn for_split(payload: Payload, split: &str) -> Payload {
-    let result = named(&payload.result, split).unwrap_or(payload.result);
-    Payload { result, ..payload }
-}
-
-/// A text of results with another split and otherwise the same bytes, since a number that is read and written again may have other
-/// digits. None where no split is named.
-fn named(result: &str, split: &str) -> Option<String> {
-    let (_, after) = result.split_once(r#""split""#)?;
-    let value = after.trim_start().strip_prefix(':')?.trim_start();
-    let mut values = serde_json::Deserializer::from_str(value).into_iter::<String>();
-    values.next()?.ok()?;
-    let before = result.strip_suffix(value)?;
-    let rest = value.get(values.byte_offset()..)?;
-    Some(format!("{before}{}{rest}", Value::from(split)))
+/// Results for this split, with exactly these labels; else why they are not sent. A Pod does not know the split: what it stores names the
+/// original's, in S3 for good.
+pub fn for_split(result: &str, split: &str, labels: &[String]) -> Result<String, String> {
+    match parsed(result)?.as_slice() {
+        [only] => Ok(format!("[{}]", written(only, split, labels)?)),
+        entries => Err(format!("the results are for {} splits, not for one", entries.len())),
+    }
 }
 
 /// Results for the splits that EvalAI lists for a phase, each with exactly its labels: what else there is stays in the bucket. Else why
 /// they are not sent.
 pub fn for_listed(result: &str, listed: &[(&str, &Split)]) -> Result<String, String> {
-    let mut entries: Vec<Raw<'_>> = parsed(result)?;
-    let mut sent = Vec::new();
-    for (name, split) in listed {
-        let found = entries.iter().position(|entry| entry.split == *name);
+    let entries = parsed(result)?;
+    let of = |(name, split): &(&str, &Split)| {
+        let found = entries.iter().find(|entry| entry.split == *name);
         let found =
             found.ok_or_else(|| format!("the results lack the split {name}, which EvalAI lists for the phase"))?;
-        let mut entry = entries.swap_remove(found);
-        let labels = &split.schema.labels;
-        entry.accuracies.retain(|name, _| labels.contains(name));
-        let number = |value: &RawValue| value.get().parse().ok().filter(|number: &f64| number.is_finite());
-        let wrong = entry.accuracies.iter().find(|(_, value)| number(value).is_none());
-        if let Some((metric, _)) = wrong {
-            return Err(format!("the metric {metric} of the split {name} is no finite number"));
-        }
-        let missing = missing(labels, |label| entry.accuracies.contains_key(label));
-        if let Some(missing) = missing {
-            return Err(format!("the split {name} of the results lacks the metrics {missing}"));
-        }
-        sent.push(entry);
-    }
-    serde_json::to_string(&sent).map_err(|error| error.to_string())
+        written(found, name, &split.schema.labels)
+    };
+    let sent: Result<Vec<String>, String> = listed.iter().map(of).collect();
+    Ok(format!("[{}]", sent?.join(",")))
 }
 
-fn parsed<'a, T: Deserialize<'a>>(result: &'a str) -> Result<Vec<T>, String> {
+fn parsed(result: &str) -> Result<Vec<Entry<'_>>, String> {
     serde_json::from_str(result).map_err(|error| format!("the results are not EvalAI's list of splits ({error})"))
 }
 
-/// The labels that are not there, in a list.
-fn missing(labels: &[String], is_there: impl Fn(&str) -> bool) -> Option<String> {
-    let missing: Vec<&str> = labels
-        .iter()
-        .map(String::as_str)
-        .filter(|label| !is_there(label))
-        .collect();
-    (!missing.is_empty()).then(|| missing.join(", "))
-}
-
-/// Why results are not sent: they lack or misname what the leaderboard wants.
-pub fn check(payload: &Payload, split: &str, labels: &[String]) -> Result<(), String> {
-    let entries: Vec<Entry> = parsed(&payload.result)?;
-    let [entry] = entries.as_slice() else {
-        return Err(format!("the results are for {} splits, not for one", entries.len()));
-    };
-    if entry.split != split {
-        return Err(format!("the results are for the split {}, not {split}", entry.split));
+/// An entry for this split, with these labels in their order.
+fn written(entry: &Entry<'_>, split: &str, labels: &[String]) -> Result<String, String> {
+    let (mut metrics, mut missing) = (Vec::new(), Vec::new());
+    for label in labels {
+        match entry.accuracies.get(label).map(|value| value.get()) {
+            Some(value) if value.parse().is_ok_and(f64::is_finite) => {
+                metrics.push(format!("{}:{value}", Value::from(label.as_str())));
+            }
+            Some(_) => return Err(format!("the metric {label} of the split {split} is no finite number")),
+            None => missing.push(label.as_str()),
+        }
     }
-    let wrong = entry
-        .accuracies
-        .iter()
-        .find(|(_, value)| !value.as_f64().is_some_and(f64::is_finite));
-    if let Some((name, _)) = wrong {
-        return Err(format!("the metric {name} is no finite number"));
+    if !missing.is_empty() {
+        let missing = missing.join(", ");
+        return Err(format!("the split {split} of the results lacks the metrics {missing}"));
     }
-    match missing(labels, |label| entry.accuracies.contains_key(label)) {
-        Some(missing) => Err(format!("the results lack the metrics {missing}")),
-        None => Ok(()),
-    }
+    let (split, metrics) = (Value::from(split), metrics.join(","));
+    let is_shown = entry.show_to_participant;
+    Ok(format!(
+        r#"{{"split":{split},"show_to_participant":{is_shown},"accuracies":{{{metrics}}}}}"#
+    ))
 }
 
 #[cfg(test)]
@@ -113,39 +76,32 @@ mod tests {
     use super::*;
     use crate::row::Schema;
 
-    fn checked(result: &str) -> Result<(), String> {
-        let payload = Payload {
-            result: result.into(),
-            ..Payload::default()
-        };
-        check(
-            &payload,
-            "leaderboard",
-            &["Driving score".into(), "Route completion".into()],
-        )
-    }
-
     #[test]
-    fn complete_finite_results_of_the_split_are_accepted() {
+    fn results_of_the_split_are_complete_and_finite_or_are_not_sent() {
+        let labels = ["Driving score".to_owned(), "Route completion".to_owned()];
+        let checked = |result: &str| for_split(result, "leaderboard", &labels);
         let whole = r#"[{"split":"leaderboard","show_to_participant":true,"accuracies":{"Driving score":43.1,"Route completion":100}}]"#;
-        assert_eq!(checked(whole), Ok(()));
+        assert_eq!(checked(whole), Ok(whole.to_owned()));
         for (result, part) in [
             ("", "list of splits"),
             ("{}", "list of splits"),
             ("[]", "0 splits"),
             (r#"[{"split":"leaderboard"}]"#, "accuracies"),
-            (r#"[{"split":"other","accuracies":{}}]"#, "split other"),
+            (
+                r#"[{"split":"a","accuracies":{}},{"split":"b","accuracies":{}}]"#,
+                "2 splits",
+            ),
             (
                 r#"[{"split":"leaderboard","accuracies":{"Driving score":1}}]"#,
-                "lack the metrics Route completion",
+                "lacks the metrics Route completion",
             ),
             (
                 r#"[{"split":"leaderboard","accuracies":{"Driving score":"1","Route completion":1}}]"#,
-                "Driving score is no finite",
+                "Driving score of the split leaderboard is no finite",
             ),
             (
                 r#"[{"split":"leaderboard","accuracies":{"Driving score":true,"Route completion":1}}]"#,
-                "Driving score is no finite",
+                "Driving score of the split leaderboard is no finite",
             ),
             (
                 r#"[{"split":"leaderboard","accuracies":{"Driving score":NaN,"Route completion":1}}]"#,
@@ -169,7 +125,7 @@ mod tests {
                 metadata: Value::Null,
             },
         };
-        let (accuracy, both) = (split(&["accuracy"]), split(&["loss", "accuracy"]));
+        let (accuracy, both) = (split(&["accuracy"]), split(&["accuracy", "loss"]));
         let dev = r#"{"split":"dev","show_to_participant":true,"accuracies":{"accuracy":0.50,"loss":1e2}}"#;
         let test = r#"{"split":"test","show_to_participant":false,"accuracies":{"accuracy":0.1}}"#;
         let results = format!("[{dev}, {test}]");
@@ -213,26 +169,25 @@ mod tests {
 
     #[test]
     fn results_name_the_split_of_their_leaderboard_and_keep_their_digits() {
-        let of = |result: &str, split| {
-            let payload = Payload {
-                result: result.into(),
-                stdout: "a summary".into(),
-                ..Payload::default()
-            };
-            let sent = for_split(payload, split);
-            assert_eq!(&*sent.stdout, "a summary");
-            sent.result.clone()
+        let labels = ["Driving score".to_owned(), "Agent blocked".to_owned()];
+        let sent = |result: &str, split| for_split(result, split, &labels);
+        let of = |split: &str| {
+            let metrics = r#"{"Driving score":0.10,"Agent blocked":1e2}"#;
+            format!(r#"[{{"split":{split},"show_to_participant":true,"accuracies":{metrics}}}]"#)
         };
-        let first = r#"[{"split": "leaderboard", "show_to_participant": true, "accuracies": {"Driving score": 0.10}}]"#;
-        let last = r#"[{"accuracies":{"Driving score":1e2},"split":"leaderboard"}]"#;
-        assert_eq!(of(first, "val"), first.replace("leaderboard", "val"));
-        assert_eq!(of(&of(first, "val"), "leaderboard"), first, "also from another one");
-        assert_eq!(of(last, r#"a "b"\"#), last.replace("leaderboard", r#"a \"b\"\\"#));
-        for same in [first, last] {
-            assert_eq!(of(same, "leaderboard"), same);
+        let first = r#"[{"split": "leaderboard", "show_to_participant": true, "accuracies": {"Agent blocked": 1e2, "Driving score": 0.10}}]"#;
+        let last = r#"[{"accuracies":{"Driving score":0.10,"Agent blocked":1e2},"show_to_participant":true,"split":"leaderboard"}]"#;
+        for stored in [first, last] {
+            assert_eq!(sent(stored, "val"), Ok(of(r#""val""#)));
+            assert_eq!(sent(stored, r#"a "b"\"#), Ok(of(r#""a \"b\"\\""#)));
         }
+        assert_eq!(
+            sent(&of(r#""val""#), "leaderboard"),
+            Ok(of(r#""leaderboard""#)),
+            "also from another one"
+        );
         for broken in ["", "[]", r#"[{"split": 1}]"#, r#"[{"split""#] {
-            assert_eq!(of(broken, "val"), broken, "that it is broken is found next");
+            assert!(sent(broken, "val").is_err(), "{broken}");
         }
     }
 }

@@ -11,7 +11,7 @@ use tokio::sync::OwnedSemaphorePermit;
 use super::sub::{Sub, Write};
 use super::{Busy, Next, Now, Queue};
 use crate::labels::{Catalog, Misfit, listed};
-use crate::payload::{check, for_listed, for_split};
+use crate::payload::{for_listed, for_split};
 use crate::types::{Changed, Key, Metrics, Outline, Payload, PayloadProblem, Target};
 use leaderboard_api::evalai_status::Outcome;
 
@@ -178,17 +178,16 @@ pub(super) fn fitted(
     catalog: Option<&Catalog>,
     is_partial: bool,
 ) -> Option<(Payload, Option<String>)> {
-    if let Metrics::Fixed(labels) = &target.metrics {
-        let payload = for_split(payload, &target.split);
-        let misfit = check(&payload, &target.split, labels).err();
-        return Some((payload, misfit));
-    }
-    // Where a phase does not show results so far, EvalAI gets the texts alone.
-    if is_partial && payload.result == NO_RESULTS {
-        return Some((payload, None));
-    }
-    let listed = listed(target, catalog?, phase).ok_or_else(|| Misfit::Unnamed { phase }.to_string());
-    Some(match listed.and_then(|listed| for_listed(&payload.result, &listed)) {
+    let fitted = match &target.metrics {
+        Metrics::Fixed(labels) => for_split(&payload.result, &target.split, labels),
+        // Where a phase does not show results so far, EvalAI gets the texts alone.
+        Metrics::Listed(_) if is_partial && payload.result == NO_RESULTS => return Some((payload, None)),
+        Metrics::Listed(_) => {
+            let listed = listed(target, catalog?, phase).ok_or_else(|| Misfit::Unnamed { phase }.to_string());
+            listed.and_then(|listed| for_listed(&payload.result, &listed))
+        }
+    };
+    Some(match fitted {
         Ok(result) => (Payload { result, ..payload }, None),
         Err(why) => (payload, Some(why)),
     })

@@ -87,7 +87,7 @@ fn a_result_without_a_metric_is_sent_once_its_leaderboard_wants_it_no_more() {
     };
     bench.update_of(&wants_more, DesiredUpdate::Final(Outcome::Finished, results(43.0)));
     bench.get(7, row(7, Status::Running));
-    assert!(matches!(bench.view(7).end, Some(Ended::Refused(why)) if why.contains("lack the metrics Agent blocked")));
+    assert!(matches!(bench.view(7).end, Some(Ended::Refused(why)) if why.contains("lacks the metrics Agent blocked")));
     bench.wait(5.0);
     bench.expect_nothing();
     bench.becomes(&key(100), &target());
@@ -250,7 +250,7 @@ fn results_fit_the_splits_of_their_leaderboard_or_are_not_sent() {
     let catalog = |names: [Option<&str>; 2]| Catalog {
         at: wall(0),
         phases: vec![],
-        splits: vec![split(1, &["accuracy"]), split(2, &["loss", "accuracy"])],
+        splits: vec![split(1, &["accuracy"]), split(2, &["accuracy", "loss"])],
         codenames: [(1, names[0]), (2, names[1])]
             .map(|(id, name)| (id, name.map(str::to_owned)))
             .into(),
@@ -263,7 +263,7 @@ fn results_fit_the_splits_of_their_leaderboard_or_are_not_sent() {
     let (both, in_order, dev) = (format!("[{DEV},{TEST}]"), format!("[{TEST},{DEV}]"), format!("[{DEV}]"));
     let (both, in_order, dev) = (both.as_str(), in_order.as_str(), dev.as_str());
     let score = r#"[{"split":"leaderboard","accuracies":{"Driving score":1.50}}]"#;
-    let of_val = r#"[{"split":"val","accuracies":{"Driving score":1.50}}]"#;
+    let of_val = r#"[{"split":"val","show_to_participant":false,"accuracies":{"Driving score":1.50}}]"#;
     for (target, catalog, result, is_partial, expected) in [
         (&of_evalai, known, both, false, Some(Ok(in_order))),
         (&of_evalai, known, both, true, Some(Ok(in_order))),
