@@ -267,7 +267,7 @@ pub struct EndView {
     pub at: Option<Timestamp>,
     /// The runner's verdict. An agent can forge its own.
     pub verdict: Option<Verdict>,
-    /// The reason that `workspace` or `collect` reported.
+    /// The reason that `workspace` or `collect` reported, with its sentence in `why`.
     pub own_reason: Option<WorkspaceReason>,
     /// The sentence of a container of the host's, or Kubernetes' own.
     pub why: Option<String>,

@@ -20,14 +20,6 @@ use leaderboard_contract::verdict::WorkspaceReason;
 use leaderboard_pod_spec::layout::{LOGS_VOLUME, SHM_VOLUME};
 use leaderboard_protocol::files::{Member, Side};
 
-/// The message should `workspace` not report it itself.
-const NOT_ISOLATED: &str = "The Pod was not shown to be isolated from the network, and network.enforcement is Require. Look at the log of its \
-     container workspace.";
-
-const NO_INPUT: &str = "The submitted file is not in the bucket.";
-const BAD_INPUT: &str = "The files that the agent has left cannot be taken; have it write regular files within the bounds, and submit \
-     again.";
-
 /// A container that does not start.
 pub(super) struct Trouble {
     pub(super) reason: Reason,
@@ -129,8 +121,8 @@ fn of_end(container: &ContainerView, is_init: bool) -> Option<Trouble> {
         return None;
     }
     // Another try of the same Pod would find the same.
-    if let Some((reason, unsaid, cause)) = end.own_reason.and_then(of_verdict) {
-        let why = end.why.as_deref().unwrap_or(unsaid);
+    if let Some((reason, cause)) = end.own_reason.and_then(of_verdict) {
+        let why = end.why.as_deref().unwrap_or_default();
         return Some(Trouble {
             is_hopeless: true,
             ..trouble(container, reason, why, cause)
@@ -142,15 +134,13 @@ fn of_end(container: &ContainerView, is_init: bool) -> Option<Trouble> {
     Some(trouble(container, Reason::Preparing, &message, Cause::Host))
 }
 
-/// What `workspace` or `collect` has found that no further try changes: with the message should it not report it itself.
-fn of_verdict(verdict: WorkspaceReason) -> Option<(Reason, &'static str, Cause)> {
+/// What `workspace` or `collect` has found that no further try changes.
+fn of_verdict(verdict: WorkspaceReason) -> Option<(Reason, Cause)> {
     match verdict {
         // The next Pod may get another node.
-        WorkspaceReason::NotIsolated | WorkspaceReason::NotKnownIsolated => {
-            Some((Reason::NotIsolated, NOT_ISOLATED, Cause::Host))
-        }
-        WorkspaceReason::InputMissing => Some((Reason::InputMissing, NO_INPUT, Cause::Host)),
-        WorkspaceReason::InputRefused => Some((Reason::InputInvalid, BAD_INPUT, Cause::Input)),
+        WorkspaceReason::NotIsolated | WorkspaceReason::NotKnownIsolated => Some((Reason::NotIsolated, Cause::Host)),
+        WorkspaceReason::InputMissing => Some((Reason::InputMissing, Cause::Host)),
+        WorkspaceReason::InputRefused => Some((Reason::InputInvalid, Cause::Input)),
         _ => None,
     }
 }

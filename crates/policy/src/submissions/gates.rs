@@ -253,11 +253,7 @@ fn is_held_by_prefix(draft: &PlanBuilder<'_>) -> bool {
 fn prefix_in_use(pod: &PodView) -> Option<&str> {
     let end = pod.container(names::CONTAINER_WORKSPACE)?.last.as_ref()?;
     let is_in_use = end.own_reason == Some(WorkspaceReason::PrefixInUse) && pod.agent_started.is_none();
-    is_in_use.then(|| {
-        end.why
-            .as_deref()
-            .unwrap_or("The prefix of the run holds results of something else.")
-    })
+    is_in_use.then(|| end.why.as_deref().unwrap_or_default())
 }
 
 /// Holds back a submission whose Pod has found the prefix in use, without an end, a retry or a write to EvalAI or table: its Job is

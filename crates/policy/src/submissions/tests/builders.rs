@@ -22,6 +22,7 @@ use leaderboard_api::{
 };
 use leaderboard_contract::report::{Outcome, Report, ReportWorker};
 use leaderboard_contract::run::Stop;
+use leaderboard_contract::verdict::WorkspaceReason;
 use leaderboard_protocol::verdict::{Verdict, What};
 
 /// UID of every submission here.
@@ -344,6 +345,7 @@ pub fn waiting(name: &str, reason: &str, message: &str) -> ContainerView {
 /// this reason of its own. Each life of it had one round.
 pub fn ended(name: &str, restarts: i32, what: &str, exit_code: i32, second: i64) -> ContainerView {
     let verdict = verdict(what, u32::try_from(restarts).unwrap());
+    let own_reason: Option<WorkspaceReason> = serde_json::from_value(json!(what)).ok();
     ContainerView {
         name: name.into(),
         restarts,
@@ -352,9 +354,9 @@ pub fn ended(name: &str, restarts: i32, what: &str, exit_code: i32, second: i64)
             exit_code,
             began: Some(at(second - 50)),
             at: Some(at(second)),
-            own_reason: serde_json::from_value(json!(what)).ok(),
+            own_reason,
             verdict,
-            why: None,
+            why: own_reason.map(|_| "It has found it so.".into()),
         }),
         ..ContainerView::default()
     }
