@@ -3,13 +3,10 @@
 //! When to ask, and what follows, is decided by `reach`.
 
 use std::fmt::Display;
-use std::sync::Arc;
 
-use super::reach::{AwsResource, Place, Seen};
+use super::reach::{At, AwsResource, Place, Seen};
 use crate::ask::Asked;
-use crate::runtime::objects::key_of;
-use leaderboard_api as api;
-use leaderboard_api::Leaderboard;
+use leaderboard_api::{DynamoTable, Leaderboard, SqsQueue};
 use leaderboard_aws::archive::{Archive, ArchiveError};
 use leaderboard_aws::clients::Aws;
 use leaderboard_aws::fault::Fault;
@@ -22,38 +19,29 @@ use leaderboard_policy::ask::Failure;
 const NO_RUN: &str = "none/";
 
 /// The places that a Leaderboard names.
-pub(super) fn named(leaderboard: &Arc<Leaderboard>) -> Vec<Place> {
+pub(super) fn named(leaderboard: &Leaderboard) -> Vec<Place> {
     let spec = &leaderboard.spec;
-    let at = |region: &Option<String>, endpoint: &Option<String>| {
-        let place = endpoint.as_ref().or(region.as_ref());
-        place.map(|place| format!(" at {place}")).unwrap_or_default()
-    };
-    let (region, endpoint) = (&spec.storage.s3.region, &spec.storage.s3.endpoint);
-    let bucket = format!("the bucket {}{}", spec.storage.s3.bucket, at(region, endpoint));
-    let mut places = vec![(AwsResource::Bucket, bucket)];
+    let mut places = vec![(AwsResource::Bucket, At::Bucket(spec.storage.s3.clone()))];
     if let Some(table) = spec.dynamo_table() {
-        let keys = table.partition_key.as_deref().zip(table.sort_key.as_deref());
-        let keys = keys.map(|(team, submission)| format!(" by {team} and {submission}"));
-        let (keys, at) = (keys.unwrap_or_default(), at(&table.region, &table.endpoint));
-        places.push((AwsResource::Table, format!("the table {}{keys}{at}", table.name)));
+        places.push((AwsResource::Table, At::Table(table.clone())));
         if !spec.observes() {
-            places.push((AwsResource::Rows, format!("the rows of {}{keys}{at}", table.name)));
+            places.push((AwsResource::Rows, At::Table(table.clone())));
         }
     }
     if let Some(queue) = spec.sqs() {
-        let at = at(&queue.region, &queue.endpoint);
-        places.push((AwsResource::Queue, format!("the queue {}{at}", queue.url)));
-        let dead = queue.dead_letter_url.as_ref();
-        places.extend(dead.map(|url| (AwsResource::DeadLetterQueue, format!("the dead-letter queue {url}{at}"))));
+        places.push((AwsResource::Queue, At::Queue(queue.clone())));
+        let dead = queue.dead_letter_url.clone();
+        let dead = dead.map(|url| At::Queue(SqsQueue { url, ..queue.clone() }));
+        places.extend(dead.map(|queue| (AwsResource::DeadLetterQueue, queue)));
     }
     if let Some(group) = spec.log_group().filter(|group| group.retention_days.is_some()) {
-        let at = at(&group.region, &group.endpoint);
-        places.push((AwsResource::LogGroup, format!("the log group {}{at}", group.name)));
+        places.push((AwsResource::LogGroup, At::LogGroup(group.clone())));
     }
-    let place = |(resource, address)| Place {
+    let generation = leaderboard.metadata.generation;
+    let place = |(resource, at)| Place {
         resource,
-        address,
-        leaderboard: Arc::clone(leaderboard),
+        at,
+        generation,
     };
     places.into_iter().map(place).collect()
 }
@@ -61,34 +49,29 @@ pub(super) fn named(leaderboard: &Arc<Leaderboard>) -> Vec<Place> {
 /// Asks for one place.
 pub(super) async fn ask(aws: Aws, asked: Asked<Place>) -> Result<Seen, Failure> {
     let (aws, place) = (&aws, &asked.question);
-    let spec = &place.leaderboard.spec;
-    let answer = match (place.resource, spec.dynamo_table(), spec.sqs(), spec.log_group()) {
-        (AwsResource::Table, Some(table), ..) => of_table(Table::describe(aws, table).await),
-        (AwsResource::Rows, Some(table), ..) => of_table(try_rows(aws, table).await),
-        (AwsResource::Queue, _, Some(queue), _) => of_queue(queue::check(aws, queue, &queue.url).await),
-        (AwsResource::DeadLetterQueue, _, Some(queue), _) => {
-            let url = queue.dead_letter_url.as_deref().unwrap_or_default();
-            of_queue(queue::check(aws, queue, url).await)
+    let answer = match &place.at {
+        At::Bucket(storage) => {
+            let prefix = format!("{}{NO_RUN}", storage.prefix.as_deref().unwrap_or_default());
+            let archive = Archive::of_storage(aws, storage).at_prefix(prefix);
+            of_bucket(archive.prefix_is_empty().await)
         }
-        (AwsResource::LogGroup, .., Some(group)) => {
+        At::Table(table) if place.resource == AwsResource::Rows => of_table(try_rows(aws, table).await),
+        At::Table(table) => of_table(Table::describe(aws, table).await),
+        At::Queue(queue) => of_queue(queue::check(aws, queue, &queue.url).await),
+        At::LogGroup(group) => {
             let days = group.retention_days.unwrap_or_default();
             of_log_group(log_groups::keep(aws, group, days).await)
         }
-        _ => {
-            let prefix = format!("{}{NO_RUN}", spec.storage.s3.prefix.as_deref().unwrap_or_default());
-            let archive = Archive::of_storage(aws, &spec.storage.s3).at_prefix(prefix);
-            of_bucket(archive.prefix_is_empty().await)
-        }
     };
     if let Ok(Seen { hidden: Some(why), .. }) | Err(Failure { why, .. }) = &answer {
-        let leaderboard = key_of(place.leaderboard.as_ref());
-        tracing::warn!(%leaderboard, place = place.address, why, "the bucket, table, queue or log group cannot be reached");
+        let (leaderboard, place) = (&asked.about, place.resource);
+        tracing::warn!(%leaderboard, ?place, why, "the bucket, table, queue or log group cannot be reached");
     }
     answer
 }
 
 /// Writes to the table, because the right to describe it does not include the right to write rows.
-async fn try_rows(aws: &Aws, table: &api::DynamoTable) -> Result<(), TableError> {
+async fn try_rows(aws: &Aws, table: &DynamoTable) -> Result<(), TableError> {
     Table::describe(aws, table).await?.try_write().await
 }
 
@@ -197,27 +180,36 @@ mod tests {
         });
         let places = |spec: &serde_json::Value| {
             let board = Leaderboard::new("one", serde_json::from_value(spec.clone()).unwrap());
-            let named = named(&Arc::new(board)).into_iter();
-            named.map(|place| place.address).collect::<Vec<_>>()
+            let named = named(&board).into_iter().map(|place| {
+                let name = match place.at {
+                    At::Bucket(storage) => storage.bucket,
+                    At::Table(table) => table.name,
+                    At::Queue(queue) => queue.url,
+                    At::LogGroup(group) => group.name,
+                };
+                (place.resource, name)
+            });
+            named.collect::<Vec<_>>()
         };
-        assert_eq!(places(&spec), ["the bucket bucket"]);
+        let of = |resource, name: &str| (resource, name.to_owned());
+        assert_eq!(places(&spec), [of(AwsResource::Bucket, "bucket")]);
         spec["table"] = json!({"dynamoDB": {"name": "rows", "region": "eu-west-1"}});
         spec["queue"] = json!({"sqs": {"url": "https://sqs/one", "deadLetterURL": "https://sqs/dead"}});
         let all = [
-            "the bucket bucket",
-            "the table rows at eu-west-1",
-            "the rows of rows at eu-west-1",
-            "the queue https://sqs/one",
-            "the dead-letter queue https://sqs/dead",
+            of(AwsResource::Bucket, "bucket"),
+            of(AwsResource::Table, "rows"),
+            of(AwsResource::Rows, "rows"),
+            of(AwsResource::Queue, "https://sqs/one"),
+            of(AwsResource::DeadLetterQueue, "https://sqs/dead"),
         ];
         assert_eq!(places(&spec), all);
         let mut observing = spec.clone();
         observing["evalai"]["mode"] = json!("Observe");
-        assert!(!places(&observing).contains(&all[2].to_owned()), "none is written");
+        assert!(!places(&observing).contains(&all[2]), "none is written");
         // A group that is the host's own is left alone.
         spec["logs"] = json!({"cloudWatch": {"name": "logs"}});
         assert_eq!(places(&spec), all);
         spec["logs"] = json!({"cloudWatch": {"name": "logs", "retentionDays": 30}});
-        assert_eq!(places(&spec).last().unwrap(), "the log group logs");
+        assert_eq!(places(&spec).last(), Some(&of(AwsResource::LogGroup, "logs")));
     }
 }

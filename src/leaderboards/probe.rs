@@ -106,7 +106,10 @@ impl Asks {
     pub(super) fn known(&self, leaderboard: &Arc<Leaderboard>) -> Looked {
         let uid = key_of(leaderboard.as_ref()).uid;
         let named = places::named(leaderboard).into_iter();
-        let known = |place: Place| Some((place.clone(), self.places.get(&place.resource)?.get(&uid)));
+        let known = |place: Place| {
+            let lookup = self.places.get(&place.resource)?.get(&uid);
+            Some((place, lookup))
+        };
         Looked {
             token: self.token.get(&uid),
             pods: self.pods.get(&uid),

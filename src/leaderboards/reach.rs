@@ -3,12 +3,11 @@
 //! Pure: `places` asks, `decide` makes the condition `Ready` of the answers. An answer counts at once. Silence counts as `Unknown`, once
 //! it has lasted for [`PATIENCE`]: its cause is not known. A service that is away for a minute makes nothing flap.
 
-use std::sync::Arc;
 use std::time::Duration;
 
 use leaderboard_api::conditions::Truth;
 use leaderboard_api::text::sentence;
-use leaderboard_api::{Leaderboard, Reason};
+use leaderboard_api::{DynamoTable, LogGroup, Reason, S3Bucket, SqsQueue};
 use leaderboard_base::backoff::Backoff;
 use leaderboard_policy::ask::{Ask, Failure, Lookup, Service};
 use leaderboard_policy::leaderboards::view::Unreachable;
@@ -55,20 +54,23 @@ impl AwsResource {
     }
 }
 
-/// One place that a Leaderboard names. An edit of the Leaderboard asks anew.
-#[derive(Clone, Debug)]
+/// One place that a Leaderboard names.
+#[derive(Clone, Debug, PartialEq)]
 pub struct Place {
     pub resource: AwsResource,
-    /// Where it is, in words: elsewhere it is another one.
-    pub address: String,
-    pub leaderboard: Arc<Leaderboard>,
+    pub at: At,
+    /// Generation of the Leaderboard: an edit asks anew.
+    pub generation: Option<i64>,
 }
 
-impl PartialEq for Place {
-    fn eq(&self, other: &Self) -> bool {
-        let generation = |place: &Self| place.leaderboard.metadata.generation;
-        (self.resource, &self.address, generation(self)) == (other.resource, &other.address, generation(other))
-    }
+/// Where a place is: elsewhere it is another one.
+#[derive(Clone, Debug, PartialEq)]
+pub enum At {
+    Bucket(S3Bucket),
+    Table(DynamoTable),
+    /// The queue itself, or the dead-letter queue in its place.
+    Queue(SqsQueue),
+    LogGroup(LogGroup),
 }
 
 /// The answer of a place.
@@ -87,12 +89,11 @@ impl Ask for Place {
     const LONGEST: Duration = Duration::from_secs(10);
 
     fn service(&self) -> Service {
-        let spec = &self.leaderboard.spec;
-        match (self.resource, spec.dynamo_table(), spec.sqs(), spec.log_group()) {
-            (AwsResource::Table | AwsResource::Rows, Some(table), ..) => Service::table(table),
-            (AwsResource::Queue | AwsResource::DeadLetterQueue, _, Some(queue), _) => Service::queue(queue),
-            (AwsResource::LogGroup, .., Some(group)) => Service::log_group(group),
-            _ => Service::bucket(&spec.storage.s3),
+        match &self.at {
+            At::Bucket(storage) => Service::bucket(storage),
+            At::Table(table) => Service::table(table),
+            At::Queue(queue) => Service::queue(queue),
+            At::LogGroup(group) => Service::log_group(group),
         }
     }
 
@@ -153,7 +154,7 @@ fn said<'a>(place: &Place, lookup: &'a Lookup<Place>) -> Option<(Truth, &'a str)
     let patient = lookup.silence.as_ref().filter(|silence| silence.lasts < PATIENCE);
     let before = patient.and_then(|silence| silence.before.as_ref());
     let mut answers = [before, lookup.last.as_ref()].into_iter().flatten();
-    let answer = answers.find(|answer| answer.question.address == place.address)?;
+    let answer = answers.find(|answer| answer.question.at == place.at)?;
     match answer.result.as_ref() {
         Ok(seen) => Some((Truth::Unknown, seen.hidden.as_ref()?)),
         Err(failure) if failure.is_refused => Some((Truth::False, &failure.why)),
@@ -170,8 +171,9 @@ pub(super) fn capitalized(text: &str) -> String {
 
 #[cfg(test)]
 mod tests {
+    use std::sync::Arc;
+
     use super::*;
-    use crate::fixtures::leaderboard;
     use leaderboard_policy::ask::{Answered, Silence};
 
     type Found = Result<Seen, Failure>;
@@ -187,11 +189,11 @@ mod tests {
         Err(Failure::silent("it does not answer; check the network"))
     }
 
-    fn place(resource: AwsResource, address: &str) -> Place {
+    fn place(resource: AwsResource, bucket: &str) -> Place {
         Place {
             resource,
-            address: address.into(),
-            leaderboard: Arc::new(leaderboard("carla", "http://127.0.0.1:1")),
+            at: At::Bucket(serde_json::from_value(serde_json::json!({"bucket": bucket})).unwrap()),
+            generation: Some(1),
         }
     }
 
@@ -271,7 +273,7 @@ mod tests {
     fn an_edit_asks_anew_and_another_address_has_nothing_of_the_old_one() {
         let one = place(AwsResource::Queue, "one");
         let mut edited = one.clone();
-        Arc::make_mut(&mut edited.leaderboard).metadata.generation = Some(2);
+        edited.generation = Some(2);
         assert_ne!(one, edited);
         let (_, lookup) = found(AwsResource::Queue, Some(bad()), None);
         assert_eq!(said(&edited, &lookup).map(|(truth, _)| truth), Some(Truth::False));
