@@ -197,29 +197,24 @@ async fn apply(client: &Client, leaderboard: &Leaderboard) -> Policy {
     }
 }
 
-/// The last measurement for this generation: that of a Pod which this process has seen, or else that of the condition. While the condition
-/// shows something else, the one that this process remembers. None if there is none, or the condition does not show any.
+/// The last measurement for this generation: that of a Pod which this process has seen, or else that of the condition, which is remembered
+/// while the condition shows something else. None if there is none, or the condition does not show any.
 pub(super) fn measured(state: &LeaderboardState, leaderboard: &Leaderboard) -> Option<WorkspaceVerdict> {
     let network = &leaderboard.spec.network;
     if network.policy == PolicySource::External || network.enforcement == Enforcement::Disabled {
         // The condition does not show it.
         return None;
     }
-    let (uid, generation) = (uid_of(leaderboard), leaderboard.metadata.generation);
-    let remembered = || {
-        let (of, verdict) = state.read(&uid, |entry| entry.measured.clone())?;
-        (of == generation).then_some(verdict)
-    };
-    state
-        .found(&uid, generation)
-        .or_else(|| known(leaderboard))
-        .or_else(remembered)
-}
-
-/// Notes what was measured, for the time when no Pod and no condition shows it.
-pub(super) fn remember(state: &LeaderboardState, leaderboard: &Leaderboard, found: &WorkspaceVerdict) {
-    let found = (leaderboard.metadata.generation, found.clone());
-    state.change(&uid_of(leaderboard), |entry| entry.measured = Some(found));
+    let (uid, generation) = (uid_of(leaderboard), leaderboard.metadata.generation?);
+    if let Some(verdict) = known(leaderboard) {
+        let found = Found {
+            generation,
+            at: None,
+            verdict,
+        };
+        state.note_found(&uid, found);
+    }
+    state.found(&uid, generation)
 }
 
 /// Remembers what a Pod has found. That of the newest spec counts, and of its Pods that of the one that ended its `workspace` last.
@@ -231,7 +226,7 @@ pub fn note_finding(state: &LeaderboardState, leaderboard: &Leaderboard, pod: &P
     if let Some(generation) = generation.and_then(|generation| generation.parse().ok()) {
         let found = Found {
             generation,
-            at,
+            at: Some(at),
             verdict,
         };
         state.note_found(&uid_of(leaderboard), found);
@@ -256,8 +251,8 @@ fn is_pod_of(pod: &Pod, leaderboard: &Leaderboard) -> bool {
         && meta.namespace.as_deref() == leaderboard.metadata.namespace.as_deref()
 }
 
-/// The isolation that a Pod has found, and when; the time is None if the kubelet reports none.
-fn finding(pod: &Pod) -> Option<(Option<Timestamp>, WorkspaceVerdict)> {
+/// The isolation that a Pod has found, and when; that is the beginning of time if the kubelet reports none.
+fn finding(pod: &Pod) -> Option<(Timestamp, WorkspaceVerdict)> {
     let mut containers = pod.status.init_container_statuses.iter();
     let end = containers.find(|c| &*c.name == names::CONTAINER_WORKSPACE)?.ended()?;
     let verdict = match WorkspaceVerdict::parse(end.message.as_deref()?) {
@@ -276,7 +271,7 @@ fn finding(pod: &Pod) -> Option<(Option<Timestamp>, WorkspaceVerdict)> {
             | WorkspaceReason::NotIsolated
             | WorkspaceReason::NotKnownIsolated
     );
-    is_finding.then_some((end.finished_at.as_ref().map(|at| at.0), verdict))
+    is_finding.then_some((end.finished_at.as_ref().map_or(Timestamp::MIN, |at| at.0), verdict))
 }
 
 /// The condition's measurement for this generation, which a Pod made that is gone.

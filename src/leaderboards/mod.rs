@@ -106,9 +106,6 @@ async fn drive(leaderboard: Arc<Leaderboard>, uses: Uses<'_>) -> Result<Duration
         ..view
     };
     let plan = decide(&view);
-    if let Some(found) = &view.measured {
-        isolation::remember(state, &leaderboard, found);
-    }
     serve(uses, &view, &plan, &looked);
     let mut version = leaderboard.metadata.resource_version.clone();
     if let Some(wanted) = plan.finalizer {

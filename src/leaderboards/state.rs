@@ -46,6 +46,7 @@ impl Applied {
 #[derive(Clone, Debug)]
 pub(super) struct Found {
     pub(super) generation: i64,
+    /// None: the condition shows it, and its Pod is gone.
     pub(super) at: Option<Timestamp>,
     pub(super) verdict: WorkspaceVerdict,
 }
@@ -72,9 +73,7 @@ pub(super) struct Entry {
     /// The sources of its stored standings, and the time of their write.
     pub(super) standings: (Option<Made>, Option<Timestamp>),
     pub(super) applied: Option<Applied>,
-    /// The last measurement, with the generation it is for.
-    pub(super) measured: Option<(Option<i64>, WorkspaceVerdict)>,
-    /// The last finding of its Pods.
+    /// The last finding of its Pods, or else of the condition.
     pub(super) found: Option<Found>,
     /// The other installation that drives it, once that was reported.
     pub(super) other: Option<String>,
@@ -110,9 +109,9 @@ impl LeaderboardState {
         });
     }
 
-    pub(super) fn found(&self, uid: &str, generation: Option<i64>) -> Option<WorkspaceVerdict> {
+    pub(super) fn found(&self, uid: &str, generation: i64) -> Option<WorkspaceVerdict> {
         let found = self.read(uid, |entry| entry.found.clone())?;
-        (Some(found.generation) == generation).then_some(found.verdict)
+        (found.generation == generation).then_some(found.verdict)
     }
 
     pub(super) fn note_found(&self, uid: &str, found: Found) {
