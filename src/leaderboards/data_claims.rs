@@ -9,27 +9,15 @@ use super::priority::Problems;
 use crate::kubernetes::call;
 use leaderboard_api::{DataSource, Leaderboard};
 
-/// How a claim was found.
-#[derive(Clone, Debug, PartialEq, Eq)]
-enum ObservedClaim {
-    Unreadable,
-    Missing,
-    /// It is there, with these access modes.
-    Present(Vec<String>),
-}
-
 /// Reads the claims that the Leaderboard names.
 pub(super) async fn look(client: &Client, leaderboard: &Leaderboard) -> Problems {
     let namespace = leaderboard.namespace().unwrap_or_default();
     let api: Api<PersistentVolumeClaim> = Api::namespaced(client.clone(), &namespace);
     let mut problems = Problems::default();
     for (field, claim) in named(leaderboard) {
-        let seen = match call("reading the PersistentVolumeClaim", claim, api.get(claim)).await {
-            Ok(found) => ObservedClaim::Present(access_modes(found)),
-            Err(error) if error.is_gone() => ObservedClaim::Missing,
-            Err(_) => ObservedClaim::Unreadable,
-        };
-        judge(field, claim, &seen, &mut problems);
+        if let Ok(found) = call("reading the PersistentVolumeClaim", claim, api.get_opt(claim)).await {
+            judge(field, claim, found.map(access_modes).as_deref(), &mut problems);
+        }
     }
     problems
 }
@@ -54,19 +42,22 @@ fn access_modes(claim: PersistentVolumeClaim) -> Vec<String> {
     of_volume.or(asked_for).unwrap_or_default()
 }
 
-fn judge(field: &str, claim: &str, seen: &ObservedClaim, problems: &mut Problems) {
+/// `modes`: its access modes; None: there is no such claim.
+fn judge(field: &str, claim: &str, modes: Option<&[String]>, problems: &mut Problems) {
     let what = format!("PersistentVolumeClaim {claim} of evaluation.container.{field}");
-    let is = |mode: &str| matches!(seen, ObservedClaim::Present(modes) if modes.iter().any(|found| found == mode));
-    let limit = match seen {
-        ObservedClaim::Unreadable => return,
-        ObservedClaim::Missing => {
-            let text = format!("{what} does not exist in this namespace. Create it, or correct its name.");
-            problems.refused.get_or_insert(text);
-            return;
-        }
-        ObservedClaim::Present(_) if is("ReadOnlyMany") || is("ReadWriteMany") => return,
-        ObservedClaim::Present(_) if is("ReadWriteOnce") => "on one node at a time, to which all Pods are pinned",
-        ObservedClaim::Present(_) => "by one Pod at a time, so that submissions run one by one",
+    let Some(modes) = modes else {
+        let text = format!("{what} does not exist in this namespace. Create it, or correct its name.");
+        problems.refused.get_or_insert(text);
+        return;
+    };
+    let is = |mode: &str| modes.iter().any(|found| found == mode);
+    if is("ReadOnlyMany") || is("ReadWriteMany") {
+        return;
+    }
+    let limit = if is("ReadWriteOnce") {
+        "on one node at a time, to which all Pods are pinned"
+    } else {
+        "by one Pod at a time, so that submissions run one by one"
     };
     problems.notes.push(format!(
         "{what} can be mounted {limit}. Use one with ReadOnlyMany or ReadWriteMany."
@@ -112,11 +103,10 @@ mod tests {
 
     #[test]
     fn a_missing_claim_is_refused_and_one_that_few_pods_get_is_noted() {
-        let present = |modes: &[&str]| ObservedClaim::Present(modes.iter().map(|mode| (*mode).to_owned()).collect());
+        let present = |modes: &[&str]| Some(modes.iter().map(|mode| (*mode).to_owned()).collect::<Vec<_>>());
         let what = "PersistentVolumeClaim d of evaluation.container.dataset";
         for (seen, refused, note) in [
-            (ObservedClaim::Unreadable, None, None),
-            (ObservedClaim::Missing, Some("does not exist in this namespace"), None),
+            (None, Some("does not exist in this namespace"), None),
             (present(&["ReadOnlyMany"]), None, None),
             (present(&["ReadWriteMany"]), None, None),
             (present(&["ReadWriteOnce", "ReadOnlyMany"]), None, None),
@@ -132,7 +122,7 @@ mod tests {
             ),
         ] {
             let mut problems = Problems::default();
-            judge("dataset", "d", &seen, &mut problems);
+            judge("dataset", "d", seen.as_deref(), &mut problems);
             let begins = |found: Option<&String>, rest: Option<&str>| match (found, rest) {
                 (Some(found), Some(rest)) => found.starts_with(&format!("{what} {rest}")),
                 (found, rest) => found.is_none() && rest.is_none(),

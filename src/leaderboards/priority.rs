@@ -28,15 +28,6 @@ pub(super) struct Problems {
     pub(super) notes: Vec<String>,
 }
 
-/// How a class was found.
-#[derive(Clone, Copy, Debug, PartialEq, Eq)]
-enum ObservedClass {
-    Unreadable,
-    Missing,
-    Preempts,
-    Waits,
-}
-
 /// The classes that the Pods of the tracks have.
 pub(super) fn asked(tracks: &[Track], pods: &[TrackPods]) -> BTreeMap<String, Asked> {
     let mut found: BTreeMap<String, Asked> = BTreeMap::new();
@@ -57,30 +48,26 @@ pub(super) async fn look(client: &Client, asked: &BTreeMap<String, Asked>) -> Pr
     let api: Api<PriorityClass> = Api::all(client.clone());
     let mut problems = Problems::default();
     for (class, asked) in asked {
-        let seen = match call("reading the PriorityClass", class, api.get(class)).await {
-            Ok(found) if found.preemption_policy.as_deref() == Some("Never") => ObservedClass::Waits,
-            Ok(_) => ObservedClass::Preempts,
-            Err(error) if error.is_gone() => ObservedClass::Missing,
-            Err(_) => ObservedClass::Unreadable,
-        };
-        judge(class, asked, seen, &mut problems);
+        if let Ok(found) = call("reading the PriorityClass", class, api.get_opt(class)).await {
+            judge(class, asked, found.as_ref(), &mut problems);
+        }
     }
     problems
 }
 
-fn judge(class: &str, asked: &Asked, seen: ObservedClass, problems: &mut Problems) {
+fn judge(class: &str, asked: &Asked, found: Option<&PriorityClass>, problems: &mut Problems) {
     let named = if asked.tracks.len() == 1 { "track" } else { "tracks" };
     let tracks = asked.tracks.join(", ");
     let what = format!("PriorityClass {class} of the {named} {tracks}");
-    let text = match seen {
-        ObservedClass::Unreadable | ObservedClass::Waits => return,
-        ObservedClass::Missing => format!("{what} does not exist. Create it, or correct its name."),
-        ObservedClass::Preempts => format!(
+    let text = match found {
+        Some(found) if found.preemption_policy.as_deref() == Some("Never") => return,
+        None => format!("{what} does not exist. Create it, or correct its name."),
+        Some(_) => format!(
             "{what} preempts: one run would end another, which then repeats some work of each worker. Set preemptionPolicy: Never \
              in the class."
         ),
     };
-    if seen == ObservedClass::Missing || asked.is_of_track {
+    if found.is_none() || asked.is_of_track {
         problems.refused.get_or_insert(text);
     } else {
         problems.notes.push(text);
@@ -121,13 +108,17 @@ mod tests {
 
     #[test]
     fn a_class_that_preempts_is_refused_where_a_track_names_it_and_noted_where_the_overrides_do() {
+        let class = |policy: Option<&str>| PriorityClass {
+            preemption_policy: policy.map(str::to_owned),
+            ..PriorityClass::default()
+        };
+        let (waits, preempts) = (class(Some("Never")), class(None));
         for (is_of_track, seen, is_refused, has_note) in [
-            (true, ObservedClass::Waits, false, false),
-            (true, ObservedClass::Unreadable, false, false),
-            (true, ObservedClass::Preempts, true, false),
-            (false, ObservedClass::Preempts, false, true),
-            (true, ObservedClass::Missing, true, false),
-            (false, ObservedClass::Missing, true, false),
+            (true, Some(&waits), false, false),
+            (true, Some(&preempts), true, false),
+            (false, Some(&preempts), false, true),
+            (true, None, true, false),
+            (false, None, true, false),
         ] {
             let asked = Asked {
                 tracks: vec!["a".into(), "b".into()],
