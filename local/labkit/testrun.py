@@ -28,6 +28,7 @@ from . import (
     lanes,
     packages,
     pagetest,
+    processors,
     pythonenv,
     quickstart,
     rights,
@@ -97,11 +98,13 @@ class Result:
     failure: str
     # What this machine lacks for it.
     lacks: str = ""
+    # Seconds that the processors have worked for it.
+    cpu: float = 0
 
 
 def run(settings: Settings, core: bool, name_filter: str, only: Sequence[str]) -> bool:
     """Runs the layers, going on after a failure; returns whether all of them passed."""
-    started = time.monotonic()
+    started, worked = time.monotonic(), processors.machine()
     chosen = [layer for layer in LAYERS if not (core and layer.needs_root) and (not only or layer.name in only)]
     if not chosen:
         raise LabError("no layer is left to run: the cluster's needs a node, so leave --core out")
@@ -116,7 +119,8 @@ def run(settings: Settings, core: bool, name_filter: str, only: Sequence[str]) -
         for layer in at_once[0] if len(at_once) == 1 else []:
             results.append(run_layer(plan, layer, results))
     results.sort(key=lambda result: NAMES.index(result.name))
-    print("\n".join([table(results, time.monotonic() - started), *plan.summary.lines()]), flush=True)
+    lines = table(results, time.monotonic() - started, processors.machine() - worked)
+    print("\n".join([lines, *plan.summary.lines()]), flush=True)
     return not any(result.failure for result in results)
 
 
@@ -154,7 +158,7 @@ def run_layer(plan: Plan, layer: Layer, before: Sequence[Result]) -> Result:
     if layer.name != "lab" and any(result.name == "build" and result.failure for result in before):
         return Result(layer.name, 0, "not run, as the build failed")
     say(f"--- {layer.name}: {layer.about}")
-    started = time.monotonic()
+    started, worked = time.monotonic(), processors.of_this_process()
     failure, lacks = "", ""
     try:
         layer.work(plan)
@@ -164,20 +168,29 @@ def run_layer(plan: Plan, layer: Layer, before: Sequence[Result]) -> Result:
     except LabError as error:
         failure = str(error)
         say(f"{layer.name} failed: {failure}")
-    return Result(layer.name, time.monotonic() - started, failure, lacks)
+    cpu = processors.of_this_process() - worked
+    return Result(layer.name, time.monotonic() - started, failure, lacks, cpu)
 
 
-def table(results: Sequence[Result], whole: float) -> str:
-    """Each layer with its time, what failed or was not run, and the time of the whole run."""
-    lines = [""]
+def table(results: Sequence[Result], whole: float, machine: float) -> str:
+    """Each layer with its time, the seconds that the processors have worked for it, and what failed or was not run; and the whole run.
+
+    The machine's seconds have what no layer has waited for: the cluster, and servers that end after their tests.
+    """
+    lines = ["", f"{'':<9}{'took':>13}{'CPU s':>8}"]
     for result in results:
         lacks = f"not run: {result.lacks}" if result.lacks else ""
-        lines.append(f"{result.name:<9}{seconds(result.seconds):>13}   {result.failure or lacks or 'passed'}")
+        end = result.failure or lacks or "passed"
+        lines.append(f"{result.name:<9}{seconds(result.seconds):>13}{result.cpu:>8.0f}   {end}")
+    others = machine - sum(result.cpu for result in results)
+    if others > 0:
+        about = "the cluster's parts and Pods, servers that outlive their tests, other programs"
+        lines.append(f"{'others':<9}{'':>13}{others:>8.0f}   {about}")
     failed = [result.name for result in results if result.failure]
     left_out = [result.name for result in results if result.lacks]
     end = f"failed: {', '.join(failed)}" if failed else "passed"
     end += f"; not run: {', '.join(left_out)}" if left_out else ""
-    lines.append(f"{'all':<9}{seconds(whole):>13}   {end}")
+    lines.append(f"{'all':<9}{seconds(whole):>13}{machine:>8.0f}   {end}")
     return "\n".join(lines)
 
 
@@ -262,10 +275,11 @@ def in_cluster(plan: Plan) -> None:
     }
     lines = plan.settings.logs / "matrix.tsv"
     lines.unlink(missing_ok=True)
-    began = rights.now()
+    began, worked = rights.now(), parts_worked(plan.settings)
     try:
         run_cluster_tests(plan, {**env, "LEADERBOARD_MATRIX": str(lines)})
     finally:
+        say(f"CPU s next to the tests: {processors.since(worked, parts_worked(plan.settings))}")
         if lines.exists():
             text = lines.read_text()
             plan.summary.cases += failed_cases(text)
@@ -275,6 +289,10 @@ def in_cluster(plan: Plan) -> None:
         say(rights.check(kube.of_lab(plan.settings, folder), plan.settings.repository, plan.settings.audit_log, began))
         policies = plan.settings.repository / "examples" / "aws" / "iam"
         say(awsrecorded.check(policies, plan.settings.aws_calls, began))
+
+
+def parts_worked(settings: Settings) -> dict[str, float]:
+    return processors.of_cluster(settings, (*cluster.NAMES, *cluster.GUESTS))
 
 
 def run_cluster_tests(plan: Plan, env: dict[str, str]) -> None:

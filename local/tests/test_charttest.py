@@ -152,11 +152,11 @@ class Driver(unittest.TestCase):
         self.assertEqual(testrun.names_of_tests({"packages": packages}), ["api", "process"])
 
     def test_the_table_names_what_failed(self) -> None:
-        lines = testrun.table(
-            [Result("lab", 1.0, ""), Result("unit", 61.0, "cargo test found failures, see above")], 61.5
-        ).splitlines()
-        self.assertTrue(lines[1].endswith("passed") and lines[2].endswith("see above"))
-        self.assertRegex(lines[3], r"^all +62 s   failed: unit$")
+        results = [Result("lab", 1.0, "", cpu=2.0), Result("unit", 61.0, "cargo test found failures, see above")]
+        lines = testrun.table(results, 61.5, 3.0).splitlines()
+        self.assertTrue(lines[2].endswith("passed") and lines[3].endswith("see above"))
+        self.assertRegex(lines[4], r"^others +1   the cluster")
+        self.assertRegex(lines[5], r"^all +62 s +3   failed: unit$")
 
 
 if __name__ == "__main__":
