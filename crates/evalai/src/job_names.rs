@@ -5,99 +5,44 @@
 use std::collections::VecDeque;
 use std::fmt;
 
-use serde::de::{Deserialize, Deserializer, IgnoredAny, MapAccess, SeqAccess, Visitor};
+use serde::de::{Deserializer, SeqAccess, Visitor};
+use serde_json::value::RawValue;
 
 /// Names that are kept, the last ones.
 const MOST: usize = 256;
 /// Bytes of the longest that is kept: no name of Kubernetes is longer.
 const LONGEST: usize = 253;
 
-/// The last names, in lower case. Whatever is no list of texts has none.
-#[derive(Debug, Default, PartialEq, Eq)]
-pub(super) struct JobNames(VecDeque<String>);
-
-impl From<JobNames> for Vec<String> {
-    fn from(names: JobNames) -> Self {
-        names.0.into()
-    }
+/// The last names of the field, in lower case. Whatever is no list of texts has none.
+pub(super) fn last_names(field: &RawValue) -> Vec<String> {
+    let mut reader = serde_json::Deserializer::from_str(field.get());
+    reader.deserialize_seq(LastNames).map(Vec::from).unwrap_or_default()
 }
 
-impl<'de> Deserialize<'de> for JobNames {
-    fn deserialize<D: Deserializer<'de>>(deserializer: D) -> Result<Self, D::Error> {
-        let names = match Part::deserialize(deserializer)? {
-            Part::List(names) => names,
-            Part::Name(_) | Part::Other => VecDeque::new(),
-        };
-        Ok(Self(names))
-    }
+fn name(part: &RawValue) -> Option<String> {
+    let name: String = serde_json::from_str(part.get()).ok()?;
+    (name.len() <= LONGEST).then(|| name.to_lowercase())
 }
 
-/// A value, as far as it matters here.
-enum Part {
-    Name(String),
-    List(VecDeque<String>),
-    Other,
-}
+struct LastNames;
 
-impl<'de> Deserialize<'de> for Part {
-    fn deserialize<D: Deserializer<'de>>(deserializer: D) -> Result<Self, D::Error> {
-        deserializer.deserialize_any(AnyPart)
-    }
-}
-
-struct AnyPart;
-
-impl<'de> Visitor<'de> for AnyPart {
-    type Value = Part;
+impl<'de> Visitor<'de> for LastNames {
+    type Value = VecDeque<String>;
 
     fn expecting(&self, out: &mut fmt::Formatter<'_>) -> fmt::Result {
-        out.write_str("any value")
+        out.write_str("a list")
     }
 
-    fn visit_str<E>(self, text: &str) -> Result<Part, E> {
-        let is_kept = text.len() <= LONGEST;
-        Ok(if is_kept {
-            Part::Name(text.to_lowercase())
-        } else {
-            Part::Other
-        })
-    }
-
-    fn visit_seq<A: SeqAccess<'de>>(self, mut list: A) -> Result<Part, A::Error> {
+    fn visit_seq<A: SeqAccess<'de>>(self, mut list: A) -> Result<Self::Value, A::Error> {
         let mut names = VecDeque::new();
-        while let Some(part) = list.next_element()? {
-            let Part::Name(name) = part else { continue };
+        while let Some(part) = list.next_element::<&RawValue>()? {
+            let Some(name) = name(part) else { continue };
             if names.len() == MOST {
                 names.pop_front();
             }
             names.push_back(name);
         }
-        Ok(Part::List(names))
-    }
-
-    fn visit_map<A: MapAccess<'de>>(self, mut map: A) -> Result<Part, A::Error> {
-        while map.next_entry::<IgnoredAny, IgnoredAny>()?.is_some() {}
-        Ok(Part::Other)
-    }
-
-    fn visit_unit<E>(self) -> Result<Part, E> {
-        Ok(Part::Other)
-    }
-
-    fn visit_bool<E>(self, _: bool) -> Result<Part, E> {
-        Ok(Part::Other)
-    }
-
-    fn visit_i64<E>(self, _: i64) -> Result<Part, E> {
-        Ok(Part::Other)
-    }
-
-    fn visit_u64<E>(self, _: u64) -> Result<Part, E> {
-        Ok(Part::Other)
-    }
-
-    fn visit_f64<E>(self, _: f64) -> Result<Part, E> {
-        Ok(Part::Other)
+        Ok(names)
     }
 }
 
@@ -106,7 +51,7 @@ mod tests {
     use super::*;
 
     fn read(text: &str) -> Vec<String> {
-        serde_json::from_str::<JobNames>(text).unwrap().into()
+        last_names(serde_json::from_str(text).unwrap())
     }
 
     #[test]

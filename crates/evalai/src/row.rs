@@ -8,8 +8,9 @@ use std::fmt;
 use jiff::Timestamp;
 use serde::{Deserialize, Deserializer};
 use serde_json::Value;
+use serde_json::value::RawValue;
 
-use super::job_names::JobNames;
+use super::job_names::last_names;
 use leaderboard_api::evalai_status::Status;
 use leaderboard_api::text::{LONGEST_NAME, one_line};
 use leaderboard_api::{Attempt, ImageReference, Order, names};
@@ -124,7 +125,7 @@ impl<'de> Deserialize<'de> for Row {
             #[serde(default)]
             input_file: Value,
             #[serde(default)]
-            job_name: JobNames,
+            job_name: Box<RawValue>,
         }
         let raw = Raw::deserialize(deserializer)?;
         let text = |value: &Value| value.as_str().map(str::to_owned);
@@ -144,7 +145,7 @@ impl<'de> Deserialize<'de> for Row {
             resumed_at: time(&raw.rerun_resumed_at),
             completed_at: time(&raw.completed_at),
             input_file: raw.input_file.as_str().map(FileUrl::from),
-            jobs: raw.job_name.into(),
+            jobs: last_names(&raw.job_name),
         })
     }
 }
