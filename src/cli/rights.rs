@@ -2,11 +2,11 @@
 
 use std::str::FromStr;
 
+use k8s_openapi::api::authorization::v1::ResourceAttributes;
 use k8s_openapi::api::rbac::v1::PolicyRule;
 use serde::Deserialize;
 
 use crate::kubernetes::Namespaces;
-use crate::kubernetes::preflight::Need;
 
 /// Rules, and where they apply.
 #[derive(Clone, Debug, Default, Deserialize)]
@@ -30,11 +30,9 @@ impl FromStr for Rights {
 
 impl Rights {
     /// Each right by itself.
-    pub fn needs<'a>(&'a self, served: &'a Namespaces, own: &'a str) -> Vec<Need<'a>> {
-        let served = served
-            .each()
-            .into_iter()
-            .flat_map(|namespace| all(&self.served, namespace));
+    pub fn needs(&self, served: &Namespaces, own: &str) -> Vec<ResourceAttributes> {
+        let served = served.each().into_iter();
+        let served = served.flat_map(|namespace| all(&self.served, namespace));
         served
             .chain(all(&self.cluster, None))
             .chain(all(&self.own, Some(own)))
@@ -42,25 +40,28 @@ impl Rights {
     }
 }
 
-fn all<'a>(rules: &'a [PolicyRule], namespace: Option<&'a str>) -> impl Iterator<Item = Need<'a>> {
+fn all(rules: &[PolicyRule], namespace: Option<&str>) -> impl Iterator<Item = ResourceAttributes> {
     rules.iter().flat_map(move |rule| of_rule(rule, namespace))
 }
 
-fn of_rule<'a>(rule: &'a PolicyRule, namespace: Option<&'a str>) -> Vec<Need<'a>> {
-    let names: Vec<Option<&str>> = match rule.resource_names.as_deref() {
+fn of_rule(rule: &PolicyRule, namespace: Option<&str>) -> Vec<ResourceAttributes> {
+    let names: Vec<Option<&String>> = match rule.resource_names.as_deref() {
         None | Some([]) => vec![None],
-        Some(names) => names.iter().map(|name| Some(name.as_str())).collect(),
+        Some(names) => names.iter().map(Some).collect(),
     };
     let mut needs = Vec::new();
     for group in rule.api_groups.iter().flatten() {
-        for resource in rule.resources.iter().flatten() {
+        for path in rule.resources.iter().flatten() {
+            let (resource, subresource) = path.split_once('/').unzip();
             for name in &names {
-                needs.extend(rule.verbs.iter().map(|verb| Need {
-                    group,
-                    resource,
-                    verb,
-                    namespace,
-                    name: *name,
+                needs.extend(rule.verbs.iter().map(|verb| ResourceAttributes {
+                    group: Some(group.clone()),
+                    resource: Some(resource.unwrap_or(path).to_owned()),
+                    subresource: subresource.map(str::to_owned),
+                    verb: Some(verb.clone()),
+                    namespace: namespace.map(str::to_owned),
+                    name: name.cloned(),
+                    ..ResourceAttributes::default()
                 }));
             }
         }
@@ -71,6 +72,7 @@ fn of_rule<'a>(rule: &'a PolicyRule, namespace: Option<&'a str>) -> Vec<Need<'a>
 #[cfg(test)]
 mod tests {
     use super::*;
+    use crate::kubernetes::preflight::described;
 
     #[test]
     fn each_right_of_a_rule_is_asked_for_where_the_rule_applies() {
@@ -82,11 +84,7 @@ mod tests {
         .parse()
         .unwrap();
         let served = Namespaces::of(["one", "two"].map(str::to_owned));
-        let asked: Vec<String> = rights
-            .needs(&served, "system")
-            .iter()
-            .map(ToString::to_string)
-            .collect();
+        let asked: Vec<String> = rights.needs(&served, "system").iter().map(described).collect();
         assert_eq!(
             asked,
             [

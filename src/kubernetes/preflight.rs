@@ -2,7 +2,6 @@
 //!
 //! Controller and bridge wait for the kinds at their start, because the definitions may be applied after the operator. `helm test` asks for both.
 
-use std::fmt;
 use std::time::Duration;
 
 use futures::{StreamExt, stream};
@@ -25,34 +24,26 @@ const KINDS_PAUSE: Duration = Duration::from_secs(2);
 /// Requests at once.
 const AT_ONCE: usize = 8;
 
-/// One thing that the process has to be allowed.
-#[derive(Clone, Copy, Debug, PartialEq, Eq)]
-pub struct Need<'a> {
-    /// Empty for the core group.
-    pub group: &'a str,
-    /// Plural; a sub-resource follows after a slash.
-    pub resource: &'a str,
-    pub verb: &'a str,
-    /// None: in every namespace, or of a kind that has none.
-    pub namespace: Option<&'a str>,
-    /// The one object that it is about; None: any.
-    pub name: Option<&'a str>,
-}
-
-impl fmt::Display for Need<'_> {
-    fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
-        write!(f, "{} {}", self.verb, self.resource)?;
-        if !self.group.is_empty() {
-            write!(f, " of {}", self.group)?;
-        }
-        if let Some(name) = self.name {
-            write!(f, " {name}")?;
-        }
-        match self.namespace {
-            Some(namespace) => write!(f, " in namespace {namespace}"),
-            None => f.write_str(" in all namespaces"),
-        }
-    }
+/// What the process has to be allowed, in words. Without a namespace it is a right in every one, or to a kind that has none.
+pub fn described(right: &ResourceAttributes) -> String {
+    let part = |before: &str, text: &Option<String>| match text.as_deref() {
+        None | Some("") => String::new(),
+        Some(text) => format!("{before}{text}"),
+    };
+    let parts = [
+        part("", &right.verb),
+        part(" ", &right.resource),
+        part("/", &right.subresource),
+        part(" of ", &right.group),
+        part(" ", &right.name),
+        part(" in namespace ", &right.namespace),
+    ];
+    let everywhere = if right.namespace.is_none() {
+        " in all namespaces"
+    } else {
+        ""
+    };
+    parts.concat() + everywhere
 }
 
 /// Registers the check for the kinds, so that the process is not ready before it is answered.
@@ -111,7 +102,7 @@ pub async fn kinds_missing(client: &Client, plurals: &[&str]) -> Option<String> 
 }
 
 /// A sentence for each need that is not met, in the order of needs.
-pub async fn access_missing(client: &Client, needs: &[Need<'_>]) -> Vec<String> {
+pub async fn access_missing(client: &Client, needs: &[ResourceAttributes]) -> Vec<String> {
     let reviews: Api<SelfSubjectAccessReview> = Api::all(client.clone());
     // Collected first: a stream of borrowing closures could not be sent to another thread.
     let asked: Vec<_> = needs.iter().map(|need| ask(&reviews, need)).collect();
@@ -119,22 +110,9 @@ pub async fn access_missing(client: &Client, needs: &[Need<'_>]) -> Vec<String> 
     answers.filter_map(|missing| async { missing }).collect().await
 }
 
-async fn ask(reviews: &Api<SelfSubjectAccessReview>, need: &Need<'_>) -> Option<String> {
-    let (resource, subresource) = match need.resource.split_once('/') {
-        Some((resource, sub)) => (resource, Some(sub.to_owned())),
-        None => (need.resource, None),
-    };
-    let attributes = ResourceAttributes {
-        group: Some(need.group.to_owned()),
-        resource: Some(resource.to_owned()),
-        subresource,
-        verb: Some(need.verb.to_owned()),
-        namespace: need.namespace.map(str::to_owned),
-        name: need.name.map(str::to_owned),
-        ..ResourceAttributes::default()
-    };
+async fn ask(reviews: &Api<SelfSubjectAccessReview>, need: &ResourceAttributes) -> Option<String> {
     let spec = SelfSubjectAccessReviewSpec {
-        resource_attributes: Some(attributes),
+        resource_attributes: Some(need.clone()),
         ..Default::default()
     };
     let review = SelfSubjectAccessReview {
@@ -143,7 +121,8 @@ async fn ask(reviews: &Api<SelfSubjectAccessReview>, need: &Need<'_>) -> Option<
     };
     let params = PostParams::default();
     let asked = reviews.create(&params, &review);
-    match call_within(CALL_LIMIT, "a review of access", need.resource, asked).await {
+    let need = described(need);
+    match call_within(CALL_LIMIT, "a review of access", &need, asked).await {
         Ok(answer) if answer.status.as_ref().is_some_and(|status| status.allowed) => None,
         Ok(_) => Some(format!("may not {need}; add the verb to the operator's role")),
         Err(error) => Some(format!("can't ask whether it may {need}: {}", error.cause())),

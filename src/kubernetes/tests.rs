@@ -14,10 +14,11 @@ use tokio::sync::{mpsc, watch};
 use tokio::time::timeout;
 use tower_test::mock::{Handle, pair};
 
+use k8s_openapi::api::authorization::v1::ResourceAttributes;
 use kube::ResourceExt;
 use kube::runtime::watcher::Config;
 
-use super::preflight::{Need, access_missing, await_kinds};
+use super::preflight::{access_missing, await_kinds};
 use super::*;
 use crate::observability::Observability;
 use leaderboard_api::Leaderboard;
@@ -417,28 +418,20 @@ async fn the_preflight_names_each_missing_verb() {
         )
     };
     let (client, _script) = scripted(vec![review(true), review(false)]);
+    let need = |verb: &str, group: &str, resource: &str| ResourceAttributes {
+        group: Some(group.into()),
+        resource: Some(resource.into()),
+        verb: Some(verb.into()),
+        ..ResourceAttributes::default()
+    };
     let needs = [
-        Need {
-            group: "batch",
-            resource: "jobs",
-            verb: "create",
-            namespace: None,
-            name: None,
+        need("create", "batch", "jobs"),
+        ResourceAttributes {
+            subresource: Some("status".into()),
+            namespace: Some("ns".into()),
+            ..need("patch", "leaderboard.carla.org", "submissions")
         },
-        Need {
-            group: "leaderboard.carla.org",
-            resource: "submissions/status",
-            verb: "patch",
-            namespace: Some("ns"),
-            name: None,
-        },
-        Need {
-            group: "",
-            resource: "pods",
-            verb: "list",
-            namespace: None,
-            name: None,
-        },
+        need("list", "", "pods"),
     ];
     let missing = access_missing(&client, &needs).await;
     assert_eq!(

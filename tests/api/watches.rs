@@ -3,13 +3,14 @@
 use std::time::Duration;
 
 use futures::StreamExt;
+use k8s_openapi::api::authorization::v1::ResourceAttributes;
 use k8s_openapi::api::core::v1::Event;
 use kube::api::{DeleteParams, Patch, PatchParams, PostParams};
 use kube::runtime::watcher::Config;
 use kube::{Api, ResourceExt};
 use leaderboard_api::Submission;
 use leaderboard_base::shutdown::Stop;
-use leaderboard_operator::kubernetes::preflight::{Need, access_missing, await_kinds};
+use leaderboard_operator::kubernetes::preflight::{access_missing, await_kinds};
 use leaderboard_operator::kubernetes::{WatchEvents, guarded, objects, spawn_uncached, spawn_watch};
 use leaderboard_operator::observability::Observability;
 use leaderboard_operator::submissions::observe::causes::OF_PODS;
@@ -134,13 +135,13 @@ async fn the_preflight_finds_the_kinds_and_the_permissions_of_an_administrator()
     )
     .await;
     assert!(found.expect("in time") && telemetry.readiness.missing().is_empty());
-    let need = |resource, verb| Need {
-        group: "leaderboard.carla.org",
-        resource,
-        verb,
-        namespace: None,
-        name: None,
+    let need = |verb: &str, subresource: Option<&str>| ResourceAttributes {
+        group: Some("leaderboard.carla.org".into()),
+        resource: Some("submissions".into()),
+        subresource: subresource.map(Into::into),
+        verb: Some(verb.into()),
+        ..ResourceAttributes::default()
     };
-    let needs = [need("submissions", "watch"), need("submissions/status", "patch")];
+    let needs = [need("watch", None), need("patch", Some("status"))];
     assert_eq!(access_missing(&client, &needs).await, Vec::<String>::new());
 }
