@@ -177,8 +177,7 @@ fn named_image(draft: &PlanBuilder<'_>) -> Result<String, Untaken> {
 
 /// The message while the file in EvalAI cannot be read.
 fn image_unread(draft: &PlanBuilder<'_>) -> String {
-    let error = draft.view.evalai.as_ref().and_then(|view| view.error.as_deref());
-    let why = error.map_or_else(String::new, |e| format!(" The last request failed: {}", sentence(e)));
+    let why = last_failure(draft);
     format!(
         "The image is not known: spec.image is empty, and the file in EvalAI that names it could not be read; it is tried \
          again.{why} If this lasts, check that EvalAI serves the submission's input_file."
@@ -202,21 +201,20 @@ fn is_wanted(draft: &mut PlanBuilder<'_>) -> bool {
         return false;
     }
     draft.look_again(Wait::EVALAI);
-    let message = match view.and_then(|view| view.error.as_deref()) {
-        Some(error) => draft.stall(Reason::AskingEvalAI, &asking(Some(error))),
-        None => asking(None),
-    };
+    let why = last_failure(draft);
+    let mut message = format!("EvalAI is asked whether the submission wants to run.{why}");
+    if !why.is_empty() {
+        message = draft.stall(Reason::AskingEvalAI, &message);
+    }
     draft.show(Reason::AskingEvalAI, message);
     draft.condition(conditions::ACCEPTED, Truth::Unknown, Reason::AskingEvalAI, "");
     false
 }
 
-fn asking(error: Option<&str>) -> String {
-    let why = error.map(|e| format!(" The last request failed: {}", sentence(e)));
-    format!(
-        "EvalAI is asked whether the submission wants to run.{}",
-        why.unwrap_or_default()
-    )
+/// Why the last request to EvalAI failed, after a blank; empty if it did not.
+fn last_failure(draft: &PlanBuilder<'_>) -> String {
+    let error = draft.view.evalai.as_ref().and_then(|view| view.error.as_deref());
+    error.map_or_else(String::new, |e| format!(" The last request failed: {}", sentence(e)))
 }
 
 fn find_track<'a>(draft: &PlanBuilder<'_>, leaderboard: &'a LeaderboardSpec) -> Option<&'a Track> {
@@ -263,10 +261,9 @@ fn take_team(draft: &mut PlanBuilder<'_>) {
         draft.status.team = given.map(TeamStatus::from);
     }
     let submitted = info.and_then(|info| info.submitted_at).map(Time);
-    draft.status.times.submitted = draft.status.times.submitted.take().or(submitted);
-    if draft.status.times.submitted.is_none() {
-        draft.status.times.submitted = draft.submission().metadata.creation_timestamp.clone();
-    }
+    let created = draft.submission().metadata.creation_timestamp.clone();
+    let known = draft.status.times.submitted.take();
+    draft.status.times.submitted = known.or(submitted).or(created);
 }
 
 /// Why the Leaderboard does not allow the image.
@@ -311,35 +308,27 @@ fn image_patterns(draft: &PlanBuilder<'_>, leaderboard: &LeaderboardSpec) -> Opt
 
 /// Pins the plan. False, with the reason shown, if the Leaderboard of today can't run the submission.
 fn pin(draft: &mut PlanBuilder<'_>, leaderboard: &LeaderboardSpec, track: &Track, image: Option<String>) -> bool {
-    let plan = match draft.status.plan.take() {
-        Some(pinned) if is_of_kind(&pinned, leaderboard) => Some(again(draft, leaderboard, pinned, image)),
-        Some(pinned) => {
-            draft.status.plan = Some(pinned);
-            None
-        }
-        None => first_plan(draft, leaderboard, track, image),
+    let plan = match &draft.status.plan {
+        Some(pinned) if is_of_kind(pinned, leaderboard) => Ok(again(draft, leaderboard, pinned.clone(), image)),
+        Some(_) => Err(
+            "It was made anew with another kind of evaluation than the submission was accepted for. Cancel this submission.".to_owned(),
+        ),
+        None => first_plan(draft, leaderboard, track, image)
+            .ok_or_else(|| format!("Its track {} names no score. Set container.score of the track.", track.name)),
     };
-    let Some(plan) = plan else {
-        let why = if draft.status.plan.is_some() {
-            "It was made anew with another kind of evaluation than the submission was accepted for. Cancel this submission.".to_owned()
-        } else {
-            format!(
-                "Its track {} names no score. Set container.score of the track.",
-                track.name
-            )
-        };
-        let message = format!(
-            "Leaderboard {} can't run the submission. {why}",
-            draft.spec().leaderboard_name
-        );
-        draft.refuse(Reason::TrackNotFound, &message);
-        return false;
+    let plan = match plan {
+        Ok(plan) => plan,
+        Err(why) => {
+            let name = &draft.spec().leaderboard_name;
+            let message = format!("Leaderboard {name} can't run the submission. {why}");
+            draft.refuse(Reason::TrackNotFound, &message);
+            return false;
+        }
     };
     draft.status.results_url = Some(effective::results_url(&plan.storage.s3, &plan.run_id));
     draft.status.plan = Some(plan);
-    if draft.status.times.accepted.is_none() {
-        draft.status.times.accepted = Some(draft.time());
-    }
+    let now = draft.time();
+    draft.status.times.accepted.get_or_insert(now);
     true
 }
 
