@@ -56,12 +56,8 @@ impl Source {
 /// A submission that wants to run.
 #[derive(Clone, Debug, PartialEq, Eq)]
 pub struct Incoming {
-    /// Id of the challenge.
-    pub challenge: i64,
-    /// Id of the phase.
-    pub phase: i64,
-    /// Id of the submission.
-    pub submission: i64,
+    /// Its ids.
+    pub evalai: EvalaiRef,
     /// The participant's image, if it is known.
     pub image: Option<String>,
     /// Where it comes from.
@@ -75,20 +71,14 @@ impl Incoming {
     /// The request of a message. `id` is the message's id in its queue; `sent_ms` is in milliseconds since 1970.
     pub fn of(message: &Message, id: String, sent_ms: i64) -> Self {
         Self {
-            challenge: message.challenge,
-            phase: message.phase,
-            submission: message.submission,
+            evalai: EvalaiRef {
+                challenge: message.challenge,
+                phase: message.phase,
+                submission: message.submission,
+            },
             image: message.image.clone(),
             source: Source::Message(id),
             sent_ms,
-        }
-    }
-
-    fn reference(&self) -> EvalaiRef {
-        EvalaiRef {
-            challenge: self.challenge,
-            phase: self.phase,
-            submission: self.submission,
         }
     }
 }
@@ -98,21 +88,13 @@ impl Incoming {
 pub enum Ingest {
     /// There is none yet: create this one.
     Create(Box<Submission>),
-    /// It has ended and is wanted again: raise its attempt, if it still is at this resourceVersion.
-    Bump { attempt: Attempt, resource_version: String },
+    /// It has ended and is wanted again: raise its attempt, if it still is at the resourceVersion that was read.
+    Bump(Attempt),
     /// It has ended, and no further attempt begins: it has finished, or EvalAI's row alone asks for one, which no message has announced.
     /// Note that, so that people see it.
-    Refuse { attempt: Attempt, resource_version: String },
-    /// It is known already.
-    Repeat,
-    /// There is none, and EvalAI's row was run before: no message has announced that it is to be run again.
-    NotNew,
-    /// The old one is being deleted: come back when it is gone.
-    Deleting,
-    /// Its present attempt is being stopped: come back when that has ended.
-    Stopping,
-    /// The name belongs to another leaderboard, challenge or phase.
-    IdTaken(String),
+    Refuse(Attempt),
+    /// Write nothing.
+    Leave(Outcome),
 }
 
 /// Why nothing could be done.
@@ -142,51 +124,39 @@ impl From<IngestError> for NotIngested {
 fn decide_ingest(leaderboard: &str, existing: Option<&Submission>, incoming: &Incoming) -> Ingest {
     let Some(existing) = existing else {
         if was_run_before(&incoming.source) {
-            return Ingest::NotNew;
+            return Ingest::Leave(Outcome::NotNew);
         }
         return Ingest::Create(Box::new(new_submission(leaderboard, incoming)));
     };
     if existing.metadata.deletion_timestamp.is_some() {
-        return Ingest::Deleting;
+        return Ingest::Leave(Outcome::Deleting);
     }
     let spec = &existing.spec;
-    if spec.leaderboard_name != leaderboard || spec.evalai != Some(incoming.reference()) {
-        return Ingest::IdTaken(owner(existing));
+    if spec.leaderboard_name != leaderboard || spec.evalai != Some(incoming.evalai) {
+        return Ingest::Leave(Outcome::IdTaken(owner(existing)));
     }
-    let Some(resource_version) = existing.metadata.resource_version.clone() else {
-        return Ingest::Repeat;
-    };
-    if !is_newer(existing, incoming) {
-        return Ingest::Repeat;
+    if existing.metadata.resource_version.is_none() || !is_newer(existing, incoming) {
+        return Ingest::Leave(Outcome::Repeat);
     }
     let progress = progress(existing);
     match progress {
-        Progress::Live => return Ingest::Repeat,
-        Progress::Stopping => return Ingest::Stopping,
+        Progress::Live => return Ingest::Leave(Outcome::Repeat),
+        Progress::Stopping => return Ingest::Leave(Outcome::Stopping),
         Progress::Finished | Progress::Ended => {}
     }
     let record = Ingested::of(existing).unwrap_or_default();
     let attempt = spec.attempt.next();
     let is_noted = record.refused.is_some_and(|refused| refused.attempt == attempt);
     match incoming.source {
-        Source::Message(_) if progress == Progress::Ended => Ingest::Bump {
-            attempt,
-            resource_version,
-        },
+        Source::Message(_) if progress == Progress::Ended => Ingest::Bump(attempt),
         Source::Sweep(Swept::Resuming)
             if is_resumable(existing) && record.without_message.len() < MOST_WITHOUT_MESSAGE =>
         {
-            Ingest::Bump {
-                attempt,
-                resource_version,
-            }
+            Ingest::Bump(attempt)
         }
         // Noted once: a row that is edited again and again is not worth a write each time.
-        _ if is_noted => Ingest::Repeat,
-        _ => Ingest::Refuse {
-            attempt,
-            resource_version,
-        },
+        _ if is_noted => Ingest::Leave(Outcome::Repeat),
+        _ => Ingest::Refuse(attempt),
     }
 }
 
@@ -257,11 +227,11 @@ fn owner(existing: &Submission) -> String {
 fn new_submission(leaderboard: &str, incoming: &Incoming) -> Submission {
     Submission {
         metadata: ObjectMeta {
-            name: Some(names::submission(incoming.submission)),
+            name: Some(names::submission(incoming.evalai.submission)),
             annotations: Some(BTreeMap::from([annotation(&record(None, incoming, Attempt::FIRST))])),
             labels: Some(BTreeMap::from([
                 (names::LABEL_LEADERBOARD.to_owned(), leaderboard.to_owned()),
-                (names::LABEL_PHASE.to_owned(), incoming.phase.to_string()),
+                (names::LABEL_PHASE.to_owned(), incoming.evalai.phase.to_string()),
             ])),
             finalizers: Some(vec![names::FINALIZER_SUBMISSION.to_owned()]),
             ..ObjectMeta::default()
@@ -269,14 +239,9 @@ fn new_submission(leaderboard: &str, incoming: &Incoming) -> Submission {
         spec: SubmissionSpec {
             leaderboard_name: leaderboard.to_owned(),
             image: incoming.image.clone(),
-            input: None,
-            evalai: Some(incoming.reference()),
-            track: None,
-            check: false,
-            team: None,
-            priority: 0,
+            evalai: Some(incoming.evalai),
             attempt: Attempt::FIRST,
-            cancel: false,
+            ..SubmissionSpec::default()
         },
         status: None,
     }
@@ -336,44 +301,29 @@ async fn rounds(
     incoming: &Incoming,
     existing: &mut Option<Submission>,
 ) -> Result<Outcome, IngestError> {
-    let name = names::submission(incoming.submission);
+    let name = names::submission(incoming.evalai.submission);
     // Most are new, so the first try creates; the answer AlreadyExists makes the read necessary.
     if was_run_before(&incoming.source) {
         *existing = call(&name, "the read", api.get_opt(&name)).await?;
     }
     for _ in 0..ROUNDS {
         let done = match decide_ingest(leaderboard, existing.as_ref(), incoming) {
-            Ingest::Create(fresh) => create(api, &name, &fresh).await?.map(|created| {
-                *existing = Some(created);
-                Outcome::Created
-            }),
-            Ingest::Bump {
-                attempt,
-                resource_version,
-            } => {
+            Ingest::Create(fresh) => (create(api, &name, &fresh).await?, Outcome::Created),
+            Ingest::Bump(attempt) => {
                 let record = record(existing.as_ref(), incoming, attempt);
                 let spec = json!({ "attempt": attempt, "cancel": false });
-                let bumped = note(api, &name, &resource_version, &record, &spec).await?;
-                bumped.map(|bumped| {
-                    *existing = Some(bumped);
-                    Outcome::Bumped(attempt)
-                })
+                let bumped = note(api, &name, existing.as_ref(), &record, &spec).await?;
+                (bumped, Outcome::Bumped(attempt))
             }
-            Ingest::Refuse {
-                attempt,
-                resource_version,
-            } => {
+            Ingest::Refuse(attempt) => {
                 let record = refusal(existing.as_ref(), incoming, attempt);
-                let noted = note(api, &name, &resource_version, &record, &json!({})).await?;
-                noted.map(|_| Outcome::Refused)
+                let noted = note(api, &name, existing.as_ref(), &record, &json!({})).await?;
+                (noted, Outcome::Refused)
             }
-            Ingest::NotNew => Some(Outcome::NotNew),
-            Ingest::Repeat => Some(Outcome::Repeat),
-            Ingest::Deleting => Some(Outcome::Deleting),
-            Ingest::Stopping => Some(Outcome::Stopping),
-            Ingest::IdTaken(owner) => Some(Outcome::IdTaken(owner)),
+            Ingest::Leave(outcome) => return Ok(outcome),
         };
-        if let Some(outcome) = done {
+        if let (Some(written), outcome) = done {
+            *existing = Some(written);
             return Ok(outcome);
         }
         *existing = call(&name, "the read", api.get_opt(&name)).await?;
@@ -404,13 +354,14 @@ async fn create(api: &Api<Submission>, name: &str, fresh: &Submission) -> Result
 async fn note(
     api: &Api<Submission>,
     name: &str,
-    resource_version: &str,
+    existing: Option<&Submission>,
     record: &Ingested,
     spec: &Value,
 ) -> Result<Option<Submission>, IngestError> {
     let (key, text) = annotation(record);
+    let version = existing.and_then(|existing| existing.metadata.resource_version.as_deref());
     let patch = json!({
-        "metadata": { "resourceVersion": resource_version, "annotations": { key: text } },
+        "metadata": { "resourceVersion": version, "annotations": { key: text } },
         "spec": spec,
     });
     let params = PatchParams {

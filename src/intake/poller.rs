@@ -241,7 +241,7 @@ impl<S: Source> Poller<S> {
         match (&envelope.content, outcome) {
             (Ok(content), MessageOutcome::Ingest { namespace, leaderboard }) => {
                 let incoming = Incoming::of(content, received.id.clone(), received.sent_ms);
-                let span = ingest::span(&namespace, &leaderboard, incoming.submission);
+                let span = ingest::span(&namespace, &leaderboard, incoming.evalai.submission);
                 let ingested = self.ingest(&namespace, &leaderboard, &incoming).instrument(span).await;
                 ingested.map_or(MessageOutcome::Lapse, |ingested| {
                     route::settle(&envelope, &ingested.map_err(Into::into), rules, self.now_ms())

@@ -10,7 +10,7 @@ use tracing::Instrument;
 
 use crate::intake::ingest::{self, Incoming, Source};
 use crate::kubernetes::Store;
-use leaderboard_api::{Evalai, Foreign, Leaderboard, Submission};
+use leaderboard_api::{Evalai, EvalaiRef, Foreign, Leaderboard, Submission};
 use leaderboard_evalai::{SweepRow, Swept};
 use leaderboard_policy::intake::route::{self, Outcome};
 
@@ -38,9 +38,11 @@ async fn take(client: &Client, board: &Leaderboard, row: &SweepRow, kind: Swept)
     let namespace = board.namespace().unwrap_or_default();
     let api: Api<Submission> = Api::namespaced(client.clone(), &namespace);
     let incoming = Incoming {
-        challenge: row.challenge,
-        phase: row.phase,
-        submission: row.submission,
+        evalai: EvalaiRef {
+            challenge: row.challenge,
+            phase: row.phase,
+            submission: row.submission,
+        },
         image: None,
         source: Source::Sweep(kind),
         sent_ms: row.time.as_millisecond(),

@@ -20,7 +20,7 @@ use tokio::sync::watch;
 
 use super::objects::merge;
 use crate::support::{apiserver, ministack};
-use leaderboard_api::{Attempt, Ingested, Leaderboard, Submission, names};
+use leaderboard_api::{Attempt, EvalaiRef, Ingested, Leaderboard, Submission, names};
 use leaderboard_aws::clients::Aws;
 use leaderboard_base::shutdown::Stop;
 use leaderboard_base::tasks::TaskFailed;
@@ -370,9 +370,11 @@ async fn the_sweep_begins_one_attempt_and_a_message_any() {
     let now = jiff::Timestamp::now().as_millisecond();
     let take = async |source: Source, minute: i64| {
         let incoming = Incoming {
-            challenge: 1,
-            phase: 2,
-            submission: 7,
+            evalai: EvalaiRef {
+                challenge: 1,
+                phase: 2,
+                submission: 7,
+            },
             image: None,
             source,
             sent_ms: now + minute * 60_000,

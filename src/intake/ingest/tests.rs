@@ -10,9 +10,11 @@ const BOARD: &str = "leaderboard-20";
 
 fn incoming(source: Source, sent_ms: i64) -> Incoming {
     Incoming {
-        challenge: 1,
-        phase: 2,
-        submission: 3,
+        evalai: EvalaiRef {
+            challenge: 1,
+            phase: 2,
+            submission: 3,
+        },
         image: Some("r.example/a:1".into()),
         source,
         sent_ms,
@@ -75,10 +77,7 @@ fn bumped(mut made: Submission, by: &Incoming) -> Submission {
 }
 
 fn bump_to(attempt: i64) -> Ingest {
-    Ingest::Bump {
-        attempt: Attempt(attempt),
-        resource_version: "10".into(),
-    }
+    Ingest::Bump(Attempt(attempt))
 }
 
 #[test]
@@ -107,7 +106,7 @@ fn the_first_message_makes_the_object_with_everything_it_needs() {
     );
 }
 
-const REPEAT: Ingest = Ingest::Repeat;
+const REPEAT: Ingest = Ingest::Leave(Outcome::Repeat);
 
 fn check(what: &str, existing: &Submission, incoming: &Incoming, want: &Ingest) {
     assert_eq!(decide_ingest(BOARD, Some(existing), incoming), *want, "{what}");
@@ -146,7 +145,7 @@ fn a_resume_bumps_what_has_failed_or_was_cancelled() {
     let in_state = |state| with_state(made_by(&first), state);
     check("failed", &in_state(State::Failed), &resume, &bump_to(2));
     check("cancelled", &in_state(State::Cancelled), &resume, &bump_to(2));
-    check("finished", &in_state(State::Finished), &resume, &refuse(2, "10"));
+    check("finished", &in_state(State::Finished), &resume, &refuse(2));
     check("pending", &in_state(State::Pending), &resume, &REPEAT);
     check("running", &in_state(State::Running), &resume, &REPEAT);
     check("resumed", &in_state(State::Resumed), &resume, &REPEAT);
@@ -161,7 +160,7 @@ fn a_resume_bumps_what_has_failed_or_was_cancelled() {
         "the run had finished by then",
         &by_person(State::Finished),
         &resume,
-        &refuse(3, "10"),
+        &refuse(3),
     );
     let fresh = bumped(in_state(State::Failed), &resume);
     check(
@@ -228,11 +227,8 @@ fn the_sweep_and_the_message_that_it_stood_in_for_count_once() {
     );
 }
 
-fn refuse(attempt: i64, version: &str) -> Ingest {
-    Ingest::Refuse {
-        attempt: Attempt(attempt),
-        resource_version: version.into(),
-    }
+fn refuse(attempt: i64) -> Ingest {
+    Ingest::Refuse(Attempt(attempt))
 }
 
 /// The object after a refusal was noted.
@@ -252,7 +248,7 @@ fn refused(mut made: Submission, sent_ms: i64) -> Submission {
 #[test]
 fn a_row_that_was_edited_to_submitted_begins_no_other_attempt() {
     let failed = with_state(made_by(&message("a", 100_000)), State::Failed);
-    check("the first time", &failed, &sweep(300_000), &refuse(2, "10"));
+    check("the first time", &failed, &sweep(300_000), &refuse(2));
     let noted = refused(failed, 300_000);
     check("the same row again", &noted, &sweep(300_000), &REPEAT);
     check("edited once more", &noted, &sweep(400_000), &REPEAT);
@@ -261,7 +257,7 @@ fn a_row_that_was_edited_to_submitted_begins_no_other_attempt() {
     let mut raised = noted;
     raised.spec.attempt = Attempt(2);
     let raised = with_state(raised, State::Failed);
-    check("after another attempt", &raised, &sweep(500_000), &refuse(3, "10"));
+    check("after another attempt", &raised, &sweep(500_000), &refuse(3));
 }
 
 #[test]
@@ -271,17 +267,13 @@ fn one_attempt_begins_without_a_message_until_the_next_message_comes() {
     check("a resume whose message was lost", &failed, &lost, &bump_to(2));
     let second = with_state(bumped(failed, &lost), State::Failed);
     assert_eq!(Ingested::of(&second).unwrap().without_message, [Attempt(2)]);
-    check("another one", &second, &swept_resume(600_000), &refuse(3, "11"));
+    check("another one", &second, &swept_resume(600_000), &refuse(3));
     let noted = refused(second, 600_000);
     check("and another one", &noted, &swept_resume(900_000), &REPEAT);
     let resume = message("b", 950_000);
     let third = with_state(bumped(noted, &resume), State::Failed);
     assert!(Ingested::of(&third).unwrap().without_message.is_empty());
-    let want = Ingest::Bump {
-        attempt: Attempt(4),
-        resource_version: "11".into(),
-    };
-    check("after a message", &third, &swept_resume(1_300_000), &want);
+    check("after a message", &third, &swept_resume(1_300_000), &bump_to(4));
 }
 
 #[test]
@@ -290,13 +282,13 @@ fn the_sweep_resumes_only_what_has_failed_and_nobody_cancelled() {
     let lost = swept_resume(300_000);
     check("failed", &in_state(State::Failed), &lost, &bump_to(2));
     // EvalAI resumes only what has failed: the row of one that was cancelled was edited.
-    check("cancelled", &in_state(State::Cancelled), &lost, &refuse(2, "10"));
+    check("cancelled", &in_state(State::Cancelled), &lost, &refuse(2));
     let mut by_host = in_state(State::Cancelled);
     by_host.spec.cancel = true;
-    check("cancelled by a host", &by_host, &lost, &refuse(2, "10"));
+    check("cancelled by a host", &by_host, &lost, &refuse(2));
     let mut late = in_state(State::Failed);
     late.spec.cancel = true;
-    check("failed, while a host cancelled it", &late, &lost, &refuse(2, "10"));
+    check("failed, while a host cancelled it", &late, &lost, &refuse(2));
     check(
         "a message after the cancel",
         &by_host,
@@ -307,7 +299,10 @@ fn the_sweep_resumes_only_what_has_failed_and_nobody_cancelled() {
 
 #[test]
 fn a_resume_without_a_message_begins_nothing_where_its_object_is_gone() {
-    assert_eq!(decide_ingest(BOARD, None, &swept_resume(100_000)), Ingest::NotNew);
+    assert_eq!(
+        decide_ingest(BOARD, None, &swept_resume(100_000)),
+        Ingest::Leave(Outcome::NotNew)
+    );
     let first = with_state(made_by(&sweep(100_000)), State::Failed);
     check("of a first run", &first, &swept_resume(600_000), &bump_to(2));
 }
@@ -315,7 +310,10 @@ fn a_resume_without_a_message_begins_nothing_where_its_object_is_gone() {
 #[test]
 fn a_row_that_was_run_before_makes_no_object_without_a_message() {
     let swept = |kind| incoming(Source::Sweep(kind), 300_000);
-    assert_eq!(decide_ingest(BOARD, None, &swept(Swept::Edited)), Ingest::NotNew);
+    assert_eq!(
+        decide_ingest(BOARD, None, &swept(Swept::Edited)),
+        Ingest::Leave(Outcome::NotNew)
+    );
     assert!(matches!(
         decide_ingest(BOARD, None, &message("a", 300_000)),
         Ingest::Create(_)
@@ -323,9 +321,9 @@ fn a_row_that_was_run_before_makes_no_object_without_a_message() {
     // Its participant can have edited the row of a re-run: that is shown, and counts.
     let rerun = with_state(made_by(&swept(Swept::Rerun)), State::Failed);
     assert_eq!(Ingested::of(&rerun).unwrap().without_message, [Attempt(1)]);
-    check("its resume", &rerun, &swept_resume(600_000), &refuse(2, "10"));
+    check("its resume", &rerun, &swept_resume(600_000), &refuse(2));
     let failed = with_state(made_by(&message("a", 100_000)), State::Failed);
-    check("of one that is there", &failed, &swept(Swept::Edited), &refuse(2, "10"));
+    check("of one that is there", &failed, &swept(Swept::Edited), &refuse(2));
 }
 
 #[test]
@@ -337,11 +335,7 @@ fn a_resume_of_a_resume_goes_on_counting() {
         ),
         State::Cancelled,
     );
-    let want = Ingest::Bump {
-        attempt: Attempt(3),
-        resource_version: "11".into(),
-    };
-    assert_eq!(decide_ingest(BOARD, Some(&resumed), &message("c", 300)), want);
+    assert_eq!(decide_ingest(BOARD, Some(&resumed), &message("c", 300)), bump_to(3));
 }
 
 #[test]
@@ -350,11 +344,11 @@ fn an_object_being_deleted_is_waited_for() {
     existing.metadata.deletion_timestamp = Some(Time(jiff::Timestamp::UNIX_EPOCH));
     assert_eq!(
         decide_ingest(BOARD, Some(&existing), &message("b", 200)),
-        Ingest::Deleting
+        Ingest::Leave(Outcome::Deleting)
     );
     assert_eq!(
         decide_ingest("another", Some(&existing), &message("b", 200)),
-        Ingest::Deleting
+        Ingest::Leave(Outcome::Deleting)
     );
 }
 
@@ -380,7 +374,7 @@ fn a_name_of_another_submission_is_taken() {
     for (what, existing) in cases {
         let decided = decide_ingest(BOARD, Some(&existing), &message("b", 200));
         assert!(
-            matches!(&decided, Ingest::IdTaken(text) if text.contains("submission-3 belongs to")),
+            matches!(&decided, Ingest::Leave(Outcome::IdTaken(text)) if text.contains("submission-3 belongs to")),
             "{what}: {decided:?}"
         );
     }
@@ -394,13 +388,13 @@ fn one_made_by_hand_is_resumed_only_by_what_was_sent_later() {
             broken.map(|text| BTreeMap::from([(names::ANNOTATION_INGESTED.to_owned(), text.to_owned())]));
         assert_eq!(
             decide_ingest(BOARD, Some(&existing), &message("b", 4_000)),
-            Ingest::Repeat,
+            Ingest::Leave(Outcome::Repeat),
             "{broken:?}"
         );
         // Creation times have no milliseconds.
         assert_eq!(
             decide_ingest(BOARD, Some(&existing), &message("b", 5_900)),
-            Ingest::Repeat,
+            Ingest::Leave(Outcome::Repeat),
             "{broken:?}"
         );
         assert_eq!(
