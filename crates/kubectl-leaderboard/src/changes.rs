@@ -3,16 +3,15 @@
 use std::pin::pin;
 use std::process::ExitCode;
 
-use futures::StreamExt;
 use kube::ResourceExt;
 
 use crate::change::{self, Request};
 use crate::cluster::{Cluster, Fetched, Scope};
-use crate::commands::{frame, note_interruption, nothing};
+use crate::commands::{changes, frame, next, nothing};
 use crate::error::{self, Error};
-use crate::output::{self, note, print};
+use crate::output::{self, code, note, print};
 use crate::{Cancel, facts, resume, submit, upload};
-use leaderboard_api::{Attempt, Leaderboard, State, Submission, SubmissionStatus};
+use leaderboard_api::{Attempt, Leaderboard, State, Submission};
 
 /// How often a change is tried again after a conflict with somebody else's.
 const TRIES: usize = 4;
@@ -64,14 +63,6 @@ async fn resume_named(cluster: &Cluster, wanted: &resume::Resume) -> Result<Exit
         is_fulfilled &= wait(cluster, name, attempt).await? == State::Finished;
     }
     Ok(code(is_fulfilled))
-}
-
-fn code(is_fulfilled: bool) -> ExitCode {
-    if is_fulfilled {
-        ExitCode::SUCCESS
-    } else {
-        ExitCode::FAILURE
-    }
 }
 
 /// Sends a request for each, and says how many were taken.
@@ -174,25 +165,20 @@ fn refusal(request: Request, submission: &Submission, error: kube::Error) -> Err
 
 /// Waits for the end of an attempt, and prints each state until then.
 async fn wait(cluster: &Cluster, name: &str, attempt: Attempt) -> Result<State, Error> {
-    let mut changes = pin!(cluster.changes(name));
-    let (mut printed, mut last) = (String::new(), String::new());
-    while let Some(change) = changes.next().await {
-        match change {
-            Ok(Some(submission)) => {
-                let Some((state, lines)) = facts::transition(&submission, attempt, frame()) else {
-                    continue;
-                };
-                if state != last {
-                    print(&lines);
-                    last = state;
-                }
-                if let Some(status) = submission.status.filter(SubmissionStatus::has_ended) {
-                    return Ok(status.state_of_conditions());
-                }
-            }
-            Ok(None) => return Err(Error::Gone(name.to_owned())),
-            Err(error) => note_interruption(error, &mut printed)?,
+    let mut changes = pin!(changes(cluster, name));
+    let mut last = String::new();
+    loop {
+        let submission = next(&mut changes).await?;
+        let Some((state, lines)) = facts::transition(&submission, attempt, frame()) else {
+            continue;
+        };
+        if state != last {
+            print(&lines);
+            last = state;
+        }
+        let status = facts::status(&submission);
+        if status.has_ended() {
+            return Ok(status.state_of_conditions());
         }
     }
-    Err(Error::Api("the watch has ended".to_owned()))
 }

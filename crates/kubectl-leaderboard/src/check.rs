@@ -13,10 +13,10 @@ use leaderboard_api::{Evaluation, Leaderboard, State, Submission, reasons};
 use serde_json::{Value, json};
 
 use crate::board::Observed;
-use crate::cluster::{Cluster, Fetched};
+use crate::cluster::Cluster;
 use crate::commands::{follow, frame};
 use crate::error::Error;
-use crate::output::{note, print};
+use crate::output::{code, note, print};
 use crate::text::Frame;
 use crate::{facts, submit, why};
 
@@ -44,11 +44,7 @@ pub struct Check {
 
 /// Checks a Leaderboard; the exit code shows whether it passed.
 pub async fn check(cluster: &Cluster, wanted: &Check) -> Result<ExitCode, Error> {
-    let leaderboard = match cluster.leaderboard(&wanted.name).await? {
-        Fetched::Found(leaderboard) => leaderboard,
-        Fetched::Missing => return Err(cluster.unknown::<Leaderboard>("Leaderboard", &wanted.name).await?),
-        Fetched::Forbidden => return Err(Error::Forbidden("Leaderboards cannot be read".to_owned())),
-    };
+    let leaderboard = cluster.known_leaderboard(&wanted.name).await?;
     let object = object(&leaderboard, wanted).map_err(Error::Unfit)?;
     let created = cluster.create(&object, false).await?;
     let name = created.name_any();
@@ -66,16 +62,14 @@ pub async fn check(cluster: &Cluster, wanted: &Check) -> Result<ExitCode, Error>
         cluster.delete(&name).await?;
     }
     let (submission, leaderboard) = followed?;
-    let (verdict, code) = if has_passed(&submission, leaderboard.observed()) {
-        ("The check passed.", ExitCode::SUCCESS)
+    let has_passed = has_passed(&submission, leaderboard.observed());
+    let verdict = if has_passed {
+        "The check passed."
     } else {
-        (
-            "The check did not pass. Correct what is named above, and run it again.",
-            ExitCode::FAILURE,
-        )
+        "The check did not pass. Correct what is named above, and run it again."
     };
     print(&[String::new(), verdict.to_owned()]);
-    Ok(code)
+    Ok(code(has_passed))
 }
 
 /// The Submission to create, or why a check cannot begin, with the next step.

@@ -21,7 +21,7 @@ use serde::de::DeserializeOwned;
 use serde_json::Value;
 
 use super::board::Observed;
-use super::error::{Error, of_kubeconfig, of_log};
+use super::error::{Error, no_leaderboards, of_kubeconfig, of_log};
 use super::help::GLOBAL;
 use super::{facts, lines, near};
 use leaderboard_api::names::LABEL_SUBMISSION;
@@ -255,6 +255,15 @@ impl Cluster {
             Ok(None) => Ok(Fetched::Missing),
             Err(kube::Error::Api(status)) if status.is_forbidden() => Ok(Fetched::Forbidden),
             Err(error) => Err(error.into()),
+        }
+    }
+
+    /// A Leaderboard that a command cannot do without.
+    pub async fn known_leaderboard(&self, name: &str) -> Result<Leaderboard, Error> {
+        match self.leaderboard(name).await? {
+            Fetched::Found(found) => Ok(*found),
+            Fetched::Missing => Err(self.unknown::<Leaderboard>("Leaderboard", name).await?),
+            Fetched::Forbidden => Err(no_leaderboards()),
         }
     }
 

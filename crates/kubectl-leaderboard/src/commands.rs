@@ -4,15 +4,17 @@ use std::pin::pin;
 use std::process::ExitCode;
 use std::time::Duration;
 
-use futures::StreamExt;
+use futures::future::ready;
+use futures::{Stream, StreamExt};
 use jiff::Timestamp;
+use kube::runtime::watcher;
 use serde_json::Value;
 
 use crate::cluster::{Cluster, Fetched, Scope};
 use crate::error::{self, Error};
-use crate::output::{self, Format, Screen, note, print};
+use crate::output::{self, Format, Screen, note_once, print};
 use crate::text::Frame;
-use crate::{Watched, facts, overview, status, top, why};
+use crate::{Show, Watched, facts, overview, status, top, why};
 use leaderboard_api::Submission;
 use leaderboard_api::client_errors::watch as watch_error;
 
@@ -28,32 +30,34 @@ pub fn frame() -> Frame {
     }
 }
 
-/// `why NAME`.
-pub async fn explain(cluster: &Cluster, name: &str, format: Format) -> Result<ExitCode, Error> {
-    let submission = cluster.submission(name).await?;
-    let leaderboard = cluster.leaderboard(&submission.spec.leaderboard_name).await?;
-    let value = why::value(&submission, leaderboard.observed());
-    let lines = output::document(format, &value);
-    print(&lines.unwrap_or_else(|| why::explain(&submission, leaderboard.observed(), frame())));
+/// `why`.
+pub async fn why(cluster: &Cluster, wanted: &Show) -> Result<ExitCode, Error> {
+    let format = wanted.output.format;
+    let lines = match &wanted.name {
+        Some(name) => explained(cluster, name, format).await?,
+        None => survey(cluster, &wanted.scope, format).await?,
+    };
+    print(&lines);
     Ok(ExitCode::SUCCESS)
 }
 
-/// `why` of all.
-pub async fn survey(cluster: &Cluster, scope: &Scope, format: Format) -> Result<ExitCode, Error> {
+async fn explained(cluster: &Cluster, name: &str, format: Format) -> Result<Vec<String>, Error> {
+    let submission = cluster.submission(name).await?;
+    let leaderboard = cluster.leaderboard(&submission.spec.leaderboard_name).await?;
+    let lines = output::document(format, &why::value(&submission, leaderboard.observed()));
+    Ok(lines.unwrap_or_else(|| why::explain(&submission, leaderboard.observed(), frame())))
+}
+
+async fn survey(cluster: &Cluster, scope: &Scope, format: Format) -> Result<Vec<String>, Error> {
     let submissions = cluster.submissions(scope).await?;
     let leaderboards = cluster.leaderboards(scope).await?;
-    let value = overview::value(&submissions, leaderboards.as_deref(), frame().now);
-    if let Some(lines) = output::document(format, &value) {
-        print(&lines);
-        return Ok(ExitCode::SUCCESS);
-    }
-    if submissions.is_empty() {
-        print(&nothing(cluster, scope).await);
-    } else {
-        let place = place(cluster, scope);
-        print(&overview::lines(place, &submissions, leaderboards.as_deref(), frame()));
-    }
-    Ok(ExitCode::SUCCESS)
+    let boards = leaderboards.as_deref();
+    let document = output::document(format, &overview::value(&submissions, boards, frame().now));
+    Ok(match document {
+        Some(lines) => lines,
+        None if submissions.is_empty() => nothing(cluster, scope).await,
+        None => overview::lines(place(cluster, scope), &submissions, boards, frame()),
+    })
 }
 
 fn place<'a>(cluster: &'a Cluster, scope: &Scope) -> overview::Place<'a> {
@@ -112,13 +116,12 @@ pub async fn follow(
 ) -> Result<(Submission, Fetched), Error> {
     let mut drawn = Screen::default();
     let mut last: Option<(Submission, Fetched)> = None;
-    let mut printed = String::new();
-    let mut changes = pin!(cluster.changes(name));
+    let mut changes = pin!(changes(cluster, name));
     let mut ticks = tokio::time::interval(TICK);
     loop {
-        let change = tokio::select! {
+        let submission = tokio::select! {
             biased;
-            change = changes.next() => change,
+            changed = next(&mut changes) => changed?,
             _ = ticks.tick(), if Screen::is_live() => {
                 if let Some((submission, leaderboard)) = &last {
                     drawn.draw(&screen(submission, leaderboard));
@@ -126,19 +129,12 @@ pub async fn follow(
                 continue;
             }
         };
-        match change {
-            Some(Ok(Some(submission))) => {
-                let leaderboard = cluster.leaderboard(&submission.spec.leaderboard_name).await?;
-                drawn.draw(&screen(&submission, &leaderboard));
-                if facts::has_ended(&submission) {
-                    return Ok((submission, leaderboard));
-                }
-                last = Some((submission, leaderboard));
-            }
-            Some(Ok(None)) => return Err(Error::Gone(name.to_owned())),
-            Some(Err(error)) => note_interruption(error, &mut printed)?,
-            None => return Err(Error::Api("the watch has ended".to_owned())),
+        let leaderboard = cluster.leaderboard(&submission.spec.leaderboard_name).await?;
+        drawn.draw(&screen(&submission, &leaderboard));
+        if facts::has_ended(&submission) {
+            return Ok((submission, leaderboard));
         }
+        last = Some((submission, leaderboard));
     }
 }
 
@@ -155,15 +151,34 @@ pub async fn top(cluster: &Cluster, scope: &Scope, format: Format) -> Result<Exi
     Ok(ExitCode::SUCCESS)
 }
 
-/// Reports that a watch was interrupted, and goes on, unless going on does not help.
-pub fn note_interruption(error: kube::runtime::watcher::Error, printed: &mut String) -> Result<(), Error> {
+/// A submission each time it changes; an error once it is gone.
+pub fn changes(cluster: &Cluster, name: &str) -> impl Stream<Item = Result<Submission, Error>> {
+    let gone = name.to_owned();
+    uninterrupted(cluster.changes(name)).map(move |change| change?.ok_or_else(|| Error::Gone(gone.clone())))
+}
+
+/// What a watch shows, through its interruptions.
+pub fn uninterrupted<T>(watch: impl Stream<Item = Result<T, watcher::Error>>) -> impl Stream<Item = Result<T, Error>> {
+    watch.filter_map(|change| {
+        ready(match change {
+            Ok(change) => Some(Ok(change)),
+            Err(error) => interruption(error).map(Err),
+        })
+    })
+}
+
+/// Notes that a watch was interrupted and goes on; the error if going on does not help.
+fn interruption(error: watcher::Error) -> Option<Error> {
     let message = error::phrase(&watch_error(&error));
-    if let Some(permanent) = error::permanent(error) {
-        return Err(permanent);
+    let permanent = error::permanent(error);
+    if permanent.is_none() {
+        note_once(&format!("{message}; retrying."));
     }
-    if message != *printed {
-        note(&format!("{message}; retrying."));
-        *printed = message;
-    }
-    Ok(())
+    permanent
+}
+
+/// The next change. A watch has no end of its own.
+pub async fn next<T>(watch: &mut (impl Stream<Item = Result<T, Error>> + Unpin)) -> Result<T, Error> {
+    let ended = || Err(Error::Api("the watch has ended".to_owned()));
+    watch.next().await.unwrap_or_else(ended)
 }

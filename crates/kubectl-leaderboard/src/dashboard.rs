@@ -3,7 +3,8 @@
 //! Called by `main`. `replica` is pure. Nothing is read of what passes: the page itself refuses a browser that came by another name.
 
 use std::net::{Ipv4Addr, SocketAddr};
-use std::sync::{Arc, Mutex, PoisonError};
+use std::process::ExitCode;
+use std::sync::Arc;
 
 use clap::Args;
 use k8s_openapi::api::core::v1::Pod;
@@ -15,7 +16,7 @@ use tokio::sync::Semaphore;
 
 use super::cluster::{Cluster, Scope};
 use super::error::{Error, phrase};
-use super::output::{note, print};
+use super::output::{note_once, print};
 use leaderboard_api::client_errors;
 
 /// The controller's replicas, whatever the release is called.
@@ -36,35 +37,12 @@ pub struct Dashboard {
     operator_namespace: Option<String>,
 }
 
-/// A replica that serves the page.
-#[derive(Clone, Debug, PartialEq, Eq)]
-struct Replica {
-    pod: String,
-    port: u16,
-}
-
-/// State that all connections share.
-struct Forwards {
-    pods: Api<Pod>,
-    /// The replica that answered last.
-    replica: Mutex<Option<Replica>>,
-    /// The last failure, which is printed once.
-    printed: Mutex<String>,
-}
-
 /// Serves until Ctrl-C.
-pub async fn dashboard(cluster: &Cluster, wanted: &Dashboard) -> Result<(), Error> {
-    let namespace = match &wanted.operator_namespace {
-        Some(namespace) => namespace.clone(),
-        None => operator_namespace(cluster).await?,
-    };
-    let forwards = Arc::new(Forwards {
-        pods: Api::namespaced(cluster.client.clone(), &namespace),
-        replica: Mutex::default(),
-        printed: Mutex::default(),
-    });
+pub async fn dashboard(cluster: &Cluster, wanted: &Dashboard) -> Result<ExitCode, Error> {
+    let namespace = operator_namespace(cluster, wanted.operator_namespace.as_deref()).await?;
+    let pods: Api<Pod> = Api::namespaced(cluster.client.clone(), &namespace);
     // A missing replica or port is an error before a browser opens.
-    forwards.find().await.map_err(Error::Unfit)?;
+    find(&pods).await.map_err(Error::Unfit)?;
     let address = SocketAddr::from((Ipv4Addr::LOCALHOST, wanted.port));
     let taken = |error| Error::Unfit(format!("cannot listen on {address}: {error}. Choose another --port"));
     let listener = TcpListener::bind(address).await.map_err(taken)?;
@@ -75,22 +53,23 @@ pub async fn dashboard(cluster: &Cluster, wanted: &Dashboard) -> Result<(), Erro
     ]);
     tokio::select! {
         biased;
-        ended = tokio::signal::ctrl_c() => ended.map_err(Error::Runtime),
-        () = accept(listener, forwards) => Ok(()),
+        ended = tokio::signal::ctrl_c() => ended.map_err(Error::Runtime)?,
+        () = accept(&listener, &pods) => {}
     }
+    Ok(ExitCode::SUCCESS)
 }
 
-/// The controller's replicas in a namespace.
-pub async fn replicas(cluster: &Cluster, namespace: &str) -> Result<Vec<Pod>, Error> {
-    let pods: Api<Pod> = Api::namespaced(cluster.client.clone(), namespace);
+/// The controller's replicas, or why they cannot be listed.
+pub async fn replicas(pods: &Api<Pod>) -> Result<Vec<Pod>, String> {
     let found = pods.list(&ListParams::default().labels(SELECTOR)).await;
-    Ok(found
-        .map_err(|error| Error::Unfit(of_rights(&error, "list pods")))?
-        .items)
+    Ok(found.map_err(|error| of_rights(&error, "list pods"))?.items)
 }
 
-/// Namespace of the operator that drives the Leaderboards here.
-pub async fn operator_namespace(cluster: &Cluster) -> Result<String, Error> {
+/// Namespace of the operator: the one that is named, or that of the operator which drives the Leaderboards here.
+pub async fn operator_namespace(cluster: &Cluster, named: Option<&str>) -> Result<String, Error> {
+    if let Some(named) = named {
+        return Ok(named.to_owned());
+    }
     let boards = cluster.leaderboards(&Scope::default()).await?.unwrap_or_default();
     let operators = boards
         .iter()
@@ -112,88 +91,54 @@ pub async fn operator_namespace(cluster: &Cluster) -> Result<String, Error> {
     }
 }
 
-async fn accept(listener: TcpListener, forwards: Arc<Forwards>) {
+async fn accept(listener: &TcpListener, pods: &Api<Pod>) {
     let places = Arc::new(Semaphore::new(CONNECTIONS));
     while let Ok(place) = Arc::clone(&places).acquire_owned().await {
         // One that has gone before it was accepted is no reason to end.
         let Ok((stream, _)) = listener.accept().await else {
             continue;
         };
-        let forwards = Arc::clone(&forwards);
+        let pods = pods.clone();
         tokio::spawn(async move {
-            if let Err(why) = forwards.forward(stream).await {
-                forwards.report(why);
+            if let Err(why) = forward(&pods, stream).await {
+                note_once(&why);
             }
             drop(place);
         });
     }
 }
 
-impl Forwards {
-    /// A replica that serves the page, or why there is none.
-    async fn find(&self) -> Result<Replica, String> {
-        let known = self.known();
-        if let Some(known) = known {
-            return Ok(known);
-        }
-        let pods = self.pods.list(&ListParams::default().labels(SELECTOR)).await;
-        let pods = pods.map_err(|error| of_rights(&error, "list pods"))?;
-        let found = replica(&pods.items)?;
-        *self.replica.lock().unwrap_or_else(PoisonError::into_inner) = Some(found.clone());
-        Ok(found)
-    }
-
-    fn known(&self) -> Option<Replica> {
-        self.replica.lock().unwrap_or_else(PoisonError::into_inner).clone()
-    }
-
-    fn forget(&self) {
-        *self.replica.lock().unwrap_or_else(PoisonError::into_inner) = None;
-    }
-
-    async fn forward(&self, mut browser: TcpStream) -> Result<(), String> {
-        let replica = self.find().await?;
-        let opened = self.pods.portforward(&replica.pod, &[replica.port]).await;
-        let mut forward = opened.map_err(|error| {
-            // It may be gone: the next connection looks again.
-            self.forget();
-            of_rights(&error, "create pods/portforward")
-        })?;
-        let errors = forward.take_error(replica.port);
-        let Some(mut page) = forward.take_stream(replica.port) else {
-            return Ok(());
-        };
-        let failed = async {
-            match errors {
-                Some(error) => error.await,
-                None => None,
-            }
-        };
-        let result = tokio::select! {
-            biased;
-            // Either side may end a connection at any time.
-            _ = copy_bidirectional(&mut browser, &mut page) => Ok(()),
-            Some(why) = failed => {
-                self.forget();
-                Err(format!("the operator's page does not answer: {}", phrase(&why)))
-            }
-        };
-        forward.abort();
-        result
-    }
-
-    /// A browser tries again and again: the same failure is printed once.
-    fn report(&self, why: String) {
-        let mut printed = self.printed.lock().unwrap_or_else(PoisonError::into_inner);
-        if *printed != why {
-            note(&why);
-            *printed = why;
-        }
-    }
+/// Name and port of a replica that serves the page, or why there is none.
+async fn find(pods: &Api<Pod>) -> Result<(String, u16), String> {
+    replica(&replicas(pods).await?)
 }
 
-/// The first replica that is ready and serves the page.
-fn replica(pods: &[Pod]) -> Result<Replica, String> {
+async fn forward(pods: &Api<Pod>, mut browser: TcpStream) -> Result<(), String> {
+    let (pod, port) = find(pods).await?;
+    let opened = pods.portforward(&pod, &[port]).await;
+    let mut forward = opened.map_err(|error| of_rights(&error, "create pods/portforward"))?;
+    let errors = forward.take_error(port);
+    let Some(mut page) = forward.take_stream(port) else {
+        return Ok(());
+    };
+    let failed = async {
+        match errors {
+            Some(error) => error.await,
+            None => None,
+        }
+    };
+    let result = tokio::select! {
+        biased;
+        // Either side may end a connection at any time.
+        _ = copy_bidirectional(&mut browser, &mut page) => Ok(()),
+        Some(why) = failed => Err(format!("the operator's page does not answer: {}", phrase(&why))),
+    };
+    forward.abort();
+    result
+}
+
+/// Name and port of the first replica that is ready and serves the page.
+fn replica(pods: &[Pod]) -> Result<(String, u16), String> {
     let none =
         "the operator has no replica in this namespace. Check --operator-namespace, and that its Deployment runs";
     if pods.is_empty() {
@@ -206,15 +151,7 @@ fn replica(pods: &[Pod]) -> Result<Replica, String> {
         );
     }
     serving.retain(|(pod, _)| is_ready(pod));
-    let mut names: Vec<Replica> = serving
-        .into_iter()
-        .map(|(pod, port)| Replica {
-            pod: pod.name_any(),
-            port,
-        })
-        .collect();
-    names.sort_by(|one, other| one.pod.cmp(&other.pod));
-    let first = names.into_iter().next();
+    let first = serving.into_iter().map(|(pod, port)| (pod.name_any(), port)).min();
     first.ok_or_else(|| "no replica of the operator is ready. `kubectl describe pod` says why".to_owned())
 }
 
@@ -269,11 +206,7 @@ mod tests {
             pod("c", "True", Some("page")),
             pod("b", "True", Some("http")),
         ];
-        let expected = Replica {
-            pod: "c".into(),
-            port: 8081,
-        };
-        assert_eq!(replica(&replicas), Ok(expected));
+        assert_eq!(replica(&replicas), Ok(("c".to_owned(), 8081)));
     }
 
     #[test]

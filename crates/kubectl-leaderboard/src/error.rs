@@ -148,6 +148,11 @@ fn message(error: &kube::Error) -> String {
     phrase(&text::kube(error))
 }
 
+/// Why a command cannot do without Leaderboards.
+pub(super) fn no_leaderboards() -> Error {
+    Error::Forbidden("Leaderboards cannot be read".to_owned())
+}
+
 /// Why there is no log. A Pod that is gone by now is no sign of a missing definition.
 pub(super) fn of_log(error: kube::Error) -> Error {
     match &error {

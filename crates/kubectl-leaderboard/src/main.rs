@@ -249,16 +249,7 @@ async fn carry_out_there(command: Command, cluster: &Cluster) -> Result<ExitCode
         | Command::Import(_)
         | Command::Lint(_)
         | Command::Version(_) => Ok(ExitCode::SUCCESS),
-        Command::Why(Show {
-            name: Some(name),
-            output,
-            ..
-        }) => commands::explain(cluster, &name, output.format).await,
-        Command::Why(Show {
-            name: None,
-            scope,
-            output,
-        }) => commands::survey(cluster, &scope, output.format).await,
+        Command::Why(wanted) => commands::why(cluster, &wanted).await,
         Command::Status(wanted) => Box::pin(commands::show_status(cluster, &wanted)).await,
         Command::Get(wanted) => Box::pin(get::get(cluster, &wanted)).await,
         Command::Pause(wanted) => pause::pause(cluster, &wanted, true).await,
@@ -266,11 +257,9 @@ async fn carry_out_there(command: Command, cluster: &Cluster) -> Result<ExitCode
         Command::Top { scope, output } => commands::top(cluster, &scope, output.format).await,
         Command::Scores(wanted) => scores::scores(cluster, &wanted).await,
         Command::Submit(wanted) => Box::pin(changes::submit(cluster, &wanted)).await,
-        Command::Dashboard(wanted) => Box::pin(dashboard::dashboard(cluster, &wanted))
-            .await
-            .map(|()| ExitCode::SUCCESS),
+        Command::Dashboard(wanted) => Box::pin(dashboard::dashboard(cluster, &wanted)).await,
         Command::Logs(wanted) => Box::pin(logs::logs(cluster, &wanted)).await,
-        Command::Report(wanted) => report::report(cluster, &wanted).await.map(|()| ExitCode::SUCCESS),
+        Command::Report(wanted) => report::report(cluster, &wanted).await,
         Command::Check(wanted) => Box::pin(check::check(cluster, &wanted)).await,
         Command::Cancel(target) => changes::cancel(cluster, &target).await,
         Command::Resume(wanted) => changes::resume(cluster, &wanted).await,

@@ -3,7 +3,8 @@
 //! Called by `main`. Pure but for `print`.
 
 use std::io::{ErrorKind, IsTerminal as _, Write as _};
-use std::sync::OnceLock;
+use std::process::ExitCode;
+use std::sync::{Mutex, OnceLock, PoisonError};
 
 use clap::builder::{PossibleValuesParser, TypedValueParser};
 use clap::{Args, ValueEnum};
@@ -210,6 +211,21 @@ pub fn note(text: &str) {
     for line in noted(text, columns) {
         eprintln!("{line}");
     }
+}
+
+/// Prints a note, unless it is the one before: what is tried again and again fails in one way.
+pub fn note_once(text: &str) {
+    static LAST: Mutex<String> = Mutex::new(String::new());
+    let mut last = LAST.lock().unwrap_or_else(PoisonError::into_inner);
+    if *last != text {
+        note(text);
+        text.clone_into(&mut last);
+    }
+}
+
+/// The exit code of a command that has come to its end.
+pub fn code(is_well: bool) -> ExitCode {
+    ExitCode::from(u8::from(!is_well))
 }
 
 /// The lines of a note: one, or on a terminal of so many columns as many as it needs.

@@ -8,7 +8,7 @@ use leaderboard_api::Leaderboard;
 use serde_json::json;
 
 use crate::board::{self, Observed};
-use crate::cluster::{Cluster, Fetched};
+use crate::cluster::Cluster;
 use crate::commands::frame;
 use crate::error::Error;
 use crate::output::print;
@@ -25,14 +25,10 @@ pub struct Pause {
 /// Sets `spec.paused`.
 pub async fn pause(cluster: &Cluster, wanted: &Pause, paused: bool) -> Result<ExitCode, Error> {
     let name = &wanted.name;
-    let before = match cluster.leaderboard(name).await? {
-        Fetched::Found(leaderboard) => leaderboard,
-        Fetched::Missing => return Err(cluster.unknown::<Leaderboard>("Leaderboard", name).await?),
-        Fetched::Forbidden => return Err(Error::Forbidden("Leaderboards cannot be read".to_owned())),
-    };
+    let before = cluster.known_leaderboard(name).await?;
     let was = before.spec.paused;
     let after = if was == paused {
-        *before
+        before
     } else {
         cluster.patch(name, &json!({"spec": {"paused": paused}})).await??
     };

@@ -12,10 +12,10 @@ use leaderboard_api::standings::{standings, track_of};
 use leaderboard_api::{Leaderboard, Order, Ranking, Standing, Submission, TrackStatus};
 use serde_json::{Value, json};
 
-use crate::cluster::{Cluster, Fetched, Scope};
+use crate::cluster::{Cluster, Filter, Scope};
 use crate::commands::frame;
 use crate::csv;
-use crate::error::Error;
+use crate::error::{Error, no_leaderboards};
 use crate::output::{self, Format, print};
 use crate::table::table;
 use crate::text::{Frame, columns, join};
@@ -67,11 +67,19 @@ pub(super) struct Board {
 
 /// Prints the standings.
 pub async fn scores(cluster: &Cluster, wanted: &Scores) -> Result<ExitCode, Error> {
+    let filter = Filter {
+        leaderboard: wanted.name.clone(),
+        ..Filter::default()
+    };
     let scope = Scope {
         all_namespaces: wanted.all_namespaces,
+        filter,
         ..Scope::default()
     };
-    let leaderboards = leaderboards(cluster, wanted, &scope).await?;
+    let leaderboards = match &wanted.name {
+        Some(name) if !wanted.all_namespaces => vec![cluster.known_leaderboard(name).await?],
+        _ => cluster.leaderboards(&scope).await?.ok_or_else(no_leaderboards)?,
+    };
     let submissions = cluster.submissions(&scope).await?;
     let boards = boards(&leaderboards, &submissions, wanted.track.as_deref());
     if boards.is_empty() {
@@ -83,22 +91,6 @@ pub async fn scores(cluster: &Cluster, wanted: &Scores) -> Result<ExitCode, Erro
     }
     print(&printed(&boards, wanted.format, frame()));
     Ok(ExitCode::SUCCESS)
-}
-
-async fn leaderboards(cluster: &Cluster, wanted: &Scores, scope: &Scope) -> Result<Vec<Leaderboard>, Error> {
-    let forbidden = || Error::Forbidden("Leaderboards cannot be read".to_owned());
-    match &wanted.name {
-        Some(name) if !wanted.all_namespaces => match cluster.leaderboard(name).await? {
-            Fetched::Found(found) => Ok(vec![*found]),
-            Fetched::Missing => Err(cluster.unknown::<Leaderboard>("Leaderboard", name).await?),
-            Fetched::Forbidden => Err(forbidden()),
-        },
-        name => {
-            let mut found = cluster.leaderboards(scope).await?.ok_or_else(forbidden)?;
-            found.retain(|board| name.as_ref().is_none_or(|name| board.name_any() == *name));
-            Ok(found)
-        }
-    }
 }
 
 /// Why no track was found, with the next step.

@@ -15,7 +15,7 @@ use crate::aws::{self, Unread};
 use crate::board::Observed;
 use crate::cluster::Cluster;
 use crate::commands::frame;
-use crate::error::Error;
+use crate::error::{Error, no_leaderboards};
 use crate::foreign;
 use crate::output::{ask, print};
 use crate::submit::Submit;
@@ -35,7 +35,7 @@ pub async fn upload(
     object: &mut Value,
 ) -> Result<(), Error> {
     let Some(board) = leaderboard.leaderboard() else {
-        return Err(Error::Forbidden("Leaderboards cannot be read".to_owned()));
+        return Err(no_leaderboards());
     };
     object["spec"]["input"] = json!(measured(path, board)?);
     let storage = &board.spec.storage.s3;

@@ -5,7 +5,7 @@ use std::process::ExitCode;
 
 use clap::Args;
 use k8s_openapi::api::core::v1::Pod;
-use kube::ResourceExt;
+use kube::{Api, ResourceExt};
 use serde_json::{Value, json};
 
 use crate::cluster::{Cluster, Target};
@@ -41,31 +41,28 @@ pub(super) type Running = BTreeMap<(String, String), usize>;
 /// Prints the versions. Without a cluster the own one is printed all the same.
 pub async fn version(target: Target, wanted: &Version) -> Result<ExitCode, Error> {
     let asked = if wanted.client {
-        None
+        Ok(None)
     } else {
-        Some(ask(target, wanted).await)
+        ask(target, wanted).await.map(Some)
     };
-    let (operator, failed) = match asked {
-        None => (None, None),
-        Some(Ok(operator)) => (Some(operator), None),
-        Some(Err(error)) => (None, Some(error)),
+    let (operator, end) = match asked {
+        Ok(operator) => (operator, Ok(ExitCode::SUCCESS)),
+        Err(error) => (None, Err(error)),
     };
     let found = operator
         .as_ref()
         .map(|(namespace, running)| (namespace.as_str(), running));
     let lines_of_it = output::document(wanted.output.format, &value(found));
     print(&lines_of_it.unwrap_or_else(|| lines(OWN, found, frame())));
-    failed.map_or(Ok(ExitCode::SUCCESS), Err)
+    end
 }
 
 async fn ask(target: Target, wanted: &Version) -> Result<(String, Running), Error> {
     let cluster = Cluster::connect(target).await?;
     let asked = async {
-        let namespace = match &wanted.operator_namespace {
-            Some(namespace) => namespace.clone(),
-            None => operator_namespace(&cluster).await?,
-        };
-        let pods = replicas(&cluster, &namespace).await?;
+        let namespace = operator_namespace(&cluster, wanted.operator_namespace.as_deref()).await?;
+        let pods = Api::namespaced(cluster.client.clone(), &namespace);
+        let pods = replicas(&pods).await.map_err(Error::Unfit)?;
         Ok((namespace, running(&pods)))
     };
     asked.await.map_err(|error: Error| error.naming(&cluster.server))

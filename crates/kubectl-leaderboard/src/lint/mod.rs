@@ -25,7 +25,7 @@ use self::schema::Fault;
 use crate::error::Error;
 use crate::import::text_of;
 use crate::near;
-use crate::output::{paragraphs, print};
+use crate::output::{code, paragraphs, print};
 
 /// The manifests.
 #[derive(Args, Debug)]
@@ -68,7 +68,7 @@ pub fn lint(wanted: &Lint) -> Result<ExitCode, Error> {
         is_well &= findings.is_empty() && checked != Checked::default();
         print(&paragraphs(&lines(&shown, &findings, &checked)));
     }
-    Ok(if is_well { ExitCode::SUCCESS } else { ExitCode::FAILURE })
+    Ok(code(is_well))
 }
 
 /// Lines about one file: each fault, and a sentence about all objects.

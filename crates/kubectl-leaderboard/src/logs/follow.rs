@@ -8,12 +8,11 @@ use futures::stream::{BoxStream, SelectAll};
 use futures::{Stream, StreamExt};
 use k8s_openapi::api::core::v1::{ContainerStatus, Pod};
 use kube::ResourceExt;
-use kube::runtime::watcher;
 use leaderboard_api::Submission;
 
 use super::{Logs, Source, begins_again, begins_later, end, sources, workers};
 use crate::cluster::Cluster;
-use crate::commands::note_interruption;
+use crate::commands::{changes, next, uninterrupted};
 use crate::error::Error;
 use crate::facts;
 use crate::output::{note, print_labelled};
@@ -30,7 +29,6 @@ struct Following<'a> {
     submission: Submission,
     begun: BTreeSet<Life>,
     lines: SelectAll<Lines>,
-    printed: String,
 }
 
 /// Prints the lines as they come.
@@ -42,15 +40,14 @@ pub(super) async fn follow(cluster: &Cluster, wanted: &Logs, submission: Submiss
     {
         note(&begins_later(&submission));
     }
-    let mut changes = pin!(cluster.changes(&wanted.name));
-    let mut pods = pin!(cluster.pod_changes(&wanted.name));
+    let mut changes = pin!(changes(cluster, &wanted.name));
+    let mut pods = pin!(uninterrupted(cluster.pod_changes(&wanted.name)));
     let mut following = Following {
         cluster,
         wanted,
         submission,
         begun: BTreeSet::new(),
         lines: SelectAll::new(),
-        printed: String::new(),
     };
     while !following.is_over() {
         following.step(&mut changes, &mut pods).await?;
@@ -68,21 +65,14 @@ impl Following<'_> {
     /// Takes whichever comes first: a line, a change of the submission, or one of a Pod.
     async fn step(
         &mut self,
-        changes: &mut (impl Stream<Item = Result<Option<Submission>, watcher::Error>> + Unpin),
-        pods: &mut (impl Stream<Item = Result<Pod, watcher::Error>> + Unpin),
+        changes: &mut (impl Stream<Item = Result<Submission, Error>> + Unpin),
+        pods: &mut (impl Stream<Item = Result<Pod, Error>> + Unpin),
     ) -> Result<(), Error> {
         tokio::select! {
             // A log that never pauses hides no change.
             biased;
-            Some(change) = changes.next() => match change {
-                Ok(Some(submission)) => self.submission = submission,
-                Ok(None) => return Err(Error::Gone(self.wanted.name.clone())),
-                Err(error) => note_interruption(error, &mut self.printed)?,
-            },
-            Some(pod) = pods.next() => match pod {
-                Ok(pod) => self.begin(&pod),
-                Err(error) => note_interruption(error, &mut self.printed)?,
-            },
+            changed = next(changes) => self.submission = changed?,
+            pod = next(pods) => self.begin(&pod?),
             line = self.lines.next(), if !self.lines.is_empty() => match line {
                 // The last log has ended.
                 None => {}
@@ -90,7 +80,6 @@ impl Following<'_> {
                 Some((_, Err(error @ (Error::Forbidden(_) | Error::Credentials(_))))) => return Err(error),
                 Some((source, Err(error))) => note(&format!("the log of {} was interrupted: {error}", source.container)),
             },
-            else => return Err(Error::Api("the watch has ended".to_owned())),
         }
         Ok(())
     }

@@ -5,6 +5,7 @@
 mod redact;
 
 use std::path::PathBuf;
+use std::process::ExitCode;
 
 use clap::Args;
 use leaderboard_api::text::sentence;
@@ -36,7 +37,7 @@ struct Part {
 }
 
 /// Writes the report.
-pub async fn report(cluster: &Cluster, wanted: &Report) -> Result<(), Error> {
+pub async fn report(cluster: &Cluster, wanted: &Report) -> Result<ExitCode, Error> {
     let now = frame().now;
     let parts = ask(cluster).await;
     let submissions = parts.iter().find(|part| part.name == SUBMISSIONS);
@@ -71,7 +72,7 @@ pub async fn report(cluster: &Cluster, wanted: &Report) -> Result<(), Error> {
     let path = file.display().to_string();
     std::fs::write(&file, text + "\n").map_err(|error| Error::File(path.clone(), error))?;
     print(&lines(&path, &cluster.namespace, &counts, &missing, frame()));
-    Ok(())
+    Ok(ExitCode::SUCCESS)
 }
 
 async fn ask(cluster: &Cluster) -> [Part; 4] {
