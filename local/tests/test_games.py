@@ -14,6 +14,7 @@ from pathlib import Path
 
 from labkit import image
 from labkit.errors import LabError
+from labkit.process import wait_until
 from labkit.settings import Settings
 
 REPOSITORY = Path(__file__).resolve().parents[2]
@@ -27,6 +28,8 @@ PLAYED = {1: [7, 9, 4, 10], 2: [10, 10, 7, 9]}
 RIGHT = {1: (34, 41, 40), 2: (39, 44, 38)}
 HALF = 50
 SECONDS = 30
+# Between two looks at what can't be watched: a test that looks without a pause takes the processor from what it waits for.
+PAUSE = 0.01
 
 
 def free_ports() -> int:
@@ -76,11 +79,14 @@ class Games(unittest.TestCase):
     ) -> subprocess.Popen[bytes]:
         """An evaluator that listens."""
         process = self.start(program, worker, **variables)
-        while process.poll() is None:
+
+        def listens() -> bool:
             with socket.socket() as probe:
-                if probe.connect_ex(("127.0.0.1", self.port + 100 * (worker - 1))) == 0:
-                    return process
-        self.fail((self.folder / f"evaluators-{worker}" / "log").read_text())
+                return probe.connect_ex(("127.0.0.1", self.port + 100 * (worker - 1))) == 0
+
+        wait_until(lambda: listens() or process.poll() is not None, SECONDS, PAUSE)
+        self.assertIsNone(process.poll(), (self.folder / f"evaluators-{worker}" / "log").read_text())
+        return process
 
     def hostile(self, kind: str, worker: int) -> subprocess.Popen[bytes]:
         return self.start(GAMES / "agent.py", worker, KIND=kind)
@@ -113,8 +119,10 @@ class Games(unittest.TestCase):
                 self.setUp()
                 evaluator = self.evaluator(worker)
                 agent = self.hostile(kind, worker)
-                while self.result(worker)["done"] != done:
-                    self.assertIn(agent.poll(), (None, 1))
+                played = wait_until(
+                    lambda worker=worker, done=done: self.result(worker)["done"] == done, SECONDS, PAUSE
+                )
+                self.assertTrue(played, agent.poll())
                 if kind == "crash-once":
                     self.assertEqual(agent.wait(SECONDS), 1)
                 agent.kill()
@@ -151,8 +159,7 @@ class Games(unittest.TestCase):
         self.assertEqual(self.hostile("take-port", 2).wait(SECONDS), 1)
         self.assertEqual(evaluator.wait(SECONDS), 1)
         log = self.folder / "agents-1" / "log"
-        while "taken" not in log.read_text():
-            pass
+        self.assertTrue(wait_until(lambda: "taken" in log.read_text(), SECONDS, PAUSE))
         again = self.start(GAMES / "evaluator.py", 2, FAULT="none")
         self.assertEqual(again.wait(SECONDS), 1)
 
@@ -246,8 +253,9 @@ class Classification(unittest.TestCase):
             for worker, (easy, hard, _) in RIGHT.items():
                 with self.subTest(fault=fault, worker=worker):
                     process = self.evaluator(worker, fault, splits, "")
-                    while (self.result(worker).get("done"), fault) == (None, "hold"):
-                        self.assertIsNone(process.poll())
+                    if fault == "hold":
+                        begun = wait_until(lambda worker=worker: "done" in self.result(worker), SECONDS, PAUSE)
+                        self.assertTrue(begun, process.poll())
                     if fault == "crash-once":
                         self.assertEqual(process.wait(SECONDS), 1)
                     process.kill()
