@@ -23,13 +23,17 @@ PASTED = re.compile(r"^kubectl -n (\S+) apply --filename=- <<'EOF'\n(.*?)\nEOF$"
 def text_of(kube: Kube, chart: Path, values: Mapping[str, Any]) -> str:
     """What people read after an installation with these values."""
     argv = ["install", RELEASE, str(chart), f"--namespace={SYSTEM}", "--dry-run=client", "--values=-"]
-    given = json.dumps(chartrender.nested({**IMAGE, **values}))
+    given = json.dumps(chartrender.nested({**IMAGE, **chartrender.LEAN, **values}))
     return kube.run("helm", *argv, given=given).partition("\nNOTES:\n")[2]
 
 
-def notes(kube: Kube, chart: Path) -> str:
-    for values, present, missing in NOTES:
-        text = text_of(kube, chart, values)
+def texts(kube: Kube, chart: Path) -> list[str]:
+    """For each case what people read."""
+    return [text_of(kube, chart, values) for values, _, _ in NOTES]
+
+
+def notes(shown: Sequence[str]) -> str:
+    for (values, present, missing), text in zip(NOTES, shown, strict=True):
         wrong = [f"lacks {one!r}" for one in present if one not in text]
         wrong += [f"has {one!r}" for one in missing if one in text]
         if wrong:
@@ -37,11 +41,11 @@ def notes(kube: Kube, chart: Path) -> str:
     return f"{len(NOTES)} cases"
 
 
-def manifests(kube: Kube, chart: Path) -> str:
+def manifests(kube: Kube, chart: Path, shown: Sequence[str]) -> str:
     """The server takes each manifest as it stands, and each Leaderboard names what the same values allow."""
     count = 0
-    for values, _, _ in NOTES:
-        pasted = PASTED.findall(text_of(kube, chart, values))
+    for (values, _, _), text in zip(NOTES, shown, strict=True):
+        pasted = PASTED.findall(text)
         if len(pasted) != 2:
             raise LabError(f"with {json.dumps(values)} NOTES.txt has {len(pasted)} manifests and not 2")
         bounds = allowed(kube, chart, values)
@@ -63,7 +67,7 @@ def manifests(kube: Kube, chart: Path) -> str:
 def allowed(kube: Kube, chart: Path, values: Mapping[str, Any]) -> dict[str, dict[str, list[str]]]:
     """What the installed controller would let Leaderboards name, by namespace."""
     container = chartrender.at(
-        chartrender.objects(kube, chartrender.template(kube, chart, values))[CONTROLLER],
+        chartrender.objects(kube, chartrender.template(kube, chart, {**chartrender.LEAN, **values}))[CONTROLLER],
         "spec.template.spec.containers.0",
     )
     bounds: dict[str, dict[str, list[str]]] = json.loads(

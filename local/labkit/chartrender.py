@@ -21,6 +21,11 @@ SOURCE = re.compile(r"^# Source: leaderboard-operator/(templates/\S+)$", re.MULT
 MONITORING_KINDS = ("PodMonitor", "ServiceMonitor", "PrometheusRule")
 # Three minutes for the removal of the definitions, which the API server is reminded of every 5 s.
 REMOVAL_LOOKS, REMOVAL_PAUSE = 36, 5
+# Stands before each of several texts that one kubectl reads.
+MARK = "Text"
+DEFINITION = "CustomResourceDefinition/"
+# The definitions are most of what the chart renders, and the same for all values but those that are about them.
+LEAN: Mapping[str, Any] = {"crds.enabled": False}
 
 
 def folder(repository: Path) -> Path:
@@ -51,11 +56,31 @@ def objects(kube: Kube, manifests: str) -> dict[str, dict[str, Any]]:
 
     An empty patch that kubectl makes here gives them back as JSON.
     """
-    text = kube.run(
-        "kubectl", "patch", "--local", "--filename=-", "--type=merge", "--patch={}", "--output=json", given=manifests
-    )
+    return by_name(as_json(kube, manifests))
+
+
+def objects_of_each(kube: Kube, texts: Sequence[str]) -> list[dict[str, dict[str, Any]]]:
+    """The same for each of many texts, by one kubectl."""
+    mark = f"---\napiVersion: v1\nkind: {MARK}\nmetadata: {{name: mark}}\n---\n"
+    found: list[list[dict[str, Any]]] = []
+    for item in as_json(kube, "".join(f"{mark}{text}\n" for text in texts)):
+        if item["kind"] == MARK:
+            found.append([])
+        else:
+            found[-1].append(item)
+    if len(found) != len(texts):
+        raise LabError(f"kubectl has given back {len(found)} texts of {len(texts)}")
+    return [by_name(items) for items in found]
+
+
+def as_json(kube: Kube, manifests: str) -> list[dict[str, Any]]:
+    argv = ["patch", "--local", "--filename=-", "--type=merge", "--patch={}", "--output=json"]
+    return documents(kube.run("kubectl", *argv, given=manifests))
+
+
+def by_name(items: Sequence[dict[str, Any]]) -> dict[str, dict[str, Any]]:
     found: dict[str, dict[str, Any]] = {}
-    for item in documents(text):
+    for item in items:
         kind, metadata = item["kind"], item["metadata"]
         name = f"{kind}/{metadata.get('namespace', '')}/{metadata['name']}"
         if name in found:
@@ -110,11 +135,9 @@ def fault(rendered: Mapping[str, Any], shown: Shown) -> str | None:
 
 def every_value(kube: Kube, chart: Path) -> str:
     """Renders each case; then no value and no template may be without one."""
-    sources: set[str] = set()
-    for case in chartshows.CASES:
-        manifests = template(kube, chart, case.values, case.kinds)
-        sources |= set(SOURCE.findall(manifests))
-        rendered = objects(kube, manifests)
+    texts = [template(kube, chart, lean(case), case.kinds) for case in chartshows.CASES]
+    sources = set(SOURCE.findall("\n".join(texts)))
+    for case, rendered in zip(chartshows.CASES, objects_of_each(kube, texts), strict=True):
         faults = [text for shown in case.shown if (text := fault(rendered, shown))]
         if faults:
             raise LabError(f"with {json.dumps(case.values)}: {'; '.join(faults)}")
@@ -123,6 +146,12 @@ def every_value(kube: Kube, chart: Path) -> str:
     if untested or idle:
         raise LabError(f"chartshows.py has no case for the values {untested} and none that renders {idle}: add them")
     return f"{len(chartshows.CASES)} cases, {sum(len(case.shown) for case in chartshows.CASES)} assertions"
+
+
+def lean(case: Case) -> Mapping[str, Any]:
+    """The values of a case, without the definitions where it is about other objects."""
+    is_about_them = any(shown.object.startswith(DEFINITION) for shown in case.shown)
+    return case.values if is_about_them else {**LEAN, **case.values}
 
 
 def without_case(chart: Path, cases: Sequence[Case]) -> list[str]:

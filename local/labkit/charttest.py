@@ -4,10 +4,11 @@ Called by `lab chart-test`. The API server is a throwaway one without nodes; it 
 """
 
 import json
+import re
 import shutil
 import tempfile
 import time
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
@@ -40,6 +41,8 @@ from .settings import Settings
 
 # The Jobs that the operator's tests hold its own against.
 JOBS = "crates/pod-spec/src/job/golden"
+# The kind of each object of a YAML text, or of a JSON one.
+KIND = re.compile(r"""^(?:kind: |  "kind": ")(\w+)""", re.MULTILINE)
 CRDS = ("leaderboards.leaderboard.carla.org", "submissions.leaderboard.carla.org")
 
 
@@ -72,17 +75,20 @@ def run(settings: Settings, update: bool) -> None:
         check("values that must be refused", lambda: refused_values(kube, chart))
         check("what each value shows in the objects", lambda: chartrender.every_value(kube, chart))
         check("what people of other charts type", lambda: chartsets.typed(kube, chart))
-        check("NOTES.txt", lambda: chartnotes.notes(kube, chart))
+        shown = chartnotes.texts(kube, chart)
+        check("NOTES.txt", lambda: chartnotes.notes(shown))
         check("alerts and dashboard", lambda: chartrender.queries(kube, chart, settings.repository))
-        check("kubeconform -strict, with that server's schemas", lambda: conform(kube, chart, own_document(kube), jobs))
+        rendered = {file.name if file else "defaults.yaml": render(kube, chart, file) for file in values_files(chart)}
+        given = rendered | {file.name: file.read_text() for file in sorted(jobs.glob("*.json"))}
+        check("kubeconform -strict, with that server's schemas", lambda: conform(kube, given, own_document(kube)))
         for version in kubeversions.SUMS:
             served = kubeversions.document(settings, version)
-            check(f"the same for Kubernetes {version}", lambda served=served: conform(kube, chart, served, jobs))
-        check("server-side dry run", lambda: dry_run(kube, chart))
+            check(f"the same for Kubernetes {version}", lambda served=served: conform(kube, given, served))
+        check("server-side dry run", lambda: dry_run(kube, rendered))
         check("one file without Helm", lambda: chartrender.applied(kube, chart))
         check("install, rights in one leaderboard's namespace", lambda: installed(kube, chart))
         check("rights of people", lambda: people(kube))
-        check("manifests of NOTES.txt", lambda: chartnotes.manifests(kube, chart))
+        check("manifests of NOTES.txt", lambda: chartnotes.manifests(kube, chart, shown))
         check("examples of Chart.yaml", lambda: examples(kube, chart))
         check("values of examples/aws", lambda: aws_values(kube, chart, settings.repository / "examples" / "aws"))
         check("manifests of demo and quickstart", lambda: manifests(kube, settings.repository / "examples"))
@@ -196,37 +202,43 @@ def own_document(kube: Kube) -> dict[str, Any]:
     return document
 
 
-def conform(kube: Kube, chart: Path, document: dict[str, Any], jobs: Path) -> str:
+def conform(kube: Kube, given: Mapping[str, str], document: dict[str, Any]) -> str:
     """What the chart renders, and the Jobs as the controller makes them, are right by the schemas of a document."""
-    objects = 0
+    kinds = [kind for text in given.values() for kind in KIND.findall(text)]
     with tempfile.TemporaryDirectory(prefix="leaderboard-schemas-") as folder:
-        for name, schema in schemas.files(document):
-            (Path(folder) / name).write_text(json.dumps(schema))
-        argv = ["kubeconform", "-strict", "-summary", "-output=json", f"-schema-location={folder}/{schemas.TEMPLATE}"]
-        given = {str(file or "values.yaml"): render(kube, chart, file) for file in values_files(chart)}
-        given |= {file.name: file.read_text() for file in sorted(jobs.glob("*.json"))}
-        for name, manifests in given.items():
-            done = kube.attempt(*argv, given=manifests)
-            answer = json.loads(done.stdout or "{}")
-            if done.returncode != 0:
-                raise LabError(f"{name}: {describe(answer) or done.stderr.strip()[-300:]}")
-            objects += answer["summary"]["valid"]
-    return f"{objects} objects"
+        known, texts = Path(folder) / "schemas", Path(folder) / "given"
+        known.mkdir()
+        texts.mkdir()
+        for name, schema in schemas.files(document, frozenset(kinds)):
+            (known / name).write_text(json.dumps(schema))
+        for name, text in given.items():
+            (texts / name).write_text(text)
+        location = f"-schema-location={known}/{schemas.TEMPLATE}"
+        done = kube.attempt("kubeconform", "-strict", "-summary", "-output=json", location, str(texts))
+    answer = json.loads(done.stdout or "{}")
+    if done.returncode != 0:
+        raise LabError(describe(answer) or done.stderr.strip()[-300:])
+    valid = answer["summary"]["valid"]
+    if valid != len(kinds):
+        raise LabError(f"of {len(kinds)} objects it has judged {valid}")
+    return f"{valid} objects"
 
 
 def describe(answer: dict[str, Any]) -> str:
     bad = [one for one in answer.get("resources", []) if one["status"] != "statusValid"]
-    return "; ".join(f"{one['kind']} {one['name']}: {one['msg']}" for one in bad)[:600]
+    return "; ".join(f"{Path(one['filename']).name}: {one['kind']} {one['name']}: {one['msg']}" for one in bad)[:600]
 
 
-def dry_run(kube: Kube, chart: Path) -> str:
+def dry_run(kube: Kube, rendered: Mapping[str, str]) -> str:
     """The server's own answer to each rendering; the Pods in it must be as confined as they claim."""
-    objects = 0
-    for file in values_files(chart):
-        argv = ["apply", "--server-side", "--dry-run=server", "--validate=strict", "--filename=-", "--output=json"]
-        items = json.loads(kube.run("kubectl", *argv, given=render(kube, chart, file)))["items"]
-        objects += len(items)
-        for item in items:
+    argv = ["apply", "--server-side", "--dry-run=server", "--validate=strict", "--filename=-", "--output=json"]
+    objects, judged = 0, set[str]()
+    for text in rendered.values():
+        # Many are the same with other values, the large definitions among them.
+        new = [part for part in text.rstrip("\n").split("\n---\n") if part not in judged]
+        judged.update(new)
+        for item in documents(kube.run("kubectl", *argv, given="\n---\n".join(new))) if new else []:
+            objects += 1
             if item["kind"] == "Deployment":
                 confined(item)
     return f"{objects} objects"

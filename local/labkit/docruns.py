@@ -150,7 +150,8 @@ def typed(repository: Path, kube: Kube, folder: Path, found: Sequence[Block]) ->
             "MANPAGER": "cat",
             "KUBE_EDITOR": "/bin/true",
             "PYTHONPATH": str(repository / "local"),
-            "PYTHONDONTWRITEBYTECODE": "1",
+            # Hundreds of starts: none is to compile what it runs.
+            "PYTHONPYCACHEPREFIX": str(folder / "compiled"),
             "DOCUMENTS_FOLDER": str(folder),
             "DOCUMENTS_KUBECTL": str(kube.tools / "kubectl"),
             "DOCUMENTS_HELM": str(kube.tools / "helm"),
@@ -183,7 +184,7 @@ def install(programs: Path) -> None:
             raise LabError(f"{name} is missing, which the documents use: apt-get install {name}")
         (programs / name).symlink_to(found)
     stand_in = programs / "stand-in"
-    stand_in.write_text(f'#!{shutil.which("bash")}\nexec python3 -m labkit.docprograms "$0" "$@"\n')
+    stand_in.write_text(f'#!{shutil.which("bash")}\nexec python3 -S -m labkit.docprograms "$0" "$@"\n')
     stand_in.chmod(0o755)
     for name in ("kubectl", "helm", "aws", "cargo", "make", "leaderboard-operator", docprograms.PLUGIN, *ELSEWHERE):
         (programs / name).symlink_to("stand-in")

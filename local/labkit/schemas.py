@@ -4,7 +4,7 @@ kubeconform's own schemas come from the internet; these come from the very serve
 not know.
 """
 
-from collections.abc import Iterator
+from collections.abc import Collection, Iterator
 from typing import Any
 
 REFERENCE = "#/definitions/"
@@ -17,11 +17,13 @@ LENIENT = {
 TEMPLATE = "{{.Group}}_{{.ResourceAPIVersion}}_{{.ResourceKind}}.json"
 
 
-def files(openapi: dict[str, Any]) -> Iterator[tuple[str, dict[str, Any]]]:
-    """The name and content of one file for each kind in a document of OpenAPI v2."""
+def files(openapi: dict[str, Any], kinds: Collection[str] | None = None) -> Iterator[tuple[str, dict[str, Any]]]:
+    """The name and content of one file for each kind in a document of OpenAPI v2, or for each of these names."""
     definitions = {name: strict(name, schema) for name, schema in openapi["definitions"].items()}
     for name, schema in openapi["definitions"].items():
         for kind in schema.get("x-kubernetes-group-version-kind", []):
+            if kinds is not None and kind["kind"] not in kinds:
+                continue
             # kubeconform takes the version for the group where there is no group.
             group = kind["group"] or kind["version"]
             file = f"{group}_{kind['version']}_{kind['kind'].lower()}.json"
