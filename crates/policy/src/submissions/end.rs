@@ -96,11 +96,10 @@ fn wait_for_bucket(draft: &mut PlanBuilder<'_>, why: &str) -> bool {
     let message = draft.stall(Reason::NotStored, &message);
     let since = draft.blocked_since(Reason::NotStored).unwrap_or(draft.now());
     let until = after(since, limit);
-    if draft.now() >= until {
+    if !draft.waits_until(until) {
         return false;
     }
     draft.show(Reason::NotStored, message);
-    draft.requeue_at(until);
     draft.look_again(Wait::REPORT);
     true
 }

@@ -51,11 +51,7 @@ pub(super) fn waits_for_policy(draft: &mut PlanBuilder<'_>) -> bool {
     };
     let created = draft.submission().metadata.creation_timestamp.as_ref();
     let until = Wait::POLICY.shown_at(created.map_or(draft.now(), |time| time.0));
-    let is_silent = draft.now() < until && !is_refused;
-    if is_silent {
-        draft.requeue_at(until);
-    }
-    let reason = if is_silent {
+    let reason = if !is_refused && draft.waits_until(until) {
         Reason::Preparing
     } else {
         Reason::NotIsolated
@@ -89,11 +85,10 @@ pub(super) fn waits_for_phase(draft: &mut PlanBuilder<'_>) -> bool {
     let message = draft.stall(Reason::PhaseDiffers, &message);
     let since = draft.blocked_since(Reason::PhaseDiffers).unwrap_or(draft.now());
     let until = Wait::PHASE.over_at(since);
-    if draft.now() >= until {
-        end::failed(draft, infrastructure(Reason::PhaseDiffers, &what));
-    } else {
-        draft.requeue_at(until);
+    if draft.waits_until(until) {
         draft.refuse(Reason::PhaseDiffers, &message);
+    } else {
+        end::failed(draft, infrastructure(Reason::PhaseDiffers, &what));
     }
     true
 }

@@ -47,8 +47,8 @@ pub(super) fn leave_job(draft: &mut PlanBuilder<'_>) {
     if job.end.is_some() {
         return;
     }
-    if let Some(until) = farewell(draft) {
-        return draft.requeue_at(until);
+    if farewell(draft).is_some_and(|until| draft.waits_until(until)) {
+        return;
     }
     if job.deleting {
         stop::remove_overdue_pod(draft);
@@ -63,8 +63,7 @@ fn farewell(draft: &PlanBuilder<'_>) -> Option<Timestamp> {
     let pod = draft.view.pod.as_ref().filter(|pod| pod.delete_by.is_none())?;
     pod.run_ended?;
     let end = draft.status.end()?;
-    let until = Wait::FAREWELL.over_at(end.last_transition_time.0);
-    (draft.now() < until).then_some(until)
+    Some(Wait::FAREWELL.over_at(end.last_transition_time.0))
 }
 
 /// Removes a Job whose host wants it gone before Kubernetes removes it: that is late enough for every end to be read first.
@@ -81,9 +80,7 @@ pub(super) fn remove_job_in_time(draft: &mut PlanBuilder<'_>) {
     }
     let finished = draft.status.times.finished.as_ref().map(|time| time.0);
     let until = after(end.at().or(finished).unwrap_or(draft.now()), seconds.into());
-    if draft.now() < until {
-        draft.requeue_at(until);
-    } else {
+    if !draft.waits_until(until) {
         draft.act(stop::delete(job, Wait::DELETION.longest));
         draft.look_again(Wait::DELIVERY);
     }
@@ -101,7 +98,7 @@ pub(super) fn release(draft: &mut PlanBuilder<'_>, complete: bool) {
     }
     let patience = draft.leaderboard().map_or(900, |l| l.deadlines.finalize_seconds);
     let until = after(deleted.0, patience);
-    if draft.now() >= until {
+    if !draft.waits_until(until) {
         draft.event(
             true,
             Reason::ReleasedUnpublished,
@@ -109,8 +106,6 @@ pub(super) fn release(draft: &mut PlanBuilder<'_>, complete: bool) {
         );
         draft.act(Action::Forget);
         draft.act(Action::SetFinalizer(false));
-    } else {
-        draft.requeue_at(until);
     }
 }
 
@@ -126,9 +121,8 @@ pub(super) fn needs_finalizer(draft: &PlanBuilder<'_>) -> bool {
 /// Deletes the Submission if its time is over, else comes back at that time.
 pub(super) fn delete_in_time(draft: &mut PlanBuilder<'_>) {
     let Some(until) = deleted_at(draft) else { return };
-    if draft.now() < until {
-        draft.look_again(Wait::RETENTION);
-        return draft.requeue_at(until);
+    if draft.waits_until(until) {
+        return draft.look_again(Wait::RETENTION);
     }
     let board = draft.view.leaderboard.as_deref();
     if !board.is_none_or(|board| standings::can_spare(board, draft.submission())) {

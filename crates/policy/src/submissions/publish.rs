@@ -72,9 +72,8 @@ pub(super) enum Delivery {
 
 /// Shows that EvalAI has the end. The table's answer is waited for, so that both are one write.
 fn show_published(draft: &mut PlanBuilder<'_>, at: Timestamp, recorded: bool) {
-    let until = Wait::TOGETHER.shown_at(at);
-    if !recorded && draft.now() < until {
-        return draft.requeue_at(until);
+    if !recorded && draft.waits_until(Wait::TOGETHER.shown_at(at)) {
+        return;
     }
     draft.status.times.published = Some(Time(at));
     let team = draft.view.evalai.as_ref().and_then(|evalai| evalai.team_id.clone());

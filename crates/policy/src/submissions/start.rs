@@ -166,9 +166,7 @@ fn lasts(draft: &mut PlanBuilder<'_>, found: &Trouble) -> Option<i64> {
     }
     let seconds = draft.deadlines().start_seconds;
     let since = draft.blocked_since(found.reason).unwrap_or(draft.now());
-    let until = after(since, seconds);
-    draft.requeue_at(until);
-    (draft.now() >= until).then_some(seconds)
+    (!draft.waits_until(after(since, seconds))).then_some(seconds)
 }
 
 /// The message for a run whose node is away, before Kubernetes has given its Pod up.
@@ -273,8 +271,8 @@ fn without_pod(draft: &mut PlanBuilder<'_>, job: &JobView) {
             LOST
         });
     } else if let Some(at) = job.begun().map(|at| Wait::POD.shown_at(at)) {
-        if draft.now() < at {
-            return draft.requeue_at(at);
+        if draft.waits_until(at) {
+            return;
         }
         let message = "The Job has not created a Pod and no event explains why. Look at the Job, and check that the \
                        cluster's controller manager runs.";
@@ -309,12 +307,7 @@ fn refused(what: &str, words: &str) -> (Reason, String) {
 
 /// Shows nothing yet of a Job that is new.
 fn settles(draft: &mut PlanBuilder<'_>, job: &JobView) -> bool {
-    let settled = job.begun().map(|at| Wait::NODE.shown_at(at));
-    let Some(settled) = settled.filter(|at| draft.now() < *at) else {
-        return false;
-    };
-    draft.requeue_at(settled);
-    true
+    job.begun().is_some_and(|at| draft.waits_until(Wait::NODE.shown_at(at)))
 }
 
 fn unschedulable(draft: &mut PlanBuilder<'_>, job: &JobView, words: &str, scale_up: Option<&ScaleUp>) {
@@ -350,11 +343,10 @@ fn is_late(draft: &mut PlanBuilder<'_>, job: &JobView, reason: Reason, message: 
         job.begun()
     };
     let deadline = after(since.unwrap_or(draft.now()), limit);
-    if draft.now() >= deadline {
-        let what = format!("No node accepted the Pod within {limit} s: {message}");
-        draft.fail(infrastructure(Reason::ScheduleDeadline, &what));
-        return true;
+    if draft.waits_until(deadline) {
+        return false;
     }
-    draft.requeue_at(deadline);
-    false
+    let what = format!("No node accepted the Pod within {limit} s: {message}");
+    draft.fail(infrastructure(Reason::ScheduleDeadline, &what));
+    true
 }

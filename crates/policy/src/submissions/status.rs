@@ -317,6 +317,15 @@ impl<'a> PlanBuilder<'a> {
         self.requeue_in(Duration::try_from(left).unwrap_or_default() + Duration::from_millis(50));
     }
 
+    /// True if this time is still to come; then it asks for another look at it.
+    pub(super) fn waits_until(&mut self, at: Timestamp) -> bool {
+        let waits = self.now() < at;
+        if waits {
+            self.requeue_at(at);
+        }
+        waits
+    }
+
     pub(super) fn condition(&mut self, type_: &str, truth: Truth, reason: impl Into<ReasonName>, message: &str) {
         self.condition_at(&self.time(), type_, truth, reason, message);
     }
@@ -416,11 +425,11 @@ impl<'a> PlanBuilder<'a> {
     /// Shows a wait that is a stall once it has lasted for so long.
     pub(super) fn stalls_after(&mut self, wait: Wait, reason: Reason, message: &str) {
         let until = wait.over_at(self.blocked(reason));
-        if self.now() >= until {
-            return self.stall_with(reason, message);
+        if self.waits_until(until) {
+            self.waits_since(reason, message);
+        } else {
+            self.stall_with(reason, message);
         }
-        self.requeue_at(until);
-        self.waits_since(reason, message);
     }
 
     /// Shows a wait, and remembers since when it has lasted.

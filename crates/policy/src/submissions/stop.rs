@@ -201,8 +201,7 @@ pub(super) fn leaves_lost_pod(draft: &mut PlanBuilder<'_>, job: &JobView) -> boo
     let Some((pod, at)) = pod.and_then(|pod| Some((pod, given_up_at(draft.view.node.state, pod)?))) else {
         return false;
     };
-    if draft.now() < at {
-        draft.requeue_at(at);
+    if draft.waits_until(at) {
         return false;
     }
     let found = failure::node_lost(pod.node.as_deref(), draft.view.node.state, draft.words());

@@ -60,12 +60,9 @@ fn goes_on(draft: &mut PlanBuilder<'_>) {
 
 /// True if the queue may still admit the Job without a wait: that costs no write then.
 fn is_new(draft: &mut PlanBuilder<'_>, job: &JobView) -> bool {
-    let shown_at = job.created.map(|at| Wait::SUSPENDED.shown_at(at));
-    let Some(at) = shown_at.filter(|at| draft.now() < *at && !draft.status.shows(Reason::Suspended)) else {
-        return false;
-    };
-    draft.requeue_at(at);
-    true
+    let is_shown = draft.status.shows(Reason::Suspended);
+    let is_early = |created| draft.waits_until(Wait::SUSPENDED.shown_at(created));
+    !is_shown && job.created.is_some_and(is_early)
 }
 
 fn message(draft: &PlanBuilder<'_>, job: &JobView, suspension: &Suspension) -> String {
