@@ -1,11 +1,10 @@
 //! One submission with all that the page shows of it. Pure.
 
-use leaderboard_api::{Attempt, Condition, Evalai, State, Submission, SubmissionStatus};
+use leaderboard_api::{Condition, Evalai, State, Submission, SubmissionStatus};
 use serde::Serialize;
 
 use super::links;
-use super::phases::{Phases, seconds};
-use super::rows::{Failed, Number, Waits, Worker, message, name, open, progress};
+use super::rows::{Cause, Number, Run, Waits, message, name, open};
 
 /// Metrics of a run that are shown.
 const METRICS: usize = 12;
@@ -19,19 +18,14 @@ pub(super) struct Detail {
     #[serde(flatten)]
     waits: Waits,
     state: &'static str,
-    failure: Option<Failed>,
-    attempt: Option<Attempt>,
+    failure: Option<Cause>,
+    #[serde(flatten)]
+    run: Run,
     /// Bytes of the submitted file, if the submission is one.
     file: Option<i64>,
-    node: Option<String>,
-    done: i32,
-    total: i32,
-    unit: String,
     score: Option<Number>,
     is_final: bool,
     metrics: Vec<Number>,
-    workers: Vec<Worker>,
-    phases: Phases,
     conditions: Vec<Fact>,
     /// Where the end has not arrived yet.
     open: Vec<&'static str>,
@@ -64,25 +58,18 @@ impl Detail {
     pub(super) fn of(submission: &Submission, evalai: Option<&Evalai>) -> Self {
         let none = SubmissionStatus::default();
         let status = submission.status.as_ref().unwrap_or(&none);
-        let (done, total, unit) = progress(status);
         let state = status.known_state().unwrap_or(State::Pending);
         let score = status.score.as_ref();
         let file = status.input.as_ref().or(submission.spec.input.as_ref());
         Self {
             waits: Waits::of(submission),
             state: state.as_str(),
-            failure: (status.failure.as_ref()).map(|failure| Failed::of(submission, failure)),
-            attempt: status.attempt,
+            failure: status.failure.as_ref().map(Cause::of),
+            run: Run::of(submission, status),
             file: file.map(|file| file.size),
-            node: status.node_name.as_deref().map(name),
-            done,
-            total,
-            unit,
             score: score.map(|score| Number::new(&score.name, &score.text)),
             is_final: score.is_some_and(|score| score.is_final),
             metrics: Number::first(&status.metrics, METRICS),
-            workers: status.workers.iter().map(Worker::of).collect(),
-            phases: Phases::of(submission),
             conditions: status.conditions.iter().map(Fact::of).collect(),
             open: open(status),
             results: (status.results_url.as_deref()).map(|url| leaderboard_api::text::one_line(url, ADDRESS)),
@@ -101,7 +88,7 @@ impl Fact {
             status: name(&condition.status),
             reason: name(condition.reason.as_str()),
             message: message(&condition.message),
-            since: seconds(condition.last_transition_time.0),
+            since: condition.last_transition_time.0.as_second(),
         }
     }
 }

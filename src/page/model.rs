@@ -12,7 +12,7 @@ use leaderboard_api::{Leaderboard, State, Submission, SubmissionStatus, conditio
 use serde::Serialize;
 
 use super::links;
-use super::phases::{Phases, Typical, seconds, typical};
+use super::phases::{Phases, Typical, typical};
 use super::rows::{Ended, Failed, Runs, Waits, end};
 use super::standings::{Table, tables};
 
@@ -72,13 +72,8 @@ struct Board {
     is_paused: bool,
     /// How many may run at once; none if nothing limits them.
     slots: Option<i32>,
-    /// How many of them are taken: a Pod that starts has one and does not run yet.
-    in_use: usize,
-    running: usize,
-    waiting: usize,
-    finished: usize,
-    failed: usize,
-    cancelled: usize,
+    #[serde(flatten)]
+    tally: Tally,
     evalai: Option<Budget>,
     /// Address of the challenge's page in EvalAI.
     challenge: Option<String>,
@@ -87,20 +82,16 @@ struct Board {
 
 /// Requests to EvalAI.
 #[derive(Serialize, Debug, PartialEq, Eq)]
-#[serde(rename_all = "camelCase")]
 struct Budget {
     used: i32,
     limit: i32,
     /// Results that EvalAI does not have yet.
     waiting: i32,
-    /// When the last of them is expected there.
-    last_expected: Option<i64>,
 }
 
 /// Failures of the last hours.
 #[derive(Serialize, Debug)]
 struct Failures {
-    hours: i64,
     classes: Vec<FailureCount>,
     #[serde(flatten)]
     list: List<Failed>,
@@ -126,14 +117,17 @@ struct Sorted<'a> {
 }
 
 /// Numbers of a Leaderboard's submissions.
-#[derive(Default)]
+#[derive(Serialize, Default, Debug, PartialEq, Eq)]
+#[serde(rename_all = "camelCase")]
 struct Tally {
+    /// How many slots are taken: a Pod that starts has one and does not run yet.
     in_use: usize,
     running: usize,
     waiting: usize,
     finished: usize,
     failed: usize,
     cancelled: usize,
+    #[serde(skip)]
     last_runs: Vec<Phases>,
 }
 
@@ -146,13 +140,12 @@ impl<'a> PageView<'a> {
     ) -> Self {
         let leaderboards = by_name(leaderboards);
         let sorted = Sorted::of(submissions);
-        let tallies = sorted.tallies();
         let ended = sorted.ended.iter();
         Self {
             replica,
             version: env!("CARGO_PKG_VERSION"),
             standings: standings(&leaderboards),
-            leaderboards: boards(&leaderboards, &tallies),
+            leaderboards: boards(&leaderboards, sorted.tallies()),
             waiting: List::of(&sorted.waiting, WAITING, |one| Waits::of(one)),
             running: List::of(&sorted.running, RUNNING, |one| Runs::of(one)),
             ended: List::of(&sorted.ended, ENDED, |(one, state)| Ended::of(one, *state)),
@@ -252,21 +245,24 @@ fn standings(leaderboards: &[&Leaderboard]) -> List<Table> {
     List::of(&tables, TABLES, Table::clone)
 }
 
-fn boards(leaderboards: &[&Leaderboard], tallies: &BTreeMap<Key, Tally>) -> List<Board> {
-    let none = Tally::default();
-    List::of(leaderboards, LEADERBOARDS, |leaderboard| {
-        let tally = tallies.get(&name(leaderboard)).unwrap_or(&none);
+fn boards(leaderboards: &[&Leaderboard], mut tallies: BTreeMap<Key, Tally>) -> List<Board> {
+    let first = leaderboards.iter().take(LEADERBOARDS);
+    let rows = first.map(|leaderboard| {
+        let tally = tallies.remove(&name(leaderboard)).unwrap_or_default();
         board(leaderboard, tally)
-    })
+    });
+    List {
+        count: leaderboards.len(),
+        rows: rows.collect(),
+    }
 }
 
-fn board(leaderboard: &Leaderboard, tally: &Tally) -> Board {
+fn board(leaderboard: &Leaderboard, tally: Tally) -> Board {
     let usage = leaderboard.status.as_ref().and_then(|status| status.evalai.as_ref());
     let budget = usage.map(|usage| Budget {
         used: usage.requests_last_minute,
         limit: usage.requests_per_minute,
         waiting: usage.backlog.as_ref().map_or(0, |backlog| backlog.waiting),
-        last_expected: (usage.backlog.as_ref()).map(|backlog| seconds(backlog.last_expected_time.0)),
     });
     Board {
         namespace: leaderboard.namespace().unwrap_or_default(),
@@ -274,15 +270,10 @@ fn board(leaderboard: &Leaderboard, tally: &Tally) -> Board {
         trouble: trouble(leaderboard),
         is_paused: leaderboard.spec.paused,
         slots: leaderboard.spec.concurrency.total,
-        in_use: tally.in_use,
-        running: tally.running,
-        waiting: tally.waiting,
-        finished: tally.finished,
-        failed: tally.failed,
-        cancelled: tally.cancelled,
+        typical: typical(&tally.last_runs),
+        tally,
         evalai: budget,
         challenge: leaderboard.spec.evalai.as_ref().and_then(links::challenge),
-        typical: typical(&tally.last_runs),
     }
 }
 
@@ -320,7 +311,6 @@ fn failures<'a>(ended: impl Iterator<Item = &'a Submission>, now: Timestamp) -> 
     classes.sort_by_key(|class| std::cmp::Reverse(class.count));
     classes.truncate(FAILURES);
     Failures {
-        hours: RECENT_HOURS,
         classes,
         list: List::of(&failed, FAILURES, |(one, failure)| Failed::of(one, failure)),
     }

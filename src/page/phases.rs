@@ -1,6 +1,5 @@
 //! Where the time of a submission goes: waiting, starting, running, publishing. Pure.
 
-use jiff::Timestamp;
 use k8s_openapi::apimachinery::pkg::apis::meta::v1::Time;
 use leaderboard_api::{Submission, Times};
 use serde::Serialize;
@@ -70,11 +69,6 @@ pub(super) fn typical(runs: &[Phases]) -> Option<Typical> {
         running: median(2)?,
         publishing: median(3)?,
     })
-}
-
-/// Seconds since 1970.
-pub(super) fn seconds(at: Timestamp) -> i64 {
-    at.as_second()
 }
 
 #[cfg(test)]

@@ -6,12 +6,11 @@ use jiff::Timestamp;
 use kube::ResourceExt;
 use leaderboard_api::text::{one_line, sentence};
 use leaderboard_api::{
-    Attempt, EndReason, Failure, Metric, ReasonName, State, Submission, SubmissionStatus, WorkerState, WorkerStatus,
-    conditions, reasons,
+    Attempt, Failure, Metric, ReasonName, State, Submission, SubmissionStatus, WorkerStatus, conditions, reasons,
 };
 use serde::Serialize;
 
-use super::phases::{Phases, seconds};
+use super::phases::Phases;
 
 /// Characters of a name of a stranger, and of a message.
 const NAME: usize = 80;
@@ -31,7 +30,6 @@ pub(super) struct Who {
 
 /// A submission that waits.
 #[derive(Serialize, Clone, Debug, PartialEq, Eq)]
-#[serde(rename_all = "camelCase")]
 pub(super) struct Waits {
     #[serde(flatten)]
     pub who: Who,
@@ -45,20 +43,26 @@ pub(super) struct Waits {
 }
 
 /// A submission that runs.
-#[derive(Serialize, Clone, Debug, PartialEq, Eq)]
-#[serde(rename_all = "camelCase")]
+#[derive(Serialize, Clone, Debug, PartialEq)]
 pub(super) struct Runs {
     #[serde(flatten)]
     pub who: Who,
-    pub reason: Option<String>,
+    pub score: Option<String>,
+    #[serde(flatten)]
+    pub run: Run,
+}
+
+/// The run of a submission.
+#[derive(Serialize, Clone, Debug, PartialEq)]
+pub(super) struct Run {
     pub attempt: Option<Attempt>,
     pub node: Option<String>,
     pub done: i32,
     pub total: i32,
     /// Name of what is counted.
     pub unit: String,
-    pub score: Option<String>,
-    pub workers: Vec<Worker>,
+    /// Numbers and words of closed sets alone.
+    pub workers: Vec<WorkerStatus>,
     pub phases: Phases,
 }
 
@@ -69,34 +73,15 @@ pub(super) struct Number {
     value: String,
 }
 
-/// One of its workers.
-#[derive(Serialize, Clone, Debug, PartialEq, Eq)]
-pub(super) struct Worker {
-    pub id: i32,
-    pub done: i32,
-    pub total: i32,
-    pub crashes: i32,
-    pub state: WorkerState,
-    /// Cause of the end of its last round, after a crash.
-    pub last: Option<EndReason>,
-}
-
 /// A submission that has ended.
 #[derive(Serialize, Clone, Debug, PartialEq, Eq)]
-#[serde(rename_all = "camelCase")]
 pub(super) struct Ended {
     #[serde(flatten)]
     pub who: Who,
     pub state: &'static str,
     /// Side that caused the failure.
     pub class: Option<&'static str>,
-    pub reason: Option<String>,
     pub score: Option<String>,
-    pub is_final: bool,
-    pub done: i32,
-    pub total: i32,
-    /// Name of what is counted.
-    pub unit: String,
     /// Where the end has not arrived yet.
     pub open: Vec<&'static str>,
     pub phases: Phases,
@@ -104,14 +89,20 @@ pub(super) struct Ended {
 
 /// A submission that has failed.
 #[derive(Serialize, Clone, Debug, PartialEq, Eq)]
-#[serde(rename_all = "camelCase")]
 pub(super) struct Failed {
     #[serde(flatten)]
     pub who: Who,
+    #[serde(flatten)]
+    pub cause: Cause,
+    pub time: Option<i64>,
+}
+
+/// Why a submission has failed.
+#[derive(Serialize, Clone, Debug, PartialEq, Eq)]
+pub(super) struct Cause {
     pub class: &'static str,
     pub reason: String,
     pub message: String,
-    pub time: Option<i64>,
 }
 
 /// When it ended.
@@ -152,10 +143,6 @@ fn with_status<T>(submission: &Submission, read: impl FnOnce(&SubmissionStatus) 
     }
 }
 
-fn reason(status: &SubmissionStatus) -> Option<String> {
-    status.reason.as_ref().map(|reason| name(reason.as_str()))
-}
-
 impl Waits {
     pub(super) fn of(submission: &Submission) -> Self {
         let created = submission.metadata.creation_timestamp.as_ref().map(|time| time.0);
@@ -173,12 +160,12 @@ impl Waits {
                 eta: waiting
                     .and_then(leaderboard_api::Waiting::eta)
                     .map(|eta| eta.to_string()),
-                reason: reason(status),
+                reason: status.reason.as_ref().map(|reason| name(reason.as_str())),
                 message: match meaning {
                     Some(meaning) if own.is_empty() => message(&meaning),
                     _ => message(own),
                 },
-                since: since.map(seconds),
+                since: since.map(Timestamp::as_second),
             }
         })
     }
@@ -186,30 +173,27 @@ impl Waits {
 
 impl Runs {
     pub(super) fn of(submission: &Submission) -> Self {
-        with_status(submission, |status| {
-            let (done, total, unit) = progress(status);
-            Self {
-                who: Who::of(submission),
-                reason: reason(status),
-                attempt: status.attempt,
-                node: status.node_name.as_deref().map(name),
-                done,
-                total,
-                unit,
-                score: status.score.as_ref().map(|score| name(&score.text)),
-                workers: status.workers.iter().map(Worker::of).collect(),
-                phases: Phases::of(submission),
-            }
+        with_status(submission, |status| Self {
+            who: Who::of(submission),
+            score: status.score.as_ref().map(|score| name(&score.text)),
+            run: Run::of(submission, status),
         })
     }
 }
 
-pub(super) fn progress(status: &SubmissionStatus) -> (i32, i32, String) {
-    let progress = status.progress.as_ref();
-    progress.map_or_else(
-        || (0, 0, String::new()),
-        |progress| (progress.done, progress.total, name(&progress.unit)),
-    )
+impl Run {
+    pub(super) fn of(submission: &Submission, status: &SubmissionStatus) -> Self {
+        let progress = status.progress.as_ref();
+        Self {
+            attempt: status.attempt,
+            node: status.node_name.as_deref().map(name),
+            done: progress.map_or(0, |progress| progress.done),
+            total: progress.map_or(0, |progress| progress.total),
+            unit: progress.map(|progress| name(&progress.unit)).unwrap_or_default(),
+            workers: status.workers.clone(),
+            phases: Phases::of(submission),
+        }
+    }
 }
 
 impl Number {
@@ -227,41 +211,15 @@ impl Number {
     }
 }
 
-impl Worker {
-    pub(super) fn of(worker: &WorkerStatus) -> Self {
-        Self {
-            id: worker.id,
-            done: worker.done,
-            total: worker.total,
-            crashes: worker.crashes,
-            state: worker.state,
-            last: worker
-                .last
-                .as_ref()
-                .filter(|_| worker.crashes > 0)
-                .map(|last| last.reason),
-        }
-    }
-}
-
 impl Ended {
     pub(super) fn of(submission: &Submission, state: State) -> Self {
-        with_status(submission, |status| {
-            let (done, total, unit) = progress(status);
-            let score = status.score.as_ref();
-            Self {
-                who: Who::of(submission),
-                state: state.as_str(),
-                class: status.failure.as_ref().map(|failure| failure.class.as_str()),
-                reason: reason(status),
-                score: score.map(|score| name(&score.text)),
-                is_final: score.is_some_and(|score| score.is_final),
-                done,
-                total,
-                unit,
-                open: open(status),
-                phases: Phases::of(submission),
-            }
+        with_status(submission, |status| Self {
+            who: Who::of(submission),
+            state: state.as_str(),
+            class: status.failure.as_ref().map(|failure| failure.class.as_str()),
+            score: status.score.as_ref().map(|score| name(&score.text)),
+            open: open(status),
+            phases: Phases::of(submission),
         })
     }
 }
@@ -277,10 +235,18 @@ impl Failed {
     pub(super) fn of(submission: &Submission, failure: &Failure) -> Self {
         Self {
             who: Who::of(submission),
+            cause: Cause::of(failure),
+            time: end(submission).map(Timestamp::as_second),
+        }
+    }
+}
+
+impl Cause {
+    pub(super) fn of(failure: &Failure) -> Self {
+        Self {
             class: failure.class.as_str(),
             reason: name(failure.reason.as_str()),
             message: message(&failure.message),
-            time: end(submission).map(seconds),
         }
     }
 }

@@ -4,7 +4,6 @@ use kube::ResourceExt;
 use leaderboard_api::{Leaderboard, Order, Standing, TrackStatus};
 use serde::Serialize;
 
-use super::phases::seconds;
 use super::rows::name;
 
 /// Metrics of a result that are shown beside its score.
@@ -86,7 +85,7 @@ impl Row {
             name: name(&standing.submission),
             score: name(&standing.score.text),
             values: metrics.iter().map(value).collect(),
-            finished: standing.finished_at.as_ref().map(|time| seconds(time.0)),
+            finished: standing.finished_at.as_ref().map(|time| time.0.as_second()),
         }
     }
 }

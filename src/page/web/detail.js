@@ -34,7 +34,7 @@ function cause(row, now) {
 function workers(row) {
   if (!row.workers.length) return null;
   const items = row.workers.map((worker) => {
-    const crashes = worker.crashes ? badge("warn", `${worker.crashes} ${worker.crashes === 1 ? "crash" : "crashes"}${worker.last ? `: ${worker.last}` : ""}`) : null;
+    const crashes = worker.crashes ? badge("warn", `${worker.crashes} ${worker.crashes === 1 ? "crash" : "crashes"}${worker.last ? `: ${worker.last.reason}` : ""}`) : null;
     return element("li", {}, `Worker ${worker.id}`, bar(worker.total ? worker.done / worker.total : 0, worker.state === "Done" ? "good" : worker.crashes ? "warn" : "running"), element("span", {}, `${worker.done}/${worker.total}`), element("span", { class: "muted" }, WORKER[worker.state] ?? ""), crashes);
   });
   return part("Workers", element("ul", { class: "workers" }, items));
