@@ -3,7 +3,6 @@
 //! One task a process, started by `leader::start`. Each call is bounded; what a call did when no answer came is found out
 //! by looking again, never assumed.
 
-use std::sync::Arc;
 use std::time::Duration;
 
 use k8s_openapi::api::coordination::v1::Lease;
@@ -16,28 +15,18 @@ use super::decide::{Decision, Leading, Loss, ObservedLease, decide, is_overdue};
 use super::record::{Record, held, released};
 use super::{Fence, Leadership, Settings};
 use crate::kubernetes::{CallError, call_within};
-use crate::metrics::Metrics;
 use crate::observability::Observability;
-use crate::observability::liveness::Liveness;
 use leaderboard_base::backoff::jittered;
-use leaderboard_base::clock::Clock;
 
 /// Looks at a Lease that changes while it is being released.
 const RELEASE_TRIES: u32 = 3;
 
-/// Where the election publishes.
-pub(super) struct Outlets {
-    pub publish: watch::Sender<Leadership>,
-    pub fence: Fence,
-}
-
 pub(super) struct Elector {
     api: Api<Lease>,
     settings: Settings,
-    outlets: Outlets,
-    clock: Clock,
-    metrics: Arc<Metrics>,
-    liveness: Liveness,
+    publish: watch::Sender<Leadership>,
+    fence: Fence,
+    telemetry: Observability,
     seen: ObservedLease,
     /// The Lease as the server last answered it. None: there is none, if `is_fresh`.
     lease: Option<Lease>,
@@ -53,14 +42,19 @@ enum Next {
 }
 
 impl Elector {
-    pub(super) fn new(client: Client, settings: Settings, outlets: Outlets, telemetry: &Observability) -> Self {
+    pub(super) fn new(
+        client: Client,
+        settings: Settings,
+        publish: watch::Sender<Leadership>,
+        fence: Fence,
+        telemetry: &Observability,
+    ) -> Self {
         Self {
             api: Api::namespaced(client, &settings.namespace),
             settings,
-            outlets,
-            clock: telemetry.clock.clone(),
-            metrics: telemetry.metrics.clone(),
-            liveness: telemetry.liveness.clone(),
+            publish,
+            fence,
+            telemetry: telemetry.clone(),
             seen: ObservedLease::default(),
             lease: None,
             is_fresh: false,
@@ -87,7 +81,7 @@ impl Elector {
     }
 
     async fn round(&mut self) -> Next {
-        let now = self.clock.since_boot();
+        let now = self.telemetry.clock.since_boot();
         if let Some(loss) = self
             .leading
             .and_then(|leading| is_overdue(&leading, &self.settings.timing, now))
@@ -100,7 +94,7 @@ impl Elector {
         {
             return self.failed(&error);
         }
-        let now = self.clock.since_boot();
+        let now = self.telemetry.clock.since_boot();
         match decide(
             &self.seen,
             &self.settings.identity,
@@ -123,8 +117,8 @@ impl Elector {
     }
 
     async fn write(&mut self, term: i32) -> Next {
-        let sent = self.clock.since_boot();
-        let lease = held(self.lease.as_ref(), &self.settings, term, self.clock.now());
+        let sent = self.telemetry.clock.since_boot();
+        let lease = held(self.lease.as_ref(), &self.settings, term, self.telemetry.clock.now());
         self.is_fresh = false;
         match self.send(&lease).await {
             Ok(written) => {
@@ -160,41 +154,39 @@ impl Elector {
         let object = format!("Lease {}", self.settings.name);
         let answer = call_within(limit, what, &object, call).await;
         if answer.as_ref().err().is_none_or(is_stale) {
-            self.liveness.answered();
+            self.telemetry.liveness.answered();
         }
         answer
     }
 
     fn note(&mut self, lease: Option<Lease>) {
         self.seen
-            .note(lease.as_ref().map(Record::read), self.clock.since_boot());
+            .note(lease.as_ref().map(Record::read), self.telemetry.clock.since_boot());
         self.lease = lease;
         self.is_fresh = true;
     }
 
     /// A write that shows us as the leader, sent at `sent`, has succeeded.
     fn lead(&mut self, term: i32, sent: Duration) {
-        self.outlets.fence.renewed(sent);
+        self.fence.renewed(sent);
         if self.leading.replace(Leading { term, renewed_at: sent }).is_none() {
             let quiet = if self.seen.is_quiet_before(term) {
                 Duration::ZERO
             } else {
                 self.settings.timing.evalai_quiet
             };
-            self.outlets.fence.begin(Instant::now() + quiet);
-            self.metrics.set_leading(Some(term));
+            self.fence.begin(Instant::now() + quiet);
+            self.telemetry.metrics.set_leading(Some(term));
             tracing::info!(term, quiet = quiet.as_secs(), lease = self.settings.name, "leading");
-            self.outlets.publish.send_replace(Leadership::Leader { term });
+            self.publish.send_replace(Leadership::Leader { term });
         }
     }
 
     fn lose(&mut self, why: &str) {
-        self.outlets.fence.close();
-        self.metrics.set_leading(None);
+        self.fence.close();
+        self.telemetry.metrics.set_leading(None);
         tracing::error!(lease = self.settings.name, why, "leading no more");
-        self.outlets
-            .publish
-            .send_replace(Leadership::Lost { why: why.to_owned() });
+        self.publish.send_replace(Leadership::Lost { why: why.to_owned() });
     }
 
     fn failed(&self, error: &CallError) -> Next {
@@ -203,7 +195,7 @@ impl Elector {
             // Two candidates that met once are kept from meeting again.
             jittered(retry / 8, 0.1)
         } else {
-            self.metrics.work.lease_errors.of([error.reason()]).inc();
+            self.telemetry.metrics.work.lease_errors.of([error.reason()]).inc();
             tracing::warn!("{error}");
             jittered(retry / 2, 0.1)
         };
@@ -216,7 +208,7 @@ impl Elector {
             return Duration::MAX;
         };
         let deadline = leading.renewed_at + self.settings.timing.renew_deadline;
-        deadline.saturating_sub(self.clock.since_boot())
+        deadline.saturating_sub(self.telemetry.clock.since_boot())
     }
 
     fn retry(&self) -> Duration {
@@ -227,8 +219,8 @@ impl Elector {
         if let Some(leading) = self.leading {
             self.release(leading.term).await;
         }
-        self.metrics.set_leading(None);
-        self.outlets.publish.send_replace(Leadership::Standby);
+        self.telemetry.metrics.set_leading(None);
+        self.publish.send_replace(Leadership::Standby);
     }
 
     async fn release(&mut self, term: i32) {
@@ -255,7 +247,9 @@ impl Elector {
         let Some(lease) = self.lease.take().filter(|_| is_ours) else {
             return Ok(());
         };
-        self.send(&released(lease, self.clock.now())).await.map(|_| ())
+        self.send(&released(lease, self.telemetry.clock.now()))
+            .await
+            .map(|_| ())
     }
 }
 

@@ -16,7 +16,6 @@ pub(crate) mod tests;
 
 use std::time::Duration;
 
-use k8s_openapi::apimachinery::pkg::apis::meta::v1::OwnerReference;
 use tokio::sync::{oneshot, watch};
 use tokio::task::JoinHandle;
 use tokio::time::Instant;
@@ -61,8 +60,6 @@ pub struct Settings {
     /// Name of the Lease.
     pub name: String,
     pub identity: Identity,
-    /// Owner of a Lease that is made new, so that it goes with the operator.
-    pub owner: Option<OwnerReference>,
     pub timing: Timing,
 }
 
@@ -73,7 +70,6 @@ impl Settings {
             namespace: namespace.to_owned(),
             name: name.to_owned(),
             identity,
-            owner: None,
             timing: Timing::default(),
         }
     }
@@ -135,11 +131,7 @@ pub fn start(client: kube::Client, settings: Settings, telemetry: &Observability
     let (publish, leadership) = watch::channel(Leadership::Standby);
     let (release, released) = oneshot::channel();
     let fence = Fence::new(telemetry.clock.clone(), settings.timing.renew_deadline);
-    let outlets = elector::Outlets {
-        publish,
-        fence: fence.clone(),
-    };
-    let elector = elector::Elector::new(client, settings, outlets, telemetry);
+    let elector = elector::Elector::new(client, settings, publish, fence.clone(), telemetry);
     // Its orderly end means that the Lease is lost or released.
     let task = telemetry.tasks.may_end("lease", elector.run(released));
     Leader {

@@ -124,7 +124,6 @@ fn new(settings: &Settings) -> Lease {
         name: Some(settings.name.clone()),
         namespace: Some(settings.namespace.clone()),
         labels: Some([(LABEL_MANAGED_BY.to_owned(), OPERATOR.to_owned())].into()),
-        owner_references: settings.owner.clone().map(|owner| vec![owner]),
         ..ObjectMeta::default()
     };
     Lease { metadata, spec: None }
