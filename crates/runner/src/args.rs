@@ -41,6 +41,7 @@ simulator:  --answer-seconds 10    how long a server may take to answer when its
 evaluator:  --port P               it is ready when it listens there; without one, as soon as it is started
             --answer-seconds 600   how long it may take, after its agent's exit with code 0, until its result is complete; alone, from its start
             --alone                there is no agent beside it, and none is waited for or followed
+            --after DIR            CMD begins once all pairs before this one are done, with final results at DIR/<pair>/result.json
 agent:      --work /tmp/agent      where leaderboard.log is written
             --idle-seconds 800     no output for so long ends the command
             --report-gpu false     true: looks for a GPU before anything else, and reports it to its host
@@ -121,6 +122,8 @@ pub enum Server {
         results: PathBuf,
         /// Time from its agent's regular end to the complete result.
         answer: Duration,
+        /// Folder with the results of the pairs before this one, after which its command begins.
+        after: Option<PathBuf>,
     },
 }
 
@@ -364,6 +367,7 @@ fn server(host: Host, options: &mut Options) -> Result<Server, UsageError> {
             port: port.map(NonZeroU16::get),
             results: options.path("--results")?,
             answer: options.seconds("--answer-seconds", 600)?,
+            after: options.take("--after")?.map(PathBuf::from),
         },
     })
 }

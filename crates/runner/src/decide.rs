@@ -92,6 +92,8 @@ pub(crate) struct Seen {
     pub(crate) peer_done: bool,
     /// An evaluator's result is complete, or it has refused the submission by its exit code.
     pub(crate) has_result: bool,
+    /// Results are not final yet after which an evaluator's command begins.
+    pub(crate) held: bool,
     pub(crate) cancel: bool,
     /// `logcopy.done`: the final results are stored.
     pub(crate) stored: bool,
@@ -212,7 +214,9 @@ fn opening(part: Part, seen: &Seen) -> Action {
     if seen.peer_crashed {
         return Action::Skip(Skip::CatchUp);
     }
-    if part.is_host() || seen.peer_started {
+    if seen.held {
+        Action::Wait
+    } else if part.is_host() || seen.peer_started {
         Action::Launch
     } else if seen.overdue {
         Action::End(Cause::NotReady)

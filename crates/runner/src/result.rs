@@ -104,6 +104,12 @@ pub(crate) fn read(path: &Path) -> State {
     }
 }
 
+/// True if it is final and refuses nothing.
+pub(crate) fn is_final(path: &Path) -> bool {
+    let found = checkpoint::open(path).and_then(parse);
+    found.is_ok_and(|found| found.r#final && found.refused.is_none())
+}
+
 fn parse(file: File) -> Result<Document, Unreadable> {
     let metadata = file.metadata().map_err(Unreadable::Io)?;
     if metadata.len() > MAX_BYTES {
@@ -172,6 +178,18 @@ mod tests {
         for (text, is_complete) in cases {
             assert_eq!(state_of(text).is_complete(), is_complete, "{text}");
         }
+        for (text, expected) in [
+            (cases[0].0, true),
+            (cases[1].0, false),
+            (cases[2].0, true),
+            (cases[5].0, false),
+            (REFUSAL, false),
+        ] {
+            let file = tempfile::NamedTempFile::new().unwrap();
+            fs::write(file.path(), text).unwrap();
+            assert_eq!(is_final(file.path()), expected, "{text}");
+        }
+        assert!(!is_final(Path::new("/nothing/is/here")));
         for text in [
             "",
             "[]",

@@ -156,8 +156,7 @@ impl Runner {
         if let Some(group) = &mut self.group {
             group.reap();
         }
-        let child = self.child();
-        let has_result = self.has_result();
+        let (child, has_result) = (self.child(), self.has_result());
         let (me, peer, round) = (self.me, self.peer, self.round);
         let of = |member, mark| StatusFile::Of(member, mark).exists(&self.job.status);
         let seen = Seen {
@@ -167,6 +166,7 @@ impl Runner {
             peer_crashed: of(peer, Mark::Crash(round)),
             peer_done: of(peer, Mark::Done),
             has_result,
+            held: self.phase == Phase::Opening && self.is_held(),
             cancel: StatusFile::Cancel.exists(&self.job.status),
             stored: StatusFile::Stored.exists(&self.job.status),
             child,

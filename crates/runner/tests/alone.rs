@@ -8,9 +8,9 @@ use std::fs;
 use std::os::unix::fs::PermissionsExt;
 use std::time::{Duration, Instant};
 
-use leaderboard_protocol::files::{Mark, StatusFile};
+use leaderboard_protocol::files::{Mark, RESULT, StatusFile};
 use leaderboard_protocol::verdict::{CODE_NO_GRAPHICS, What};
-use support::{AGENT, Container, EVALUATOR, Pod};
+use support::{AGENT, Container, EVALUATOR, MERGER, Pod};
 
 const MOMENT: Duration = Duration::from_millis(300);
 const FINAL: &str = r#"echo '{"final":true,"splits":[]}' > $RESULT"#;
@@ -26,7 +26,7 @@ fn evaluator(pod: &Pod, script: &str, options: &[&str]) -> Container {
 }
 
 fn is_stored(pod: &Pod, evaluator: &mut Container) {
-    pod.until(EVALUATOR, Mark::Done);
+    pod.until(evaluator.member, Mark::Done);
     assert!(
         evaluator.stays(MOMENT),
         "it holds its exit until the results are stored"
@@ -158,4 +158,48 @@ fn an_evaluator_that_crashes_leaves_at_once_and_may_refuse_in_the_next_round() {
     let mut refusing = evaluator(&pod, "exit 65", &[]);
     is_stored(&pod, &mut refusing);
     assert!(fs::read_to_string(pod.result()).unwrap().contains("refused"));
+}
+
+#[test]
+fn one_that_merges_begins_when_the_others_are_done_with_final_results_and_has_its_time_from_then() {
+    let pod = Pod::new();
+    let part = pod.path("parts/1");
+    fs::create_dir_all(&part).unwrap();
+    fs::write(part.join(RESULT), r#"{"final":true}"#).unwrap();
+    let mut late = pod.merger("exec sleep 1000", &["--answer-seconds=1", "--ready-seconds=1"]);
+    // Longer than each of its limits, and than the time between two looks.
+    assert!(late.stays(Duration::from_millis(1500)), "another one is not done");
+    assert!(pod.files(MERGER).is_empty());
+    pod.write(StatusFile::Of(EVALUATOR, Mark::Done));
+    assert_eq!((late.code(), late.verdict().what), (1, What::NoResult));
+    assert_eq!(pod.files(MERGER), ["evaluator-2.crash0", "evaluator-2.start0"]);
+
+    let read = format!("grep final {} && {FINAL}", part.join(RESULT).display());
+    let mut merger = pod.merger(&read, &[]);
+    is_stored(&pod, &mut merger);
+    assert_eq!(
+        pod.files(MERGER),
+        [
+            "evaluator-2.crash0",
+            "evaluator-2.done",
+            "evaluator-2.start0",
+            "evaluator-2.start1"
+        ]
+    );
+}
+
+#[test]
+fn one_that_merges_does_not_begin_where_a_result_refuses_and_a_cancel_ends_it() {
+    let pod = Pod::new();
+    let part = pod.path("parts/1");
+    fs::create_dir_all(&part).unwrap();
+    pod.write(StatusFile::Of(EVALUATOR, Mark::Done));
+    let refusal = r#"{"final":true,"refused":"The file has no header."}"#;
+    fs::write(part.join(RESULT), refusal).unwrap();
+    let mut merger = pod.merger("exec sleep 1000", &[]);
+    assert!(merger.stays(MOMENT));
+    pod.write(StatusFile::Cancel);
+    pod.write(StatusFile::Stored);
+    assert_eq!((merger.code(), merger.verdict().what), (0, What::Cancelled));
+    assert!(pod.files(MERGER).is_empty());
 }

@@ -22,6 +22,7 @@ fn an_evaluator_and_its_agent_stand_behind_the_runner_with_their_own_words() {
             port: Some(9100),
             results: "/results".into(),
             answer: seconds(60),
+            after: None,
         },
         flush: seconds(50),
         cancel: seconds(40),

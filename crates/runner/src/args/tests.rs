@@ -101,16 +101,18 @@ fn an_evaluator_has_its_defaults_and_options() {
         port: None,
         results: "/r".into(),
         answer: Duration::from_mins(10),
+        after: None,
     };
     assert!(matches!(&first.role, Role::Host { server, .. } if *server == expected));
     assert_eq!([first.ready, first.grace].map(|time| time.as_secs()), [3600, 30]);
     let more = job(&format!(
-        "{line} --port=9000 --answer-seconds 7 --log /r/c.log --gpu=any -- a"
+        "{line} --port=9000 --answer-seconds 7 --after /others --log /r/c.log --gpu=any -- a"
     ));
     let expected = Server::Evaluator {
         port: Some(9000),
         results: "/r".into(),
         answer: Duration::from_secs(7),
+        after: Some("/others".into()),
     };
     assert!(matches!(more.role, Role::Host { server, log: Some(_), gpu: Some(Needs::Any), .. } if server == expected));
 }
@@ -201,6 +203,10 @@ fn each_mistake_is_named() {
         (
             "agent --pair 1 --status /s --host evaluator --leaves /l -- a",
             "unknown option --leaves",
+        ),
+        (
+            "simulator --pair 1 --status /s --port 1 --after /r -- a",
+            "unknown option --after",
         ),
         (
             "evaluator --pair 1 --status /s --results /r --alone --leaves /l -- a",

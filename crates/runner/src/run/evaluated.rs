@@ -6,6 +6,7 @@
 use std::path::Path;
 use std::time::{Duration, Instant};
 
+use leaderboard_protocol::files::{Host, Mark, Pair, RESULT, StatusFile};
 use leaderboard_runner::args::{Program, Role, Server};
 
 use super::Runner;
@@ -24,6 +25,25 @@ impl Runner {
         self.result
             .as_mut()
             .is_some_and(|result| has_refused || result.is_complete())
+    }
+
+    /// True if a pair before this one is not done, or has no final result, and the evaluator's command begins after them.
+    pub(super) fn is_held(&self) -> bool {
+        let Role::Host {
+            server: Server::Evaluator {
+                after: Some(folder), ..
+            },
+            ..
+        } = &self.job.role
+        else {
+            return false;
+        };
+        let mut before = Pair::first(self.job.pair.index());
+        !before.all(|pair| {
+            // All its processes have ended then, so that nothing is written any more.
+            let done = StatusFile::Of(pair.host(Host::Evaluator), Mark::Done);
+            done.exists(&self.job.status) && result::is_final(&folder.join(pair.to_string()).join(RESULT))
+        })
     }
 
     fn has_refused(&self) -> bool {

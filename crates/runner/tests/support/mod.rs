@@ -68,6 +68,11 @@ pub const fn member(side: Side) -> Member {
 pub const SIMULATOR: Member = member(Side::Host(Host::Simulator));
 pub const EVALUATOR: Member = member(Side::Host(Host::Evaluator));
 pub const AGENT: Member = member(Side::Agent);
+/// Merges what the evaluator has left.
+pub const MERGER: Member = Member {
+    side: Side::Host(Host::Evaluator),
+    pair: Pair::new(2).unwrap(),
+};
 
 /// Below what the kernel gives away by itself: a Pod has its ports to itself, and here other programs connect.
 const PORTS: std::ops::Range<u16> = 20_000..32_000;
@@ -137,6 +142,14 @@ impl Pod {
         self.start(EVALUATOR, &options, &["sh", "-c", script], Stdio::null())
     }
 
+    /// Runs a shell script once the evaluator's result, below the folder `parts`, is final. It finds the path of its own in `$RESULT`.
+    pub fn merger(&self, script: &str, options: &[&str]) -> Container {
+        let results = format!("--results={}", self.path("results").display());
+        let after = format!("--after={}", self.path("parts").display());
+        let options = [&["--alone", results.as_str(), &after], options].concat();
+        self.start(MERGER, &options, &["sh", "-c", script], Stdio::null())
+    }
+
     /// An evaluator's agent that runs a shell script.
     pub fn plain(&self, script: &str, options: &[&str]) -> Container {
         let work = format!("--work={}", self.path("work").display());
@@ -178,7 +191,8 @@ impl Pod {
         let words = self.starter.iter().chain([&runner]).collect::<Vec<_>>();
         let child = Command::new(words[0])
             .args(&words[1..])
-            .args([member.side.name(), "--pair=1"])
+            .arg(member.side.name())
+            .arg(format!("--pair={}", member.pair))
             .arg(format!("--status={}", self.status().display()))
             .arg(format!("--termination-log={}", verdict.display()))
             .args(&self.options)
