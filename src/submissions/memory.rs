@@ -50,17 +50,17 @@ impl Memory {
     /// The object with the status that we wrote last, and the version that has it, where the cache does not have it yet.
     pub fn with_own_status(&self, submission: Arc<Submission>) -> Arc<Submission> {
         self.is_shown(&submission);
-        let entries = lock(&self.entries);
-        let written = entries.get(uid(submission.as_ref())).and_then(|e| e.written.as_ref());
-        match written.and_then(|written| written.status.as_deref().zip(Some(written.version))) {
-            Some((status, version)) => {
-                let mut newer = submission.as_ref().clone();
-                newer.status = Some(status.clone());
-                newer.metadata.resource_version = Some(version.to_string());
-                Arc::new(newer)
-            }
-            None => submission,
-        }
+        let own = self.read(&submission, |entry| {
+            let written = entry.written.as_ref()?;
+            Some((written.status.as_deref()?.clone(), written.version))
+        });
+        let Some((status, version)) = own else {
+            return submission;
+        };
+        let mut newer = Arc::unwrap_or_clone(submission);
+        newer.status = Some(status);
+        newer.metadata.resource_version = Some(version.to_string());
+        Arc::new(newer)
     }
 
     /// Remembers a status that we wrote, and the version that the API server has made of it. The watch may be faster than the
@@ -73,16 +73,15 @@ impl Memory {
             at: Instant::now(),
             status: (!is_shown).then(|| Box::new(status.clone())),
         };
-        let mut entries = lock(&self.entries);
-        let entry = entries.entry(uid(submission).into()).or_default();
-        (entry.written, entry.place_at) = (Some(written), None);
+        self.change(submission, |entry| {
+            (entry.written, entry.place_at) = (Some(written), None);
+        });
     }
 
     /// The cache shows an object: our own status goes once that is as new.
     pub fn is_shown(&self, submission: &Submission) {
-        let mut entries = lock(&self.entries);
-        let entry = entries.get_mut(uid(submission));
-        if let Some(written) = entry.and_then(|e| e.written.as_mut())
+        if let Some(entry) = lock(&self.entries).get_mut(uid(submission))
+            && let Some(written) = &mut entry.written
             && objects::version(submission) >= written.version
         {
             written.status = None;
@@ -91,45 +90,40 @@ impl Memory {
 
     /// Time since our last write of its status; None if this process has not written it.
     pub fn since_write(&self, submission: &Submission) -> Option<Duration> {
-        let entries = lock(&self.entries);
-        entries
-            .get(uid(submission))
-            .and_then(|e| e.written.as_ref())
-            .map(|w| w.at.elapsed())
+        self.read(submission, |entry| Some(entry.written.as_ref()?.at.elapsed()))
     }
 
     /// How long a changed place has to wait for its write; None: not at all. Each has a moment of its own, so that a step of a
     /// thousand is not a thousand writes.
     pub fn place_waits(&self, submission: &Submission, now: Instant) -> Option<Duration> {
-        let mut entries = lock(&self.entries);
-        let entry = entries.entry(uid(submission).into()).or_default();
-        let at = *entry.place_at.get_or_insert_with(|| {
+        let next = || {
             let mut next = lock(&self.next_place);
             let at = next.unwrap_or(now).max(now);
             *next = Some(at + PLACE_PACE);
             at
-        });
+        };
+        let at = self.change(submission, |entry| *entry.place_at.get_or_insert_with(next));
         at.checked_duration_since(now).filter(|left| !left.is_zero())
     }
 
     /// Remembers a Job that was created.
     pub fn created_job(&self, submission: &Submission, name: String) {
-        let mut entries = lock(&self.entries);
-        let entry = entries.entry(uid(submission).into()).or_default();
-        (entry.job, entry.refused) = (Some((name, Instant::now())), None);
+        self.change(submission, |entry| {
+            (entry.job, entry.refused) = (Some((name, Instant::now())), None);
+        });
     }
 
     /// Remembers why the API server refuses a Job.
     pub fn refused_job(&self, submission: &Submission, name: String, why: String) {
-        let mut entries = lock(&self.entries);
-        entries.entry(uid(submission).into()).or_default().refused = Some(Box::new((name, why)));
+        self.change(submission, |entry| entry.refused = Some(Box::new((name, why))));
     }
 
     /// Why the API server refuses the Job of this name, if it did last.
     pub fn refusal(&self, submission: &Submission, name: &str) -> Option<String> {
-        let entries = lock(&self.entries);
-        let refused = entries.get(uid(submission))?.refused.as_deref();
-        refused.filter(|(known, _)| known == name).map(|(_, why)| why.clone())
+        self.read(submission, |entry| {
+            let refused = entry.refused.as_deref().filter(|(known, _)| known == name);
+            refused.map(|(_, why)| why.clone())
+        })
     }
 
     /// Forgets the Job that was created: the cache shows it, or it is being deleted.
@@ -141,25 +135,23 @@ impl Memory {
 
     /// True if the Job of this name was created so lately that the cache may not show it yet.
     pub fn awaits_job(&self, submission: &Submission, name: &str) -> bool {
-        let entries = lock(&self.entries);
-        let job = entries.get(uid(submission)).and_then(|entry| entry.job.as_ref());
+        let job = self.read(submission, |entry| entry.job.clone());
         job.is_some_and(|(known, at)| known == name && at.elapsed() < JOB_SHOWS)
     }
 
     /// Remembers since when EvalAI has been asked about an attempt.
     pub fn asks_evalai(&self, submission: &Submission) {
         let attempt = submission.present_attempt();
-        let mut entries = lock(&self.entries);
-        let entry = entries.entry(uid(submission).into()).or_default();
-        if entry.asked.is_none_or(|(of, _)| of != attempt) {
-            entry.asked = Some((attempt, Instant::now()));
-        }
+        self.change(submission, |entry| {
+            if entry.asked.is_none_or(|(of, _)| of != attempt) {
+                entry.asked = Some((attempt, Instant::now()));
+            }
+        });
     }
 
     /// How long EvalAI has been asked about the present attempt.
     pub fn evalai_waited(&self, submission: &Submission) -> Duration {
-        let entries = lock(&self.entries);
-        let asked = entries.get(uid(submission)).and_then(|entry| entry.asked);
+        let asked = self.read(submission, |entry| entry.asked);
         let asked = asked.filter(|(of, _)| *of == submission.present_attempt());
         asked.map_or(Duration::ZERO, |(_, at)| at.elapsed())
     }
@@ -167,6 +159,14 @@ impl Memory {
     /// Drops an object that is gone.
     pub fn forget(&self, uid: &str) {
         lock(&self.entries).remove(uid);
+    }
+
+    fn read<T>(&self, submission: &Submission, read: impl FnOnce(&Entry) -> Option<T>) -> Option<T> {
+        lock(&self.entries).get(uid(submission)).and_then(|entry| read(entry))
+    }
+
+    fn change<T>(&self, submission: &Submission, change: impl FnOnce(&mut Entry) -> T) -> T {
+        change(lock(&self.entries).entry(uid(submission).into()).or_default())
     }
 }
 
