@@ -15,11 +15,13 @@ use crate::text::clean;
 const LONGEST_ERROR: u64 = 64 * 1024;
 
 /// Why the bucket was not read.
-#[derive(Debug, PartialEq, Eq)]
+#[derive(thiserror::Error, Debug, PartialEq, Eq)]
 pub enum Unread {
     /// There is no program `aws`.
+    #[error("the program aws is not on the PATH")]
     NoProgram,
     /// It has failed, and why.
+    #[error("{0}")]
     Failed(String),
 }
 

@@ -8,13 +8,13 @@ use clap::{Args, ValueEnum};
 use futures::StreamExt;
 use k8s_openapi::api::core::v1::Pod;
 use kube::ResourceExt;
-use leaderboard_api::{Agents, Attempt, RunPlan, State, Submission, SubmissionStatus, names};
+use leaderboard_api::{Agents, Attempt, RunPlan, State, Submission, names};
 
 use crate::aws::{Unread, read};
 use crate::cluster::Cluster;
 use crate::commands::frame;
 use crate::error::{Error, of_bucket};
-use crate::output::{ask, note, print, print_labelled};
+use crate::output::{ask, code, note, print, print_labelled};
 use crate::text::{Frame, log_line, wrap};
 use crate::{bucket, facts, foreign};
 
@@ -59,23 +59,42 @@ pub(super) enum Whose {
 }
 
 impl Whose {
-    /// The containers with their labels.
-    fn containers(self, workers: usize, only: Option<usize>) -> Vec<(String, String)> {
-        let of_workers = |name: fn(usize) -> String| {
+    /// The containers; of workers all, or only this one.
+    pub(super) fn sources(self, workers: usize, only: Option<usize>) -> Vec<Source> {
+        let of_workers = |container: fn(usize) -> String, key: fn(usize) -> String| {
             let workers = (1..=workers).filter(|worker| only.is_none_or(|only| only == *worker));
-            workers.map(|worker| (worker.to_string(), name(worker))).collect()
+            let source = |worker: usize| Source {
+                // A worker has its colour also where it is shown alone.
+                stream: worker,
+                label: worker.to_string(),
+                container: container(worker),
+                key: Some(key(worker)),
+            };
+            workers.map(source).collect()
+        };
+        let named = |stream, name: &str, key: Option<&str>| Source {
+            stream,
+            label: name.to_owned(),
+            container: name.to_owned(),
+            key: key.map(str::to_owned),
         };
         match self {
-            Self::Agent => of_workers(names::agent_container),
-            Self::Simulator => of_workers(names::simulator_container),
-            Self::Evaluator => of_workers(names::evaluator_container),
+            Self::Agent => of_workers(names::agent_container, |worker| {
+                format!("agent/agent{worker}/leaderboard.log")
+            }),
+            Self::Simulator => of_workers(names::simulator_container, |worker| {
+                format!("simulator/console-{worker}.log")
+            }),
+            Self::Evaluator => of_workers(names::evaluator_container, |worker| {
+                format!("evaluators/{worker}/console.log")
+            }),
             Self::Start => {
                 let all = names::INIT_CONTAINERS.into_iter();
                 let that_end = all.filter(|name| *name != names::CONTAINER_LOGCOPY);
-                let all = that_end.chain([names::CONTAINER_COLLECT]);
-                all.map(|name| (name.to_owned(), name.to_owned())).collect()
+                let all = that_end.chain([names::CONTAINER_COLLECT]).enumerate();
+                all.map(|(stream, name)| named(stream, name, None)).collect()
             }
-            Self::Logcopy => vec![("logcopy".to_owned(), names::CONTAINER_LOGCOPY.to_owned())],
+            Self::Logcopy => vec![named(0, names::CONTAINER_LOGCOPY, Some("logcopy/logcopy.log"))],
         }
     }
 
@@ -94,27 +113,23 @@ impl Whose {
     fn is_in_turn(self) -> bool {
         self == Self::Start
     }
-
-    /// The keys of these logs below the run's prefix, with their labels.
-    pub(super) fn keys(self, workers: usize, only: Option<usize>) -> Vec<(String, String)> {
-        let workers = (1..=workers).filter(|worker| only.is_none_or(|only| only == *worker));
-        let of_workers = |key: fn(usize) -> String| workers.map(|worker| (worker.to_string(), key(worker))).collect();
-        match self {
-            Self::Agent => of_workers(|worker| format!("agent/agent{worker}/leaderboard.log")),
-            Self::Simulator => of_workers(|worker| format!("simulator/console-{worker}.log")),
-            Self::Evaluator => of_workers(|worker| format!("evaluators/{worker}/console.log")),
-            Self::Start => Vec::new(),
-            Self::Logcopy => vec![("logcopy".to_owned(), "logcopy/logcopy.log".to_owned())],
-        }
-    }
 }
 
-/// A container whose log is shown, with its label and the number of its colour.
+/// A container whose log is shown.
 #[derive(Clone, Debug)]
-struct Source {
+pub(super) struct Source {
+    /// The number of its colour.
     stream: usize,
     label: String,
     container: String,
+    /// The log below the run's prefix, if it is stored.
+    key: Option<String>,
+}
+
+impl Source {
+    fn print(&self, line: &str) {
+        print_labelled(self.stream, &self.label, &log_line(line));
+    }
 }
 
 /// Prints the logs.
@@ -132,9 +147,10 @@ pub async fn logs(cluster: &Cluster, wanted: &Logs) -> Result<ExitCode, Error> {
     if wanted.follow && !facts::has_ended(&submission) {
         return follow::follow(cluster, wanted, submission).await;
     }
+    let sources = of.sources(workers, wanted.worker);
     let code = match cluster.pod(&wanted.name).await? {
-        Some(pod) => stream(cluster, &pod, &sources(of, workers, wanted.worker)).await?,
-        None => from_bucket(&submission, wanted, of, workers).await?,
+        Some(pod) => stream(cluster, &pod, &sources).await?,
+        None => from_bucket(&submission, wanted, of, &sources).await?,
     };
     if wanted.follow {
         note(&end(&submission));
@@ -165,31 +181,12 @@ pub(super) fn begins_again(container: &str, restarts: i32) -> String {
 
 /// One sentence about the end of a submission whose log was followed, with the next step.
 pub(super) fn end(submission: &Submission) -> String {
-    let status = submission.status.as_ref();
-    let shown = facts::shown(submission);
-    let reason = status.and_then(|status| status.reason.as_ref());
-    let reason = reason.map(|reason| format!(" ({reason})"));
-    let next = if shown == State::Finished.as_str() {
+    let next = if facts::shown(submission) == State::Finished.as_str() {
         String::new()
     } else {
         format!(" `{}` has the next step.", facts::command("why", submission))
     };
-    format!(
-        "{} is {shown}{}.{next}",
-        submission.name_any(),
-        reason.unwrap_or_default()
-    )
-}
-
-fn sources(of: Whose, workers: usize, only: Option<usize>) -> Vec<Source> {
-    let containers = of.containers(workers, only).into_iter().enumerate();
-    let source = |(stream, (label, container)): (usize, (String, String))| Source {
-        // A worker has its colour also where it is shown alone.
-        stream: label.parse().unwrap_or(stream),
-        label,
-        container,
-    };
-    containers.map(source).collect()
+    format!("{}.{next}", facts::named(submission))
 }
 
 /// How many workers have such a container: of an agent that runs first, there is one.
@@ -224,7 +221,7 @@ async fn stream(cluster: &Cluster, pod: &Pod, sources: &[Source]) -> Result<Exit
         };
         while let Some(line) = lines.next().await {
             match line {
-                Ok(line) => print_labelled(source.stream, &source.label, &log_line(&line)),
+                Ok(line) => source.print(&line),
                 Err(error) => {
                     return Err(Error::Api(format!(
                         "the log of {container} of Pod {name} ended: {error}"
@@ -237,62 +234,55 @@ async fn stream(cluster: &Cluster, pod: &Pod, sources: &[Source]) -> Result<Exit
 }
 
 /// Prints the logs that are stored, or the commands that do so where there is no program for it.
-async fn from_bucket(submission: &Submission, wanted: &Logs, of: Whose, workers: usize) -> Result<ExitCode, Error> {
-    let keys = of.keys(workers, wanted.worker);
-    let commands = in_bucket(submission, of, &keys, frame()).map_err(Error::Unfit)?;
-    let status = submission.status.as_ref();
-    let results = status
-        .and_then(|status| status.results_url.as_deref())
-        .unwrap_or_default();
-    let storage = status
-        .and_then(|status| status.plan.as_ref())
-        .map(|plan| &plan.storage.s3);
+async fn from_bucket(submission: &Submission, wanted: &Logs, of: Whose, sources: &[Source]) -> Result<ExitCode, Error> {
+    let commands = in_bucket(submission, of, sources, frame()).map_err(Error::Unfit)?;
+    let results = facts::status(submission).results_url.as_deref().unwrap_or_default();
+    let storage = facts::storage(submission);
     let named = storage.and_then(|storage| storage.endpoint.as_ref());
     foreign::confirm(&submission.name_any(), named, wanted.endpoint.as_deref(), ask)?;
-    let mut is_unread = false;
-    for (stream, (label, key)) in keys.iter().enumerate() {
-        let stream = label.parse().unwrap_or(stream);
-        let show = |line: &str| print_labelled(stream, label, &log_line(line));
-        match read(&format!("{results}/{key}"), storage, show).await {
+    let mut is_read = true;
+    for (source, key) in stored(sources) {
+        let address = format!("{results}/{key}");
+        match read(&address, storage, |line| source.print(line)).await {
             Ok(()) => {}
             Err(Unread::NoProgram) => {
                 print(&commands);
                 return Ok(ExitCode::SUCCESS);
             }
             Err(Unread::Failed(why)) => {
-                note(&of_bucket(&format!("{results}/{key}"), &why).to_string());
-                is_unread = true;
+                note(&of_bucket(&address, &why).to_string());
+                is_read = false;
             }
         }
     }
-    Ok(if is_unread {
-        ExitCode::FAILURE
-    } else {
-        ExitCode::SUCCESS
-    })
+    Ok(code(is_read))
+}
+
+/// The containers whose log is stored, with its key.
+fn stored(sources: &[Source]) -> impl Iterator<Item = (&Source, &str)> {
+    sources
+        .iter()
+        .filter_map(|source| Some((source, source.key.as_deref()?)))
 }
 
 /// The commands that read the logs once the Pod is gone, or why there is none, with the next step.
 pub(super) fn in_bucket(
     submission: &Submission,
     of: Whose,
-    keys: &[(String, String)],
+    sources: &[Source],
     frame: Frame,
 ) -> Result<Vec<String>, String> {
     let name = submission.name_any();
-    let status = submission.status.as_ref();
-    let results = status.and_then(|status| status.results_url.as_deref());
-    let is_before_start = |status: &SubmissionStatus| {
-        status.times.started.is_none() && status.attempt <= Some(Attempt::FIRST) && status.retry == 0
-    };
-    if !facts::has_ended(submission) && status.is_none_or(is_before_start) {
+    let status = facts::status(submission);
+    let has_started = status.times.started.is_some() || status.attempt > Some(Attempt::FIRST) || status.retry > 0;
+    if !facts::has_ended(submission) && !has_started {
         return Err(format!(
             "{name} is {} and has no Pod yet, so it has no log. `{} -f` waits for it",
             facts::shown(submission),
             facts::command("logs", submission)
         ));
     }
-    let (Some(results), false) = (results, keys.is_empty()) else {
+    let (Some(results), Some(_)) = (&status.results_url, stored(sources).next()) else {
         let what = if of.is_in_turn() {
             "what prepared it is not stored"
         } else {
@@ -303,17 +293,12 @@ pub(super) fn in_bucket(
             facts::command("why", submission)
         ));
     };
-    let storage = status
-        .and_then(|status| status.plan.as_ref())
-        .map(|plan| &plan.storage.s3);
     let text = format!(
         "The Pod of {name} is gone. With the program aws on the PATH, this command shows its logs. Without it:"
     );
     let mut lines = wrap(&text, frame.width);
-    lines.extend(
-        keys.iter()
-            .map(|(_, key)| bucket::print(&format!("{results}/{key}"), storage)),
-    );
+    let storage = facts::storage(submission);
+    lines.extend(stored(sources).map(|(_, key)| bucket::print(&format!("{results}/{key}"), storage)));
     Ok(lines)
 }
 
@@ -344,8 +329,9 @@ mod tests {
     #[test]
     fn each_choice_has_its_containers_and_keys() {
         let names = |whose: Whose, only| {
-            let found = whose.containers(2, only).into_iter().map(|(_, name)| name);
-            let keys = whose.keys(2, only).into_iter().map(|(_, key)| key);
+            let (found, all) = (whose.sources(2, only), whose.sources(2, only));
+            let keys = all.into_iter().filter_map(|source| source.key);
+            let found = found.into_iter().map(|source| source.container);
             (found.collect::<Vec<_>>(), keys.collect::<Vec<_>>())
         };
         let two = |a: &str, b: &str| vec![a.to_owned(), b.to_owned()];
@@ -434,8 +420,9 @@ mod tests {
     #[test]
     fn no_part_of_an_imported_address_is_a_command() {
         let hostile = submission(&json!({"resultsURL": "s3://b/$(reboot)';reboot;#", "conditions": ended()}));
-        let lines = in_bucket(&hostile, Whose::Agent, &[("1".to_owned(), "a.log".to_owned())], frame()).unwrap();
-        assert_eq!(lines[1], r"aws s3 cp 's3://b/$(reboot)'\'';reboot;#/a.log' -");
+        let lines = in_bucket(&hostile, Whose::Agent, &Whose::Agent.sources(1, None), frame()).unwrap();
+        let object = r"'s3://b/$(reboot)'\'';reboot;#/agent/agent1/leaderboard.log'";
+        assert_eq!(lines[1], format!("aws s3 cp {object} -"));
     }
 
     #[test]
@@ -447,7 +434,7 @@ mod tests {
             "track": "sensors", "storage": {"s3": storage}, "image": "a"});
         let stored = submission(&json!({"resultsURL": "s3://b/mine", "plan": plan, "conditions": ended()}));
         assert_eq!(workers(&stored, Whose::Agent), 1);
-        let in_bucket = |submission, of: Whose| in_bucket(submission, of, &of.keys(1, None), frame());
+        let in_bucket = |submission, of: Whose| in_bucket(submission, of, &of.sources(1, None), frame());
         let lines = in_bucket(&stored, Whose::Agent).unwrap();
         assert_eq!(
             lines[1],

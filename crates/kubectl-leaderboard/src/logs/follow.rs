@@ -10,13 +10,12 @@ use k8s_openapi::api::core::v1::{ContainerStatus, Pod};
 use kube::ResourceExt;
 use leaderboard_api::Submission;
 
-use super::{Logs, Source, begins_again, begins_later, end, sources, workers};
+use super::{Logs, Source, begins_again, begins_later, end, workers};
 use crate::cluster::Cluster;
 use crate::commands::{changes, next, uninterrupted};
 use crate::error::Error;
 use crate::facts;
-use crate::output::{note, print_labelled};
-use crate::text::log_line;
+use crate::output::note;
 
 /// A life of a container: one that crashes begins another one, with a log of its own.
 type Life = (String, String, i32);
@@ -33,11 +32,7 @@ struct Following<'a> {
 
 /// Prints the lines as they come.
 pub(super) async fn follow(cluster: &Cluster, wanted: &Logs, submission: Submission) -> Result<ExitCode, Error> {
-    if submission
-        .status
-        .as_ref()
-        .is_none_or(|status| status.job_name.is_none())
-    {
+    if facts::status(&submission).job_name.is_none() {
         note(&begins_later(&submission));
     }
     let mut changes = pin!(changes(cluster, &wanted.name));
@@ -76,7 +71,7 @@ impl Following<'_> {
             line = self.lines.next(), if !self.lines.is_empty() => match line {
                 // The last log has ended.
                 None => {}
-                Some((source, Ok(line))) => print_labelled(source.stream, &source.label, &log_line(&line)),
+                Some((source, Ok(line))) => source.print(&line),
                 Some((_, Err(error @ (Error::Forbidden(_) | Error::Credentials(_))))) => return Err(error),
                 Some((source, Err(error))) => note(&format!("the log of {} was interrupted: {error}", source.container)),
             },
@@ -88,7 +83,7 @@ impl Following<'_> {
     fn begin(&mut self, pod: &Pod) {
         let mut new = Vec::new();
         let (of, only) = (self.wanted.whose(&self.submission), self.wanted.worker);
-        for source in sources(of, workers(&self.submission, of).max(only.unwrap_or(0)), only) {
+        for source in of.sources(workers(&self.submission, of).max(only.unwrap_or(0)), only) {
             let Some(restarts) = life(pod, &source.container) else {
                 continue;
             };

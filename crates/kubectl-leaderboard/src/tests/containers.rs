@@ -118,7 +118,7 @@ fn printed(one: &Submission, board: &Leaderboard) -> Vec<String> {
         namespace: "arena",
         is_all: false,
     };
-    let keys = Whose::Evaluator.keys(2, None);
+    let sources = Whose::Evaluator.sources(2, None);
     let shown = [
         why::explain(one, found, frame()),
         status::screen(one, found, frame()),
@@ -128,7 +128,7 @@ fn printed(one: &Submission, board: &Leaderboard) -> Vec<String> {
         submit::lines(one, found, frame()),
         resume::lines(&[one], frame()),
         get::done(one, frame()),
-        in_bucket(one, Whose::Evaluator, &keys, frame()).unwrap_or_else(|why| vec![why]),
+        in_bucket(one, Whose::Evaluator, &sources, frame()).unwrap_or_else(|why| vec![why]),
         top::lines(all, std::slice::from_ref(board), frame()),
         scores::text(&scores::boards(std::slice::from_ref(board), all, None), frame()),
     ];

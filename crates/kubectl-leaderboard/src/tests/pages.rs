@@ -62,21 +62,22 @@ fn logs_are_printed_as_their_files_show() {
     assert_golden("logs", &text);
     let stored = submission(&ran_with(crashed(), "simulator:2"));
     assert_shown("logs-in-bucket", |frame| {
-        in_bucket(&stored, Whose::Agent, &Whose::Agent.keys(2, None), frame).unwrap()
+        in_bucket(&stored, Whose::Agent, &Whose::Agent.sources(2, None), frame).unwrap()
     });
 }
 
 #[test]
 fn a_log_that_is_not_there_is_explained() {
     let frame = |width| Frame { now: now(), width };
-    let why = |status: &Value, of: Whose| in_bucket(&submission(status), of, &of.keys(2, None), frame(80)).unwrap_err();
+    let why =
+        |status: &Value, of: Whose| in_bucket(&submission(status), of, &of.sources(2, None), frame(80)).unwrap_err();
     assert!(why(&waiting(), Whose::Agent).starts_with("submission-42 is Pending and has no Pod yet"));
     // The attempt before has stored something.
     let again = with(waiting(), &json!({"attempt": 2, "resultsURL": "s3://results/v2/42"}));
     let lines = in_bucket(
         &submission(&again),
         Whose::Agent,
-        &Whose::Agent.keys(1, None),
+        &Whose::Agent.sources(1, None),
         frame(80),
     )
     .unwrap();
