@@ -3,7 +3,7 @@
 use serde_json::{Map, Value};
 
 use leaderboard_api::text::one_line;
-use leaderboard_api::{Attempt, MAX_METRICS, MAX_NAME, Metric, Progress, Score};
+use leaderboard_api::{Attempt, MAX_METRICS, MAX_NAME, Metric};
 use leaderboard_contract::keys::{METADATA, STDOUT};
 use leaderboard_contract::report::{ContentId, Logs, Outcome, RefusedResults, Report, ReportError, ReportWorker};
 use leaderboard_contract::run::Stop;
@@ -78,15 +78,6 @@ impl ReportDigest {
         let is_spoiled = self.refused.is_some() || self.unusable.is_some();
         let is_decided = self.is_complete() || (self.is_final && is_spoiled);
         is_decided && (self.eligible || !goes_on)
-    }
-
-    pub fn progress(&self) -> Progress {
-        Progress::new(clamp(self.done), clamp(self.total), &self.unit)
-    }
-
-    /// The score so far, or of the whole run.
-    pub fn score(&self, is_final: bool) -> Option<Score> {
-        Some(Score::new(self.score.clone()?, is_final))
     }
 
     pub fn of(report: &Report, id: ContentId) -> Self {

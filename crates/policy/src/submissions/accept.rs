@@ -6,7 +6,7 @@ use std::time::Duration;
 use k8s_openapi::apimachinery::pkg::apis::meta::v1::Time;
 
 use super::end;
-use super::failure::{self, charged, for_both, participant};
+use super::failure::{charged, for_both, participant};
 use super::gates;
 use super::plan::{Action, Question};
 use super::status::PlanBuilder;
@@ -166,11 +166,11 @@ fn named_image(draft: &PlanBuilder<'_>) -> Result<String, Untaken> {
     let Some(image) = named else {
         let why = info.and_then(|i| i.image_problem.as_deref()).ok_or(Untaken::Unread)?;
         let what = sentence(&format!("The submission names no usable image: {why}"));
-        return Err(Untaken::never(None, failure::image_invalid(&what)));
+        return Err(Untaken::never(None, charged(Reason::ImageInvalid, &what)));
     };
     if let Err(why) = ImageReference::parse(&image) {
         let what = sentence(&format!("The submitted image is not a valid image reference: {why}"));
-        return Err(Untaken::never(Some(image), failure::image_invalid(&what)));
+        return Err(Untaken::never(Some(image), charged(Reason::ImageInvalid, &what)));
     }
     Ok(image)
 }

@@ -190,7 +190,7 @@ pub(super) fn failure_of(found: &Trouble, pod: &PodView, seconds: i64) -> Failur
     let message = &found.message;
     let tried = format!("{message} It was tried for {seconds} s on {}.", node_of(pod));
     let failure = match found.cause {
-        Cause::ImageName => failure::image_invalid(message),
+        Cause::ImageName => charged(Reason::ImageInvalid, message),
         Cause::ImageUser => of_image(
             Reason::ImageInvalid,
             message,

@@ -9,7 +9,6 @@ use leaderboard_api::text::sentence;
 use leaderboard_api::{Agents, EndReason, Failure, FailureClass, Reason, SubmissionStatus, WorkerStatus, reasons};
 use leaderboard_contract::keys::{REFUSED, result_path};
 use leaderboard_contract::report::{Outcome, RefusedResults};
-use leaderboard_contract::run::Stop;
 use leaderboard_evaluation::{Words, words};
 
 /// A failure that is the participant's: `what` happened, in one sentence, and what each reader does about it.
@@ -56,11 +55,6 @@ pub(super) fn at_the_end(found: Failure) -> Failure {
             }
         }
     }
-}
-
-/// The submitted text names no image that could ever be pulled.
-pub(super) fn image_invalid(what: &str) -> Failure {
-    charged(Reason::ImageInvalid, what)
 }
 
 /// The files that an agent has left cannot be taken. `what` says what the participant does, too.
@@ -181,16 +175,6 @@ fn named_crash(report: &ReportDigest, status: &SubmissionStatus) -> Failure {
                 words.unit
             ),
         )
-    }
-}
-
-/// The stop that a failure calls for, or a higher attempt.
-pub(super) fn stop_of(failure: Option<&Failure>) -> Stop {
-    match failure.map(|failure| failure.reason.known()) {
-        Some(Some(Reason::TimeLimit)) => Stop::RunDeadline,
-        // Without a failure it is stopped for a higher attempt.
-        Some(Some(Reason::NodeInterrupted)) | None => Stop::Interruption,
-        _ => Stop::Retries,
     }
 }
 

@@ -59,7 +59,7 @@ pub fn decide(view: &View) -> Plan {
     } else {
         life(&mut draft);
         if leave::needs_finalizer(&draft) {
-            draft.act_first(Action::SetFinalizer(true));
+            draft.actions.insert(0, Action::SetFinalizer(true));
         }
     }
     let report = run::demand(&draft);

@@ -9,7 +9,7 @@ use jiff::Timestamp;
 use k8s_openapi::apimachinery::pkg::apis::meta::v1::Time;
 
 use super::plan::{Action, EvalaiUpdate, TableUpdate};
-use super::run::{self, Reading};
+use super::run::report_of_end;
 use super::status::PlanBuilder;
 use super::waits::{Wait, after};
 use super::{gates, leave, logs, stop};
@@ -176,14 +176,15 @@ fn note_late_cancel(draft: &mut PlanBuilder<'_>) {
 
 /// Sends the end with all that belongs to it, once that is there. Returns why it cannot be read.
 fn send_result(draft: &mut PlanBuilder<'_>, log_left: Option<Duration>) -> Option<String> {
-    match run::report_of_end(draft) {
-        Reading::Waits(why) => return why,
-        Reading::Done if log_left.is_some() => {}
-        Reading::Done => draft.act(Action::UpdateEvalai(match draft.status.state_of_conditions() {
+    if let Err(why) = report_of_end(draft) {
+        return why;
+    }
+    if log_left.is_none() {
+        draft.act(Action::UpdateEvalai(match draft.status.state_of_conditions() {
             State::Finished => EvalaiUpdate::Finished,
             State::Cancelled => EvalaiUpdate::Cancelled,
             _ => EvalaiUpdate::Failed,
-        })),
+        }));
     }
     None
 }
@@ -350,17 +351,16 @@ fn record(draft: &mut PlanBuilder<'_>, is_shown: bool) -> Delivery {
         draft.condition(conditions::RECORDED, Truth::True, Reason::Recorded, "");
         return Delivery::Done;
     }
-    let mut unread = None;
     // Only the row of a finished submission has metrics.
-    let reading = if draft.is_successful() {
-        run::report_of_end(draft)
+    let read = if draft.is_successful() {
+        report_of_end(draft)
     } else {
-        Reading::Done
+        Ok(())
     };
-    match reading {
-        Reading::Waits(why) => unread = why.map(|why| cannot_be_read(draft, conditions::RECORDED, &why)),
-        Reading::Done => draft.act(Action::Record(TableUpdate::End)),
+    if read.is_ok() {
+        draft.act(Action::Record(TableUpdate::End));
     }
+    let unread = read.err().flatten();
     let (reason, message) = match view.error {
         Some(error) => (
             Reason::Refused,
@@ -370,11 +370,9 @@ fn record(draft: &mut PlanBuilder<'_>, is_shown: bool) -> Delivery {
             ),
         ),
         None => match unread {
-            Some(unread) => (Reason::Unread, unread),
-            None => (
-                Reason::Waiting,
-                (if is_shown { IN_LINE } else { FOLLOWS_EVALAI }).to_owned(),
-            ),
+            Some(why) => (Reason::Unread, cannot_be_read(draft, conditions::RECORDED, &why)),
+            None if is_shown => (Reason::Waiting, IN_LINE.to_owned()),
+            None => (Reason::Waiting, FOLLOWS_EVALAI.to_owned()),
         },
     };
     draft.condition(conditions::RECORDED, Truth::False, reason, &message);

@@ -20,10 +20,9 @@ use crate::view::{ContainerView, ObservedJob, ObservedReport, PodView, ReportDem
 use leaderboard_api::conditions::{self, Condition, Truth};
 use leaderboard_api::text::sentence;
 use leaderboard_api::{
-    Failure, ImageReference, PinnedImage, Reason, Repository, State, SubmissionStatus, WorkerStatus,
+    Failure, ImageReference, PinnedImage, Progress, Reason, Repository, Score, State, SubmissionStatus, WorkerStatus,
 };
-use leaderboard_contract::report::Logs;
-use leaderboard_contract::report::Patience;
+use leaderboard_contract::report::{Logs, Patience};
 
 /// Takes in what Pod and report show.
 pub(super) fn take_in(draft: &mut PlanBuilder<'_>) {
@@ -175,10 +174,10 @@ pub fn pinned(image: &str, pinned: Option<&PinnedImage>) -> String {
 
 /// Takes in how far the run is.
 pub(super) fn take_report(draft: &mut PlanBuilder<'_>, report: &ReportDigest) {
-    draft.status.progress = Some(report.progress());
+    draft.status.progress = Some(Progress::new(clamp(report.done), clamp(report.total), &report.unit));
     let is_complete = report.is_final && report.done == report.total;
-    if let Some(score) = report.score(is_complete) {
-        draft.status.score = Some(score);
+    if let Some(score) = report.score.clone() {
+        draft.status.score = Some(Score::new(score, is_complete));
         draft.status.metrics.clone_from(&report.metrics);
     }
     let old = std::mem::take(&mut draft.status.workers);
@@ -252,14 +251,6 @@ fn note_logs(draft: &mut PlanBuilder<'_>, report: &ReportDigest) {
     }
 }
 
-/// The state of a result that is to be published.
-pub(super) enum Reading {
-    /// As much as there ever will be.
-    Done,
-    /// It is being read, or cannot be read and why.
-    Waits(Option<String>),
-}
-
 /// Which report the present state of the run needs.
 pub(super) fn demand(draft: &PlanBuilder<'_>) -> Option<ReportDemand> {
     let status = &draft.status;
@@ -317,22 +308,23 @@ pub(super) fn answer_left(draft: &PlanBuilder<'_>) -> Option<Duration> {
     Wait::REPORT.silence_left(draft.view.report.waited)
 }
 
-/// Asks for the report of an ended run.
-pub(super) fn report_of_end(draft: &mut PlanBuilder<'_>) -> Reading {
+/// Asks for the report of an ended run. Ok if as much is read as there ever will be; else it is being read, or cannot be read and why.
+pub(super) fn report_of_end(draft: &mut PlanBuilder<'_>) -> Result<(), Option<String>> {
     // A submission that never had a Job has stored nothing.
     if draft.status.plan.is_none() || !draft.status.has_run() {
-        return Reading::Done;
+        return Ok(());
     }
     draft.needs_report = true;
     let view = draft.view;
     let is_read = is_of(draft, stage_after_end(draft)) && view.report.stored != ObservedReport::NotRead;
+    // A Finished submission needs its result.
+    if !draft.is_successful() && !may_wait(draft) {
+        return Ok(());
+    }
     match &view.report.stored {
-        _ if !is_read && (draft.is_successful() || may_wait(draft)) => Reading::Waits(None),
-        // A Finished submission needs its result.
-        ObservedReport::Unreadable(why) if draft.is_successful() || may_wait(draft) => {
-            Reading::Waits(Some(why.clone()))
-        }
-        _ => Reading::Done,
+        _ if !is_read => Err(None),
+        ObservedReport::Unreadable(why) => Err(Some(why.clone())),
+        _ => Ok(()),
     }
 }
 

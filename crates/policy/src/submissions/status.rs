@@ -275,10 +275,6 @@ impl<'a> PlanBuilder<'a> {
         self.actions.push(action);
     }
 
-    pub(super) fn act_first(&mut self, action: Action) {
-        self.actions.insert(0, action);
-    }
-
     pub(super) fn does(&self, is_meant: impl Fn(&Action) -> bool) -> bool {
         self.actions.iter().any(is_meant)
     }

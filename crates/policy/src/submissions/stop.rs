@@ -120,10 +120,13 @@ fn annotate(draft: &mut PlanBuilder<'_>, pod: &PodView) {
     if pod.stop.is_some() {
         return;
     }
-    let stop = if draft.is_cancelled() {
-        Stop::Cancel
-    } else {
-        failure::stop_of(draft.status.failure.as_deref())
+    let failure = draft.status.failure.as_deref();
+    let stop = match failure.map(|failure| failure.reason.known()) {
+        _ if draft.is_cancelled() => Stop::Cancel,
+        Some(Some(Reason::TimeLimit)) => Stop::RunDeadline,
+        // Without a failure it is stopped for a higher attempt.
+        Some(Some(Reason::NodeInterrupted)) | None => Stop::Interruption,
+        _ => Stop::Retries,
     };
     draft.act(Action::StopPod {
         pod: pod.name.clone(),
