@@ -10,7 +10,7 @@ use kube::Client;
 use tokio::time::{Instant, sleep};
 
 use super::rights::Rights;
-use super::serve;
+use super::serve::{self, End};
 use crate::kubernetes::Namespaces;
 use crate::kubernetes::preflight::{access_missing, kinds_missing};
 use crate::observability::logging::Format;
@@ -50,11 +50,11 @@ impl Preflight {
     }
 
     /// Looks until nothing is missing, or for as long as it may take.
-    async fn check(self) -> Result<(), String> {
+    async fn check(self) -> End {
         let config = serve::cluster("preflight").await?;
         let client = Client::try_from(config).map_err(|error| client_errors::kube(&error))?;
         let builder = reqwest::Client::builder().no_proxy().timeout(ANSWER_LIMIT);
-        let http = builder.build().map_err(|error| error.to_string())?;
+        let http = builder.build()?;
         let until = Instant::now() + Duration::from_secs(self.patience);
         loop {
             let missing = self.missing(&client, &http).await;
@@ -66,7 +66,7 @@ impl Preflight {
                 return Ok(());
             }
             if Instant::now() >= until {
-                return Err(missing.join("; "));
+                return Err(missing.join("; ").into());
             }
             sleep(PAUSE).await;
         }

@@ -1,6 +1,7 @@
 //! Subcommands that stay: `controller`, `bridge`, and the programs of a Pod. Sets up logging, TLS, clients and the
 //! stop signal, then runs the program's module.
 
+use std::error::Error;
 use std::future::Future;
 use std::process::ExitCode;
 
@@ -28,7 +29,7 @@ use leaderboard_aws::clients::Aws;
 use leaderboard_base::shutdown::on_signals;
 use leaderboard_contract::run::ENV_CHECKSUMS;
 use leaderboard_evaluation::judge::Pace;
-use leaderboard_pod::places::{self, Places, Setting};
+use leaderboard_pod::places::{self, Places, Setting, SettingError};
 use leaderboard_pod::{collect as collect_program, logcopy as logcopy_program, ownlog, workspace as workspace_program};
 use leaderboard_pod_spec::job::OwnImage;
 
@@ -46,6 +47,9 @@ const THREADS_IN_POD: usize = 2;
 /// Environment variable with the log filter.
 const ENV_LOG: &str = "RUST_LOG";
 
+/// How a program ends. An error is the last line of its log.
+pub(super) type End = Result<(), Box<dyn Error>>;
+
 pub(super) fn controller(options: Controller) -> ExitCode {
     start("controller", options.server.log_format, || lead(options))
 }
@@ -60,8 +64,7 @@ pub(super) fn workspace(options: &InPod) -> ExitCode {
         leaderboard_contract::keys::WORKSPACE_LOG,
     );
     start_logged("workspace", THREADS_IN_POD, || async {
-        let setting = setting(options)?;
-        workspace_program::main(setting).await.map_err(|e| e.to_string())
+        Ok(workspace_program::main(setting(options)?).await?)
     })
 }
 
@@ -70,10 +73,8 @@ pub(super) fn logcopy(options: &InPod) -> ExitCode {
     ownlog::start(&Places::below(&options.root).logs, leaderboard_contract::keys::OWN_LOG);
     start_logged("logcopy", THREADS_IN_POD, || async {
         let setting = setting(options)?;
-        let stop = on_signals().map_err(|e| e.to_string())?;
-        Box::pin(logcopy_program::main(setting, async move { stop.wait().await }))
-            .await
-            .map_err(|e| e.to_string())
+        let stop = on_signals()?;
+        Ok(Box::pin(logcopy_program::main(setting, async move { stop.wait().await })).await?)
     })
 }
 
@@ -81,26 +82,26 @@ pub(super) fn collect(options: &InPod) -> ExitCode {
     let places = Places::below(&options.root);
     ownlog::start(&places.logs, leaderboard_contract::keys::COLLECT_LOG);
     start_logged("collect", THREADS_IN_POD, || async {
-        let run = places::run().map_err(|e| e.to_string())?;
-        let stop = on_signals().map_err(|e| e.to_string())?;
+        let run = places::run()?;
+        let stop = on_signals()?;
         tokio::select! {
             biased;
-            copied = collect_program::main(run, places) => copied.map_err(|e| e.to_string()),
+            copied = collect_program::main(run, places) => Ok(copied?),
             // The first process of a container ignores a signal that it does not ask for.
-            () = stop.wait() => Err("it was asked to end before all files were copied".to_owned()),
+            () = stop.wait() => Err("it was asked to end before all files were copied".into()),
         }
     })
 }
 
-fn setting(options: &InPod) -> Result<Setting, String> {
+fn setting(options: &InPod) -> Result<Setting, SettingError> {
     let pace = Pace::default().faster(options.faster);
-    Setting::read(Places::below(&options.root), pace).map_err(|e| e.to_string())
+    Setting::read(Places::below(&options.root), pace)
 }
 
 /// Sets up the log, then works until the end; an error is the last line of the log and the exit code.
 pub(super) fn start<W>(program: &'static str, format: Format, work: impl FnOnce() -> W) -> ExitCode
 where
-    W: Future<Output = Result<(), String>>,
+    W: Future<Output = End>,
 {
     if let Err(error) = logging::init(format, std::env::var(ENV_LOG).ok().as_deref()) {
         eprintln!("leaderboard-operator: {error}");
@@ -111,7 +112,7 @@ where
 
 fn start_logged<W>(program: &'static str, threads: usize, work: impl FnOnce() -> W) -> ExitCode
 where
-    W: Future<Output = Result<(), String>>,
+    W: Future<Output = End>,
 {
     let version = env!("CARGO_PKG_VERSION");
     let revision = Some(REVISION).filter(|revision| !revision.is_empty());
@@ -141,12 +142,10 @@ where
     }
 }
 
-async fn lead(options: Controller) -> Result<(), String> {
-    let telemetry = Observability::new(on_signals().map_err(|e| e.to_string())?);
+async fn lead(options: Controller) -> End {
+    let telemetry = Observability::new(on_signals()?);
     let (telemetry, sending) = Sending::start(telemetry)?;
-    let health = HealthServer::start(options.server.http, telemetry.clone())
-        .await
-        .map_err(|e| e.to_string())?;
+    let health = HealthServer::start(options.server.http, telemetry.clone()).await?;
     let config = cluster("controller").await?;
     let clients = run::Clients {
         api: Client::try_from(config.clone()).map_err(|e| client_errors::kube(&e))?,
@@ -171,7 +170,7 @@ async fn lead(options: Controller) -> Result<(), String> {
     };
     let page = match options.dashboard {
         Some(port) => {
-            let page = Page::bind(port, &options.pod_name).await.map_err(|e| e.to_string())?;
+            let page = Page::bind(port, &options.pod_name).await?;
             Some(page.titled(&options.page_title))
         }
         None => None,
@@ -179,14 +178,12 @@ async fn lead(options: Controller) -> Result<(), String> {
     let result = run::run(clients, lease, settings, aws, page, telemetry).await;
     sending.finish().await;
     health.close().await;
-    result.map_err(|e| e.to_string())
+    Ok(result?)
 }
 
-async fn serve_bridge(options: Server) -> Result<(), String> {
-    let telemetry = Observability::of(Program::Bridge, on_signals().map_err(|e| e.to_string())?);
-    let server = HealthServer::start(options.http, telemetry.clone())
-        .await
-        .map_err(|e| e.to_string())?;
+async fn serve_bridge(options: Server) -> End {
+    let telemetry = Observability::of(Program::Bridge, on_signals()?);
+    let server = HealthServer::start(options.http, telemetry.clone()).await?;
     let clients = Clients::new(cluster("bridge").await?).map_err(|e| client_errors::kube(&e))?;
     let scope = bridge::Scope {
         namespaces: Namespaces::of(options.namespaces),
@@ -194,7 +191,7 @@ async fn serve_bridge(options: Server) -> Result<(), String> {
     };
     let result = bridge::run(clients, Aws::load("bridge").await, scope, telemetry).await;
     server.close().await;
-    result.map_err(|e| e.to_string())
+    Ok(result?)
 }
 
 /// How the cluster is reached. Its audit log then names the program.
@@ -213,19 +210,18 @@ struct Sending(#[cfg(feature = "otel")] Option<otlp::Sending>);
 
 impl Sending {
     #[cfg(feature = "otel")]
-    fn start(mut telemetry: Observability) -> Result<(Observability, Self), String> {
+    fn start(mut telemetry: Observability) -> Result<(Observability, Self), Box<dyn Error>> {
         if !otlp::is_wanted(|name| std::env::var(name).ok()) {
             return Ok((telemetry, Self(None)));
         }
-        let started = otlp::start(None, &telemetry.metrics, &telemetry.tasks);
-        let (traces, sending) = started.map_err(|e| e.to_string())?;
+        let (traces, sending) = otlp::start(None, &telemetry.metrics, &telemetry.tasks)?;
         telemetry.traces = traces;
         Ok((telemetry, Self(Some(sending))))
     }
 
     #[cfg(not(feature = "otel"))]
     #[allow(clippy::unnecessary_wraps, reason = "with traces it can fail")]
-    fn start(telemetry: Observability) -> Result<(Observability, Self), String> {
+    fn start(telemetry: Observability) -> Result<(Observability, Self), Box<dyn Error>> {
         if std::env::var_os("OTEL_EXPORTER_OTLP_ENDPOINT").is_some() {
             tracing::warn!(
                 "OTEL_EXPORTER_OTLP_ENDPOINT is set, but this program was built without traces (feature otel)"
