@@ -8,16 +8,16 @@ use std::collections::BTreeMap;
 use std::sync::{Arc, Mutex, MutexGuard, Weak};
 
 use jiff::{SignedDuration, Timestamp};
-use tokio::sync::{mpsc, watch};
+use tokio::sync::{Semaphore, mpsc, watch};
 use tokio::task::JoinHandle;
 use tokio::time::Instant;
 
 use super::client::Client;
-use super::files::{Files, InputAddress, InputError, InputStream};
+use super::files::{InputAddress, InputError, InputStream};
 use super::labels::Labels;
-use super::queue::{Now, Purse, Queue, Timing};
+use super::queue::{Now, PAYLOADS, Purse, Queue, Timing};
 use super::request::{Reply, Request};
-use super::task::{Outlets, Payloads, Shared, Task, now, run};
+use super::task::{Shared, Task, now, run};
 use super::transport::{ClientError, Connect, Timeouts};
 use super::types::{
     Changed, DesiredUpdate, InboxTrouble, Key, Load, PayloadReader, Publisher, Subject, SubmissionState, SweepRow,
@@ -34,7 +34,7 @@ pub struct Options {
     pub connect: Connect,
     /// Tells the time of what EvalAI and people are shown.
     pub clock: Clock,
-    pub write_guard: Arc<dyn WriteGuard>,
+    pub write_guard: WriteGuard,
     /// Reads what a bucket holds of a result.
     pub payloads: PayloadReader,
     /// No write before: after a takeover, what the process before has sent may still be worked on.
@@ -54,7 +54,7 @@ pub struct Options {
 #[cfg(any(test, feature = "fixtures"))]
 impl Options {
     /// Options of a hub without a listener to its news.
-    pub fn unheard(tasks: &Tasks, write_guard: impl WriteGuard) -> Self {
+    pub fn unheard(tasks: &Tasks, write_guard: impl Fn() -> bool + Send + Sync + 'static) -> Self {
         Self {
             connect: Arc::new(super::Network::connect),
             clock: Clock::system(),
@@ -76,13 +76,13 @@ impl Options {
 pub struct Hub(Arc<Inner>);
 
 struct Inner {
-    options: Options,
+    options: Arc<Options>,
     /// All queues count time from here, so that a moment means the same in each.
     start: Instant,
     /// `not_before` as wall-clock time.
     writes_from: Timestamp,
-    outlets: Outlets,
-    payloads: Payloads,
+    /// Places of payloads in memory.
+    places: Arc<Semaphore>,
     closing: watch::Sender<bool>,
     state: Mutex<State>,
 }
@@ -95,21 +95,18 @@ struct State {
     purses: BTreeMap<Payer, Weak<Purse>>,
 }
 
-/// Names one queue. The token is named by its digest: the user that it claims could be anybody's.
+/// One holder of a token in a namespace.
 #[derive(Clone, Debug, PartialEq, Eq, PartialOrd, Ord)]
-struct Account {
+struct Holder<T> {
     server: String,
     namespace: String,
-    token: [u8; 32],
+    name: T,
 }
 
+/// Names one queue. The token is named by its digest: the user that it claims could be anybody's.
+type Account = Holder<[u8; 32]>;
 /// Names a budget. A claimed user counts within a namespace alone, so that no namespace slows another.
-#[derive(Clone, Debug, PartialEq, Eq, PartialOrd, Ord)]
-struct Payer {
-    server: String,
-    namespace: String,
-    user: String,
-}
+type Payer = Holder<String>;
 
 struct Entry {
     shared: Arc<Shared>,
@@ -119,28 +116,14 @@ struct Entry {
     task: Option<JoinHandle<Option<bool>>>,
 }
 
-impl Account {
-    fn of(target: &Target) -> Self {
+impl<T> Holder<T> {
+    fn of(target: &Target, name: T) -> Self {
         Self {
-            server: root(target),
+            server: target.api_server.trim_end_matches('/').to_owned(),
             namespace: target.leaderboard.namespace.clone(),
-            token: target.token.digest(),
+            name,
         }
     }
-}
-
-impl Payer {
-    fn of(target: &Target) -> Self {
-        Self {
-            server: root(target),
-            namespace: target.leaderboard.namespace.clone(),
-            user: target.token.claimed_user(),
-        }
-    }
-}
-
-fn root(target: &Target) -> String {
-    target.api_server.trim_end_matches('/').to_owned()
 }
 
 impl State {
@@ -150,7 +133,8 @@ impl State {
             .places
             .get(&target.leaderboard)
             .filter(|_| *key != target.leaderboard);
-        of_leaderboard.cloned().unwrap_or_else(|| Account::of(target))
+        let own = || Account::of(target, target.token.digest());
+        of_leaderboard.cloned().unwrap_or_else(own)
     }
 
     /// Puts an object into the queue of an account. Returns the one that it was in before, if that is another one.
@@ -166,7 +150,7 @@ impl State {
     /// The purse of a user, made if there is none.
     fn purse_of(&mut self, target: &Target, now: Now) -> Arc<Purse> {
         self.purses.retain(|_, purse| purse.strong_count() > 0);
-        let payer = Payer::of(target);
+        let payer = Payer::of(target, target.token.claimed_user());
         let known = self.purses.get(&payer).and_then(Weak::upgrade);
         let purse = known.unwrap_or_else(|| Purse::new(target.requests_per_minute, now.at));
         self.purses.insert(payer, Arc::downgrade(&purse));
@@ -207,16 +191,11 @@ impl Inner {
 impl Hub {
     /// A hub without any task yet.
     pub fn new(options: Options) -> Self {
-        let outlets = Outlets {
-            changed: options.changed.clone(),
-            sweep: options.sweep.clone(),
-        };
         Self(Arc::new(Inner {
             writes_from: wall(&options.clock, options.not_before),
-            payloads: Payloads::new(options.payloads.clone()),
-            options,
+            options: Arc::new(options),
             start: Instant::now(),
-            outlets,
+            places: Arc::new(Semaphore::new(PAYLOADS)),
             closing: watch::Sender::new(false),
             state: Mutex::default(),
         }))
@@ -283,7 +262,7 @@ impl Hub {
         let not_served = || InputError::Silent("EvalAI is not asked about the submission now".to_owned());
         let shared = self.place(&address.key).ok_or_else(not_served)?;
         let opened = match &address.url {
-            Some(url) => shared.files.open(url).await,
+            Some(url) => shared.client.files.open(url).await,
             None => Err(InputError::NoFile),
         };
         if matches!(opened, Err(InputError::Gone(_) | InputError::NoFile)) {
@@ -411,7 +390,7 @@ impl Hub {
         let shared = self.shared(key, target)?;
         let news = act(&mut shared.queue(), shared.now());
         if news {
-            shared.publish(&self.0.outlets);
+            shared.publish();
             shared.notify.notify_one();
         }
         Ok(())
@@ -452,21 +431,17 @@ impl Hub {
         let inner = &self.0;
         let options = &inner.options;
         let transport = (options.connect)(&target.api_server, options.timeouts)?;
-        let meter = options.meter.clone();
+        let (token, meter) = (target.token.clone(), options.meter.clone());
+        let client = Client::new(transport, &target.api_server, token, options.timeouts, meter);
         let (timing, now) = (options.timing, inner.now());
         let not_before = options.not_before.saturating_duration_since(inner.start);
         let share = state.purse_of(target, now).share(target.requests_per_minute, now.at);
         let queue = Queue::new(timing, share, not_before, now);
-        let (token, clock) = (target.token.clone(), options.clock.clone());
-        let files = Files::new(transport.clone(), options.timeouts);
-        let shared = Arc::new(Shared::new(queue, token, files, inner.start, clock));
+        let shared = Arc::new(Shared::new(queue, client, options.clone(), inner.start));
         let (weak, account) = (Arc::downgrade(inner), account.clone());
         let work = run(Task {
             shared: shared.clone(),
-            client: Client::new(transport, &target.api_server, options.timeouts, meter),
-            guard: options.write_guard.clone(),
-            payloads: inner.payloads.clone(),
-            outlets: inner.outlets.clone(),
+            places: inner.places.clone(),
             closing: inner.closing.subscribe(),
             is_unused: Box::new(move || weak.upgrade().is_none_or(|hub| hub.state().remove_unused(&account))),
         });

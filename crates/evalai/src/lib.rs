@@ -39,5 +39,5 @@ pub use row::Row;
 pub use transport::{Body, ClientError, Connect, Failure, Timeouts, Transport};
 pub use types::{
     Changed, DesiredUpdate, Ended, ImageAnswer, InboxTrouble, Key, Metrics, Outline, Payload, PayloadProblem,
-    PayloadReader, Publisher, Run, StoredResult, Subject, SubmissionState, SweepRow, Swept, Target, Usage, WriteGuard,
+    PayloadReader, Publisher, Run, StoredResult, Subject, SubmissionState, SweepRow, Swept, Target, Usage,
 };

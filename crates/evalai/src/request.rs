@@ -105,7 +105,7 @@ impl Request {
         }
     }
 
-    /// For metrics: the method and what it is about, without a submission's id.
+    /// For metrics and logs: the method and what it is about, without a submission's id.
     pub fn op(&self) -> &'static str {
         match self {
             Self::Get(_) => "get_submission",
@@ -129,31 +129,6 @@ impl Request {
             Self::Receive(_) => "receive_message",
             Self::MessageRow(_) => "get_message_row",
             Self::DeleteMessage(..) => "delete_message",
-        }
-    }
-
-    /// For logs.
-    pub fn name(&self) -> &'static str {
-        match self {
-            Self::Get(_) => "submission",
-            Self::Image(..) => "image",
-            Self::Progress(_, Progress::Queued, _) => "queued",
-            Self::Progress(_, Progress::Running, _) => "running",
-            Self::Partial(..) => "partial",
-            Self::Final(_, outcome, _) => outcome.as_str(),
-            Self::List { purpose, .. } => match purpose {
-                Purpose::Cancel => "list of cancelled",
-                Purpose::SweepSubmitted => "sweep of submitted",
-                Purpose::SweepResuming => "sweep of resuming",
-            },
-            Self::Phases(_) => "phases",
-            Self::Splits(_) => "splits",
-            Self::DatasetSplit(..) => "dataset split",
-            Self::PhaseSplit(..) => "phase split",
-            Self::Challenge(_) => "challenge",
-            Self::Receive(_) => "message",
-            Self::MessageRow(_) => "row of a message",
-            Self::DeleteMessage(..) => "deletion of a message",
         }
     }
 }

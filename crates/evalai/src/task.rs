@@ -7,16 +7,15 @@ use std::sync::{Arc, Mutex, MutexGuard};
 use std::time::Duration;
 
 use futures::stream::{FuturesUnordered, StreamExt};
-use tokio::sync::{Notify, Semaphore, mpsc, oneshot, watch};
+use tokio::sync::{Notify, Semaphore, oneshot, watch};
 use tokio::time::Instant;
 
 use super::answer::{Answer, Silence};
 use super::client::Client;
-use super::files::Files;
-use super::queue::{Next, Now, PAYLOADS, Place, Queue, Ticket};
+use super::hub::Options;
+use super::queue::{Next, Now, Place, Queue, Ticket};
 use super::request::{Reply, Request};
-use super::types::{Changed, Key, Outline, Payload, PayloadProblem, PayloadReader, SweepRow, WriteGuard};
-use crate::token::Token;
+use super::types::{Key, Outline, Payload, PayloadProblem};
 use leaderboard_base::clock::Clock;
 use leaderboard_base::lock::lock;
 
@@ -26,34 +25,24 @@ const DRAIN: Duration = Duration::from_secs(70);
 /// State that the hub and the task of one token share.
 pub(super) struct Shared {
     queue: Mutex<Queue>,
-    token: Arc<Token>,
-    /// Reads the files that the token's submissions have.
-    pub files: Files,
+    pub client: Client,
+    options: Arc<Options>,
     /// Notified of new updates and questions.
     pub notify: Notify,
     /// The queue's time counts from here.
     start: Instant,
-    clock: Clock,
     /// Waiters for the answers to requests that the queue makes for others, by their number.
     waiters: Mutex<HashMap<u64, oneshot::Sender<Reply>>>,
 }
 
-/// Where changes go.
-#[derive(Clone)]
-pub(super) struct Outlets {
-    pub changed: mpsc::UnboundedSender<Changed>,
-    pub sweep: mpsc::UnboundedSender<SweepRow>,
-}
-
 impl Shared {
-    pub fn new(queue: Queue, token: Arc<Token>, files: Files, start: Instant, clock: Clock) -> Self {
+    pub fn new(queue: Queue, client: Client, options: Arc<Options>, start: Instant) -> Self {
         Self {
             queue: Mutex::new(queue),
-            token,
-            files,
+            client,
+            options,
             notify: Notify::new(),
             start,
-            clock,
             waiters: Mutex::default(),
         }
     }
@@ -72,7 +61,7 @@ impl Shared {
 
     /// The moment on the queue's clock.
     pub fn now(&self) -> Now {
-        now(&self.clock, self.start)
+        now(&self.options.clock, self.start)
     }
 
     /// The queue. A panic elsewhere leaves it whole: every change of it is one call.
@@ -81,17 +70,17 @@ impl Shared {
     }
 
     /// Reports what has changed.
-    pub fn publish(&self, outlets: &Outlets) {
+    pub fn publish(&self) {
         let (changes, sweep, answers) = {
             let mut queue = self.queue();
             (queue.take_changes(), queue.take_sweep(), queue.take_answers())
         };
         // A listener that is gone has no use for it.
         for change in changes {
-            let _ = outlets.changed.send(change);
+            let _ = self.options.changed.send(change);
         }
         for row in sweep {
-            let _ = outlets.sweep.send(row);
+            let _ = self.options.sweep.send(row);
         }
         for (number, answer) in answers {
             if let Some(waiter) = lock(&self.waiters).remove(&number) {
@@ -109,35 +98,11 @@ pub(super) fn now(clock: &Clock, start: Instant) -> Now {
     }
 }
 
-/// Reads payloads, each once there is a place for it: all queues have as many as one may hold.
-#[derive(Clone)]
-pub(super) struct Payloads {
-    places: Arc<Semaphore>,
-    reader: PayloadReader,
-}
-
-impl Payloads {
-    pub fn new(reader: PayloadReader) -> Self {
-        Self {
-            places: Arc::new(Semaphore::new(PAYLOADS)),
-            reader,
-        }
-    }
-
-    async fn read(&self, key: Key, outline: Arc<Outline>) -> (Key, Result<(Payload, Place), PayloadProblem>) {
-        let place = self.places.clone().acquire_owned().await.ok();
-        let payload = (self.reader)(outline).await;
-        (key, payload.map(|payload| (payload, place)))
-    }
-}
-
 /// Parts of a task.
 pub(super) struct Task {
     pub shared: Arc<Shared>,
-    pub client: Client,
-    pub guard: Arc<dyn WriteGuard>,
-    pub payloads: Payloads,
-    pub outlets: Outlets,
+    /// Places of payloads in memory: all queues have as many as one may hold.
+    pub places: Arc<Semaphore>,
     pub closing: watch::Receiver<bool>,
     /// Asked when nothing is on its way: true, once, if nobody uses the token any more. Then it is not handed out again.
     pub is_unused: Box<dyn Fn() -> bool + Send + Sync>,
@@ -148,20 +113,17 @@ pub(super) struct Task {
 pub(super) async fn run(task: Task) -> bool {
     let Task {
         shared,
-        client,
-        guard,
-        payloads,
-        outlets,
+        places,
         mut closing,
         is_unused,
     } = task;
     let (mut in_flight, mut reads) = (FuturesUnordered::new(), FuturesUnordered::new());
     while !*closing.borrow() {
         let wait = loop {
-            let next = shared.queue().next(shared.now(), guard.may_write());
+            let next = shared.queue().next(shared.now(), (shared.options.write_guard)());
             match next {
-                Next::Send(ticket) => in_flight.push(send(&shared, &client, &*guard, ticket)),
-                Next::Read(key, outline) => reads.push(payloads.read(key, outline)),
+                Next::Send(ticket) => in_flight.push(send(&shared, ticket)),
+                Next::Read(key, outline) => reads.push(read(&shared, &places, key, outline)),
                 Next::Wait(until) => break until,
             }
         };
@@ -170,12 +132,12 @@ pub(super) async fn run(task: Task) -> bool {
             return true;
         }
         let wait = wait.into_iter().chain(settled_at).min();
-        shared.publish(&outlets);
+        shared.publish();
         let until = wait.map_or_else(|| Instant::now() + Duration::from_hours(1), |at| shared.start + at);
         tokio::select! {
             biased;
             _ = closing.changed() => {}
-            Some((ticket, reply)) = in_flight.next(), if !in_flight.is_empty() => take(&shared, &outlets, &ticket, reply),
+            Some((ticket, reply)) = in_flight.next(), if !in_flight.is_empty() => take(&shared, &ticket, reply),
             Some((key, payload)) = reads.next(), if !reads.is_empty() => {
                 shared.queue().took_payload(&key, payload, shared.now());
             }
@@ -185,38 +147,50 @@ pub(super) async fn run(task: Task) -> bool {
     }
     let answers = async {
         while let Some((ticket, reply)) = in_flight.next().await {
-            take(&shared, &outlets, &ticket, reply);
+            take(&shared, &ticket, reply);
         }
     };
     lock(&shared.waiters).clear();
     let all = tokio::time::timeout(DRAIN, answers).await.is_ok();
-    all && !shared.queue().is_unsure(shared.now())
+    all && shared.queue().settled_at(shared.now()).is_none()
+}
+
+/// Reads a payload once there is a place for it.
+async fn read(
+    shared: &Shared,
+    places: &Arc<Semaphore>,
+    key: Key,
+    outline: Arc<Outline>,
+) -> (Key, Result<(Payload, Place), PayloadProblem>) {
+    let place = places.clone().acquire_owned().await.ok();
+    let payload = (shared.options.payloads)(outline).await;
+    (key, payload.map(|payload| (payload, place)))
 }
 
 /// Sends one request, unless the guard forbids writes since it was chosen, or the read of a write is too old by now. None as reply: it was
 /// not sent.
-async fn send(shared: &Shared, client: &Client, guard: &dyn WriteGuard, ticket: Ticket) -> (Ticket, Option<Reply>) {
+async fn send(shared: &Shared, ticket: Ticket) -> (Ticket, Option<Reply>) {
     let write = ticket.request.is_write();
     let is_late = ticket.leave_by.is_some_and(|by| shared.now().at > by);
-    if write && (!guard.may_write() || is_late) {
+    if write && (!(shared.options.write_guard)() || is_late) {
         return (ticket, None);
     }
     let started = Instant::now();
-    let reply = client.send(&shared.token, &ticket.request).await;
+    let reply = shared.client.send(&ticket.request).await;
     log(&ticket, &reply.answer(), started.elapsed());
     (ticket, Some(reply))
 }
 
-fn take(shared: &Shared, outlets: &Outlets, ticket: &Ticket, reply: Option<Reply>) {
+fn take(shared: &Shared, ticket: &Ticket, reply: Option<Reply>) {
     match reply {
         Some(reply) => shared.queue().answered(ticket, reply, shared.now()),
         None => shared.queue().not_sent(ticket),
     }
-    shared.publish(outlets);
+    shared.publish();
 }
 
 fn log(ticket: &Ticket, answer: &Answer<()>, took: Duration) {
-    let request = ticket.request.name();
+    let request = ticket.request.op();
     let subject = ticket.request.submission();
     let _lines = subject.map(|subject| subject.log.span().entered());
     let milliseconds = u64::try_from(took.as_millis()).unwrap_or(u64::MAX);

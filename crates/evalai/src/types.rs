@@ -60,17 +60,9 @@ pub enum Metrics {
     Listed(Arc<BTreeMap<i64, Option<String>>>),
 }
 
-/// Answers, right before each write, whether this process still leads.
-pub trait WriteGuard: Send + Sync + 'static {
-    /// True while the lease was renewed less than 10 s ago, by a clock that counts pauses of the machine.
-    fn may_write(&self) -> bool;
-}
-
-impl<F: Fn() -> bool + Send + Sync + 'static> WriteGuard for F {
-    fn may_write(&self) -> bool {
-        self()
-    }
-}
+/// Answers, right before each write, whether this process still leads: true while the lease was renewed less than 10 s ago, by a clock that
+/// counts pauses of the machine.
+pub type WriteGuard = Arc<dyn Fn() -> bool + Send + Sync>;
 
 /// An attempt of a submission, and whom to ask about it.
 #[derive(Clone, Debug)]

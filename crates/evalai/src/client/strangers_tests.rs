@@ -2,6 +2,7 @@
 
 use std::sync::{Arc, Mutex};
 
+use jiff::Timestamp;
 use tokio::io::{AsyncReadExt, AsyncWriteExt};
 use tokio::net::TcpListener;
 
@@ -61,8 +62,7 @@ fn list() -> Request {
 }
 
 async fn send(server: &Server, request: &Request) -> Reply {
-    let client = over_network(&server.url);
-    client.send(&Token::parse("the-token").unwrap(), request).await
+    over_network(&server.url, "the-token").send(request).await
 }
 
 #[tokio::test]

@@ -3,6 +3,7 @@
 use std::sync::Arc;
 use std::sync::atomic::{AtomicUsize, Ordering};
 
+use jiff::Timestamp;
 use tokio::io::{AsyncReadExt, AsyncWriteExt};
 use tokio::net::{TcpListener, TcpStream};
 
@@ -14,10 +15,10 @@ use leaderboard_api::Attempt;
 use leaderboard_api::evalai_status::{Outcome, Progress};
 use leaderboard_base::spans::LogSpan;
 
-pub(super) fn over_network(url: &str) -> Client {
-    let timeouts = Timeouts::default();
+pub(super) fn over_network(url: &str, token: &str) -> Client {
+    let (timeouts, token) = (Timeouts::default(), Token::parse(token).unwrap());
     let network = Network::connect(url, timeouts).unwrap();
-    Client::new(network, url, timeouts, Meter::default())
+    Client::new(network, url, token.into(), timeouts, Meter::default())
 }
 
 /// Reads one request, with its body. False at the end of the connection.
@@ -79,8 +80,7 @@ async fn no_request_is_lost_on_a_connection_that_the_server_gives_up() {
     let url = format!("http://{}", listener.local_addr().unwrap());
     let reused = Arc::new(AtomicUsize::new(0));
     tokio::spawn(serve(listener, reused.clone()));
-    let client = over_network(&url);
-    let token = Token::parse("x").unwrap();
+    let client = over_network(&url, "x");
     let list = Request::List {
         challenge: 1,
         purpose: Purpose::Cancel,
@@ -95,8 +95,8 @@ async fn no_request_is_lost_on_a_connection_that_the_server_gives_up() {
         list,
     ];
     for request in requests {
-        let answer = client.send(&token, &request).await.answer();
-        assert_eq!(answer, Answer::Done(()), "{}", request.name());
+        let answer = client.send(&request).await.answer();
+        assert_eq!(answer, Answer::Done(()), "{}", request.op());
     }
     assert_eq!(reused.load(Ordering::SeqCst), 0);
 }
@@ -106,9 +106,9 @@ async fn a_write_to_a_server_that_is_not_there_was_not_sent() {
     let listener = TcpListener::bind("127.0.0.1:0").await.unwrap();
     let url = format!("http://{}", listener.local_addr().unwrap());
     drop(listener);
-    let client = over_network(&url);
+    let client = over_network(&url, "x");
     let write = Request::Progress(submission(), Progress::Queued, None);
-    let answer = client.send(&Token::parse("x").unwrap(), &write).await.answer();
+    let answer = client.send(&write).await.answer();
     assert!(
         matches!(&answer, Answer::Unanswered(silence) if !silence.sent),
         "{answer:?}"

@@ -12,7 +12,7 @@ use leaderboard_base::spans::LogSpan;
 use std::time::Duration;
 
 /// A hub that nobody listens to.
-fn hub(tasks: &Tasks, write_guard: impl WriteGuard) -> Hub {
+fn hub(tasks: &Tasks, write_guard: impl Fn() -> bool + Send + Sync + 'static) -> Hub {
     Hub::new(Options::unheard(tasks, write_guard))
 }
 

@@ -213,11 +213,6 @@ impl Queue {
         }
     }
 
-    /// True if a write was not answered and the server may still be working on it.
-    pub fn is_unsure(&self, now: Now) -> bool {
-        self.settled_at(now).is_some()
-    }
-
     /// When the server must have given up every write that was not answered; none if it has.
     pub fn settled_at(&self, now: Now) -> Option<Duration> {
         let holds = self.lanes.values().map(|lane| lane.hold_until);

@@ -16,12 +16,19 @@ use crate::token::Token;
 use leaderboard_base::meter::Meter;
 
 fn client(answers: impl Fn() -> BoxFuture<'static, Response<Body>> + Send + Sync + 'static) -> Client {
-    let server = server(move |_| answers());
-    Client::new(server, "https://evalai.example", Timeouts::default(), Meter::default())
+    let (server, token) = (server(move |_| answers()), Token::parse("x").unwrap());
+    let timeouts = Timeouts::default();
+    Client::new(
+        server,
+        "https://evalai.example",
+        token.into(),
+        timeouts,
+        Meter::default(),
+    )
 }
 
 async fn ask(client: &Client, request: request::Request) -> Answer<()> {
-    client.send(&Token::parse("x").unwrap(), &request).await.answer()
+    client.send(&request).await.answer()
 }
 
 fn read() -> request::Request {

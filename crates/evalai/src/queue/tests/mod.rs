@@ -25,6 +25,33 @@ use leaderboard_api::{Attempt, Order};
 use leaderboard_base::spans::LogSpan;
 use leaderboard_contract::report::{ContentId, Patience};
 
+impl Request {
+    /// Its name in these tests.
+    fn name(&self) -> &'static str {
+        match self {
+            Self::Get(_) => "submission",
+            Self::Image(..) => "image",
+            Self::Progress(_, Progress::Queued, _) => "queued",
+            Self::Progress(_, Progress::Running, _) => "running",
+            Self::Partial(..) => "partial",
+            Self::Final(_, outcome, _) => outcome.as_str(),
+            Self::List { purpose, .. } => match purpose {
+                Purpose::Cancel => "list of cancelled",
+                Purpose::SweepSubmitted => "sweep of submitted",
+                Purpose::SweepResuming => "sweep of resuming",
+            },
+            Self::Phases(_) => "phases",
+            Self::Splits(_) => "splits",
+            Self::DatasetSplit(..) => "dataset split",
+            Self::PhaseSplit(..) => "phase split",
+            Self::Challenge(_) => "challenge",
+            Self::Receive(_) => "message",
+            Self::MessageRow(_) => "row of a message",
+            Self::DeleteMessage(..) => "deletion of a message",
+        }
+    }
+}
+
 /// A queue whose time is ours.
 struct Bench {
     queue: Queue,
@@ -210,7 +237,7 @@ impl Bench {
 
     fn is_unsure(&mut self) -> bool {
         let now = self.now();
-        self.queue.is_unsure(now)
+        self.queue.settled_at(now).is_some()
     }
 
     fn view(&self, pk: i64) -> SubmissionState {
