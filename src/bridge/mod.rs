@@ -53,7 +53,7 @@ pub async fn run(clients: Clients, aws: Aws, scope: Scope, telemetry: Observabil
     telemetry.readiness.registered();
     // Prometheus sees no increase in a sample that begins with 1.
     for outcome in route::OUTCOMES {
-        telemetry.metrics.messages.total.of([outcome]);
+        telemetry.metrics.shared.messages.of([outcome]);
     }
     let aws = aws.counted_by(telemetry.metrics.meter());
     let pulse = Arc::new(pulse(&shared));

@@ -60,7 +60,7 @@ pub async fn read(shared: Arc<Shared>, hub: Hub, operator: String) {
     let metrics = Arc::clone(&shared.telemetry.metrics);
     let open = |_: &str, way: &Way| {
         for outcome in OUTCOMES {
-            metrics.messages.total.of([outcome]);
+            metrics.shared.messages.of([outcome]);
         }
         Inbox {
             way: way.clone(),

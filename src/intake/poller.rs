@@ -19,6 +19,7 @@ use super::leaderboards::Leaderboards;
 use super::shared::Shared;
 use super::source::{Received, Source, named};
 use crate::kubernetes::call_within;
+use crate::metrics::Metrics;
 use leaderboard_api::text::one_line;
 use leaderboard_api::{Leaderboard, Reason};
 use leaderboard_base::backoff::Backoff;
@@ -96,7 +97,7 @@ impl<S: Source> Poller<S> {
             }
             let _ = tokio::time::timeout(pause, self.stop.wait_for(|stop| *stop)).await;
         }
-        self.shared.telemetry.metrics.set_oldest_message(&self.queue, None);
+        self.metrics().set_oldest_message(&self.queue, None);
     }
 
     /// It was stopped, or what stops it is gone.
@@ -130,9 +131,12 @@ impl<S: Source> Poller<S> {
         self.show_oldest();
     }
 
+    fn metrics(&self) -> &Metrics {
+        &self.shared.telemetry.metrics
+    }
+
     fn show_oldest(&self) {
-        let oldest = self.ages.oldest_ms();
-        self.shared.telemetry.metrics.set_oldest_message(&self.queue, oldest);
+        self.metrics().set_oldest_message(&self.queue, self.ages.oldest_ms());
     }
 
     async fn receive(&mut self) -> Result<Vec<Received>, String> {
@@ -167,13 +171,7 @@ impl<S: Source> Poller<S> {
             if let MessageOutcome::Dead(reason) = &outcome {
                 outcome = self.set_aside(message, reason, &readers).await;
             }
-            self.shared
-                .telemetry
-                .metrics
-                .messages
-                .total
-                .of([outcome.as_str()])
-                .inc();
+            self.metrics().shared.messages.of([outcome.as_str()]).inc();
             match outcome {
                 MessageOutcome::Delete(_) | MessageOutcome::Dead(_) => deletes.push(message),
                 MessageOutcome::Later { seconds, why } => {
@@ -268,12 +266,7 @@ impl<S: Source> Poller<S> {
             Ok(Outcome::Created | Outcome::Bumped(_)) => {
                 let waited = self.now_ms().saturating_sub(incoming.sent_ms);
                 let waited = Duration::from_millis(u64::try_from(waited).unwrap_or_default());
-                self.shared
-                    .telemetry
-                    .metrics
-                    .messages
-                    .wait
-                    .observe(waited.as_secs_f64());
+                self.metrics().shared.message_wait.observe(waited.as_secs_f64());
             }
             Ok(Outcome::Repeat | Outcome::NotNew) => {
                 tracing::debug!("a repeat");

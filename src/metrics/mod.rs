@@ -52,8 +52,6 @@ pub struct Metrics {
     pub shared: Shared,
     pub work: Work,
     pub submissions: Submissions,
-    pub evalai: Evalai,
-    pub messages: Messages,
 }
 
 /// Counted by controller and bridge.
@@ -65,6 +63,8 @@ pub struct Shared {
     pub cloud_calls: Counters<3>,
     pub cloud_call_duration: Timings<2>,
     oldest_message: Gauges<1>,
+    pub messages: Counters<1>,
+    pub message_wait: Histogram,
 }
 
 impl Shared {
@@ -92,6 +92,15 @@ impl Shared {
                 ["queue"],
                 "Unix time of the oldest message that was received and is not deleted; absent without one. `queue` is an SQS URL, or server and name in EvalAI, where a row's last request to run counts",
             ),
+            messages: r.counters(
+                "queue_messages",
+                ["outcome"],
+                "Messages by outcome, those of EvalAI's own queues in the controller that leads",
+            ),
+            message_wait: r.days(
+                "queue_message_wait_duration_seconds",
+                "Time from sending a message to the Submission that it made or resumed",
+            ),
         }
     }
 }
@@ -105,6 +114,8 @@ pub struct Work {
     pub reconcile_errors: Counters<2>,
     pub lease_errors: Counters<1>,
     pub spans: Counters<1>,
+    pub evalai_requests: Counters<2>,
+    pub evalai_duration: Timings<1>,
 }
 
 impl Work {
@@ -127,6 +138,16 @@ impl Work {
                 "trace_spans",
                 ["outcome"],
                 "Spans by outcome: `sent`, `failed` where the collector did not take them, `dropped` where too many waited",
+            ),
+            evalai_requests: r.counters(
+                "evalai_requests",
+                ["op", "outcome"],
+                "Requests to EvalAI by operation and outcome",
+            ),
+            evalai_duration: r.timings(
+                "evalai_request_duration_seconds",
+                ["op"],
+                "Duration of requests to EvalAI",
             ),
         }
     }
@@ -192,53 +213,6 @@ impl Submissions {
     }
 }
 
-/// Requests to EvalAI.
-#[derive(Debug)]
-pub struct Evalai {
-    pub requests: Counters<2>,
-    pub duration: Timings<1>,
-}
-
-impl Evalai {
-    fn new(r: &mut Families<'_>) -> Self {
-        Self {
-            requests: r.counters(
-                "evalai_requests",
-                ["op", "outcome"],
-                "Requests to EvalAI by operation and outcome",
-            ),
-            duration: r.timings(
-                "evalai_request_duration_seconds",
-                ["op"],
-                "Duration of requests to EvalAI",
-            ),
-        }
-    }
-}
-
-/// The messages of the queues.
-#[derive(Debug)]
-pub struct Messages {
-    pub total: Counters<1>,
-    pub wait: Histogram,
-}
-
-impl Messages {
-    fn new(r: &mut Families<'_>) -> Self {
-        Self {
-            total: r.counters(
-                "queue_messages",
-                ["outcome"],
-                "Messages by outcome, those of EvalAI's own queues in the controller that leads",
-            ),
-            wait: r.days(
-                "queue_message_wait_duration_seconds",
-                "Time from sending a message to the Submission that it made or resumed",
-            ),
-        }
-    }
-}
-
 impl Default for Metrics {
     fn default() -> Self {
         Self::new(Program::Controller)
@@ -252,8 +226,8 @@ impl Metrics {
         Meter::new(move |call| {
             let (service, op, outcome, took) = (call.service, call.op, call.outcome, call.took.as_secs_f64());
             if service == "evalai" {
-                metrics.evalai.requests.of([op, outcome]).inc();
-                metrics.evalai.duration.of([op]).observe(took);
+                metrics.work.evalai_requests.of([op, outcome]).inc();
+                metrics.work.evalai_duration.of([op]).observe(took);
             } else {
                 metrics.shared.cloud_calls.of([service, op, outcome]).inc();
                 metrics.shared.cloud_call_duration.of([service, op]).observe(took);
@@ -269,7 +243,6 @@ impl Metrics {
         let build = Info::new([("version", env!("CARGO_PKG_VERSION")), ("revision", REVISION)]);
         both.register("build", "The running program", build);
         let shared = Shared::new(&mut Families(both));
-        let messages = Messages::new(&mut Families(both));
         let controller = match program {
             Program::Controller => both,
             Program::Bridge => &mut unexported,
@@ -282,8 +255,6 @@ impl Metrics {
             shared,
             work: Work::new(&mut controller),
             submissions: Submissions::new(&mut controller),
-            evalai: Evalai::new(&mut controller),
-            messages,
             registry,
         }
     }

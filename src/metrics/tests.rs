@@ -30,13 +30,17 @@ fn all(program: Program) -> Metrics {
     let failure = ["ns/board", "Participant", "AgentCrashed"];
     metrics.submissions.failures.of(failure).inc();
     metrics.submissions.phases.of(["run"]).observe(3000.0);
-    metrics.evalai.requests.of(["put_finished", "ok"]).inc();
-    metrics.evalai.duration.of(["put_finished"]).observe(ms.as_secs_f64());
+    metrics.work.evalai_requests.of(["put_finished", "ok"]).inc();
+    metrics
+        .work
+        .evalai_duration
+        .of(["put_finished"])
+        .observe(ms.as_secs_f64());
     metrics.shared.cloud_calls.of(["s3", "GetObject", "ok"]).inc();
     let duration = metrics.shared.cloud_call_duration.of(["s3", "GetObject"]);
     duration.observe(second.as_secs_f64());
-    metrics.messages.total.of(["created"]).inc();
-    metrics.messages.wait.observe(2.0);
+    metrics.shared.messages.of(["created"]).inc();
+    metrics.shared.message_wait.observe(2.0);
     metrics
 }
 
