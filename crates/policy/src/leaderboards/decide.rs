@@ -11,8 +11,8 @@ use super::view::{Claims, EvalaiStanding, Policy, Unreachable, previous_controll
 use leaderboard_api::conditions::{self, Truth};
 use leaderboard_api::leaderboard::Counts;
 use leaderboard_api::{
-    CarlaShape, ContainerShape, Evalai, EvalaiUse, Leaderboard, LeaderboardStatus, Reason, ResourceExt, TableUse,
-    TeamUse, Track, TrackStatus, effective, names,
+    CarlaShape, ContainerShape, Evalai, EvalaiUse, Leaderboard, LeaderboardStatus, Reason, ResourceExt, S3Bucket,
+    TableUse, TeamUse, Track, TrackStatus, effective, names,
 };
 use leaderboard_contract::verdict::WorkspaceVerdict;
 
@@ -88,7 +88,8 @@ pub fn decide(view: &LeaderboardView) -> LeaderboardPlan {
     status.counts = Some(view.counts);
     status.gpu_use.clone_from(&view.gpu_use);
     status.evalai = view.usage.clone().filter(|_| view.refusal.is_none());
-    status.table = view.rows_waiting.filter(|waiting| *waiting > 0).map(table_use);
+    let waiting = view.rows_waiting.filter(|waiting| *waiting > 0).map(number);
+    status.table = waiting.map(|waiting| TableUse { waiting });
     status.tracks = tracks(view);
     let now = Time(view.now);
     let set = |status: &mut LeaderboardStatus, type_, (truth, reason, message): (Truth, Reason, String)| {
@@ -117,10 +118,8 @@ pub fn decide(view: &LeaderboardView) -> LeaderboardPlan {
     LeaderboardPlan { status, finalizer }
 }
 
-fn table_use(waiting: usize) -> TableUse {
-    TableUse {
-        waiting: i32::try_from(waiting).unwrap_or(i32::MAX),
-    }
+fn number(count: usize) -> i32 {
+    i32::try_from(count).unwrap_or(i32::MAX)
 }
 
 /// Message for a Leaderboard that is being deleted and still in use. Its NetworkPolicy goes with it, and has to outlive the last Pod.
@@ -245,50 +244,38 @@ fn evalai(standing: &EvalaiStanding) -> (Truth, Reason, String) {
 fn phase_conflict(view: &LeaderboardView) -> Option<String> {
     let mine = &view.leaderboard;
     let server = server(mine)?;
-    let phases: Vec<i64> = mine.spec.tracks.iter().filter_map(|t| t.phase).collect();
-    let others = others(view).filter(|l| self::server(l).as_deref() == Some(server.as_str()) && is_older(l, mine));
-    others
-        .filter(|l| {
-            l.spec
-                .tracks
-                .iter()
-                .any(|t| t.phase.is_some_and(|p| phases.contains(&p)))
-        })
-        .map(|l| qualified(l))
-        .next()
+    let phases = |l: &Leaderboard| -> Vec<i64> { l.spec.tracks.iter().filter_map(|t| t.phase).collect() };
+    let ours = phases(mine);
+    let serves_ours = |l: &Leaderboard| phases(l).iter().any(|phase| ours.contains(phase));
+    let mut older = older(view).filter(|l| self::server(l).as_ref() == Some(&server));
+    older.find(|l| serves_ours(l)).map(|l| qualified(l))
 }
 
 /// An older Leaderboard below whose prefix ours could come upon runs that it takes for its own: ids of runs are unique in one namespace
 /// for one server.
 fn prefix_conflict(view: &LeaderboardView) -> Option<String> {
     let mine = &view.leaderboard;
-    let place = |l: &Leaderboard| {
-        (
-            l.spec.storage.s3.bucket.clone(),
-            l.spec.storage.s3.prefix.clone(),
-            l.spec.storage.s3.endpoint.clone(),
-        )
+    let ours = &mine.spec.storage.s3;
+    let is_same_place = |theirs: &S3Bucket| {
+        theirs.bucket == ours.bucket && theirs.prefix == ours.prefix && theirs.endpoint == ours.endpoint
     };
-    let others = others(view).filter(|l| place(l) == place(mine) && is_older(l, mine));
-    let foreign = |l: &&Arc<Leaderboard>| {
+    let is_foreign = |l: &Leaderboard| {
         let is_of_other_server = matches!((server(l), server(mine)), (Some(a), Some(b)) if a != b);
         is_of_other_server || l.namespace() != mine.namespace()
     };
-    others.filter(|l| foreign(l)).map(|l| qualified(l)).next()
+    let mut older = older(view).filter(|l| is_same_place(&l.spec.storage.s3));
+    older.find(|l| is_foreign(l)).map(|l| qualified(l))
 }
 
-fn others(view: &LeaderboardView) -> impl Iterator<Item = &Arc<Leaderboard>> {
-    view.all
-        .iter()
-        .filter(|l| l.uid() != view.leaderboard.uid() && l.metadata.deletion_timestamp.is_none())
+/// The older Leaderboards that are to stay.
+fn older(view: &LeaderboardView) -> impl Iterator<Item = &Arc<Leaderboard>> {
+    let ours = view.leaderboard.seniority();
+    let others = view.all.iter().filter(|l| l.uid() != view.leaderboard.uid());
+    others.filter(move |l| l.metadata.deletion_timestamp.is_none() && l.seniority() < ours)
 }
 
 fn server(leaderboard: &Leaderboard) -> Option<String> {
     leaderboard.spec.evalai.as_ref().map(Evalai::server)
-}
-
-fn is_older(one: &Leaderboard, other: &Leaderboard) -> bool {
-    one.seniority() < other.seniority()
 }
 
 fn qualified(leaderboard: &Leaderboard) -> String {
@@ -301,7 +288,6 @@ fn qualified(leaderboard: &Leaderboard) -> String {
 
 fn tracks(view: &LeaderboardView) -> Vec<TrackStatus> {
     let leaderboard = view.leaderboard.as_ref();
-    let number = |count| i32::try_from(count).unwrap_or(i32::MAX);
     let status = |track: &Track| {
         let evaluation = &leaderboard.spec.evaluation;
         let carla = evaluation.carla().map(|carla| effective::shape(carla, track));

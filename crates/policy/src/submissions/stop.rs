@@ -88,32 +88,29 @@ fn stopping_since(draft: &mut PlanBuilder<'_>) -> Timestamp {
 
 fn show(draft: &mut PlanBuilder<'_>) {
     let failure = draft.status.failure.as_deref().filter(|_| !draft.is_cancelled());
-    let message = match failure {
-        Some(failure) if failure.reason == Reason::NodeLost => {
-            let what = failure.message.clone();
-            return draft.replacing(&what);
-        }
-        Some(failure) if is_interruption(failure) => {
-            let what = format!(
-                "{} Its results are being stored; a new Job resumes from them.",
-                failure.message
-            );
-            return draft.replacing(&what);
-        }
-        Some(failure) => format!(
-            "{} The run is being stopped; completed {} are kept.",
-            failure.message,
-            draft.words().units
+    let what = failure.map_or("", |failure| failure.message.as_str());
+    let (units, wanted) = (draft.words().units, draft.spec().attempt);
+    let (is_replaced, message) = match failure {
+        Some(failure) if failure.reason == Reason::NodeLost => (true, what.to_owned()),
+        Some(failure) if is_interruption(failure) => (
+            true,
+            format!("{what} Its results are being stored; a new Job resumes from them."),
         ),
-        None if draft.is_cancelled() => format!("Stopping as requested; completed {} are kept.", draft.words().units),
-        None => {
-            let wanted = draft.spec().attempt;
-            let what =
-                format!("The run stops for attempt {wanted}, which resumes from its results; they are being stored.");
-            return draft.replacing(&what);
-        }
+        Some(_) => (
+            false,
+            format!("{what} The run is being stopped; completed {units} are kept."),
+        ),
+        None if draft.is_cancelled() => (false, format!("Stopping as requested; completed {units} are kept.")),
+        None => (
+            true,
+            format!("The run stops for attempt {wanted}, which resumes from its results; they are being stored."),
+        ),
     };
-    draft.show(Reason::Stopping, message);
+    if is_replaced {
+        draft.replacing(&message);
+    } else {
+        draft.show(Reason::Stopping, message);
+    }
 }
 
 fn annotate(draft: &mut PlanBuilder<'_>, pod: &PodView) {
