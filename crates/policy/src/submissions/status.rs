@@ -189,20 +189,15 @@ impl<'a> PlanBuilder<'a> {
     /// be stopped before. True if what this reconcile has read is of another attempt and can't be used.
     pub(super) fn begin_attempt(&mut self) -> bool {
         let wanted = self.spec().attempt;
-        match self.status.attempt {
-            None => {
-                self.start_status(wanted);
-                self.show_unannounced(wanted);
-                // Without a status the world was seen as the first attempt's.
-                wanted != Attempt::FIRST
-            }
-            Some(_) if self.is_followed() && (self.is_finished() || self.is_without_job()) => {
-                self.start_status(wanted);
-                self.show_unannounced(wanted);
-                true
-            }
-            Some(_) => false,
+        let is_first = self.status.attempt.is_none();
+        let is_next = self.is_followed() && (self.is_finished() || self.is_without_job());
+        if !is_first && !is_next {
+            return false;
         }
+        self.start_status(wanted);
+        self.show_unannounced(wanted);
+        // Without a status the world was seen as the first attempt's.
+        !is_first || wanted != Attempt::FIRST
     }
 
     /// True if nothing of the attempt is there that could be stopped.
