@@ -2,7 +2,7 @@
 
 use super::bridge::StandIn;
 use leaderboard_api::SecretsManagerKey;
-use leaderboard_evalai::token::{Scheme, TokenError};
+use leaderboard_evalai::token::TokenError;
 use leaderboard_operator::leaderboards::token::of_entry;
 
 impl StandIn {
@@ -31,7 +31,7 @@ async fn it_is_read_from_a_key_of_the_entry() {
     let token = of_entry(&stand_in.aws, &stand_in.token("evalai", "auth_token"))
         .await
         .unwrap();
-    assert_eq!((token.scheme(), token.expires()), (Scheme::Token, None));
+    assert_eq!((token.scheme(), token.expires()), ("Token", None));
 }
 
 #[tokio::test]

@@ -1,7 +1,6 @@
-//! Tokens of EvalAI: where they are kept, what kind they are, when they end.
+//! Tokens of EvalAI: what kind they are, when they end, why there is none.
 //!
-//! Called by the controller, which hands a [`Token`] to `services::evalai`. Knows Secrets Manager and the text of a
-//! token; it reads no Kubernetes Secret itself and never shows a token's value.
+//! Called by the controller, which reads Secrets and hands a [`Token`] to `hub`. Knows the text of a token and never shows its value.
 
 use std::fmt;
 
@@ -14,19 +13,15 @@ use sha2::{Digest, Sha256};
 /// How long before its end a token's renewal is asked for.
 const WARN_BEFORE: SignedDuration = SignedDuration::from_hours(30 * 24);
 
-/// The scheme before the token in the `Authorization` header.
-#[derive(Clone, Copy, Debug, PartialEq, Eq)]
-pub enum Scheme {
-    /// A JWT refresh token, as EvalAI's profile page gives it.
-    Bearer,
-    /// A key of 40 hexadecimal digits, as EvalAI's login gives it.
-    Token,
-}
+/// Before a JWT refresh token, as EvalAI's profile page gives it.
+const BEARER: &str = "Bearer";
+/// Before a key of 40 hexadecimal digits, as EvalAI's login gives it.
+const TOKEN: &str = "Token";
 
 /// A token that can be sent. Its value appears in no `Debug` and no message.
 #[derive(Clone, PartialEq, Eq)]
 pub struct Token {
-    scheme: Scheme,
+    scheme: &'static str,
     value: String,
     expires: Option<Timestamp>,
     user: Option<String>,
@@ -59,10 +54,10 @@ impl Token {
     pub fn parse(text: &str) -> Result<Self, TokenError> {
         let text = text.trim();
         let value = match text.split_once(char::is_whitespace) {
-            Some(("Bearer" | "Token", value)) => value.trim(),
+            Some((BEARER | TOKEN, value)) => value.trim(),
             _ => text,
         };
-        if value.is_empty() || matches!(value, "Bearer" | "Token") {
+        if value.is_empty() || matches!(value, BEARER | TOKEN) {
             return Err(TokenError::Empty);
         }
         if !value.bytes().all(|byte| byte.is_ascii_graphic()) {
@@ -83,24 +78,21 @@ impl Token {
             _ => None,
         };
         Ok(Self {
-            scheme: if is_key { Scheme::Token } else { Scheme::Bearer },
+            scheme: if is_key { TOKEN } else { BEARER },
             value: value.into(),
             expires,
             user,
         })
     }
 
-    /// The scheme before it.
-    pub fn scheme(&self) -> Scheme {
+    /// The scheme before it in the `Authorization` header.
+    pub fn scheme(&self) -> &'static str {
         self.scheme
     }
 
     /// The value of the `Authorization` header.
     pub(crate) fn header(&self) -> String {
-        match self.scheme {
-            Scheme::Bearer => format!("Bearer {}", self.value),
-            Scheme::Token => format!("Token {}", self.value),
-        }
+        format!("{} {}", self.scheme, self.value)
     }
 
     /// When it ends, if it holds that.
@@ -167,19 +159,19 @@ mod tests {
     fn the_scheme_follows_from_the_value() {
         let key = "0123456789abcdef0123456789ABCDEF01234567";
         for (text, scheme, header) in [
-            (key.to_owned(), Scheme::Token, format!("Token {key}")),
-            (format!("Token {key}\n"), Scheme::Token, format!("Token {key}")),
+            (key.to_owned(), TOKEN, format!("Token {key}")),
+            (format!("Token {key}\n"), TOKEN, format!("Token {key}")),
             (
                 "local-host-token".to_owned(),
-                Scheme::Bearer,
+                BEARER,
                 "Bearer local-host-token".to_owned(),
             ),
             (
                 " Bearer local-host-token ".to_owned(),
-                Scheme::Bearer,
+                BEARER,
                 "Bearer local-host-token".to_owned(),
             ),
-            (key[1..].to_owned(), Scheme::Bearer, format!("Bearer {}", &key[1..])),
+            (key[1..].to_owned(), BEARER, format!("Bearer {}", &key[1..])),
         ] {
             let token = Token::parse(&text).unwrap();
             assert_eq!((token.scheme(), token.header()), (scheme, header), "{text:?}");
@@ -233,6 +225,6 @@ mod tests {
     #[test]
     fn the_value_is_in_no_debug() {
         let token = Token::parse("local-host-token").unwrap();
-        assert_eq!(format!("{token:?}"), "Token { scheme: Bearer, expires: None, .. }");
+        assert_eq!(format!("{token:?}"), r#"Token { scheme: "Bearer", expires: None, .. }"#);
     }
 }
