@@ -307,10 +307,7 @@ impl Tree {
             return Err(TreeError::Path);
         }
         let folder = self.folder(folder)?;
-        match unlinkat(&folder, name, UnlinkatFlags::NoRemoveDir) {
-            Ok(()) | Err(Errno::ENOENT) => {}
-            Err(errno) => return Err(errno.into()),
-        }
+        unlink(&folder, name)?;
         let flags = OFlag::O_WRONLY | OFlag::O_CREAT | OFlag::O_EXCL | OFlag::O_NOFOLLOW | OFlag::O_CLOEXEC;
         let mode = Mode::from_bits_truncate(0o666);
         let file = openat(&folder, name, flags, mode)?;
@@ -318,11 +315,11 @@ impl Tree {
         Ok(file.into())
     }
 
-    /// Removes a file.
+    /// Removes a file, if there is one.
     pub fn remove(&self, relative: &str) -> Result<(), TreeError> {
         let (folder, name) = relative.rsplit_once('/').ok_or(TreeError::Path)?;
         let folder = self.at(folder, OFlag::O_RDONLY | OFlag::O_DIRECTORY)?;
-        Ok(unlinkat(&folder, name, UnlinkatFlags::NoRemoveDir)?)
+        unlink(&folder, name)
     }
 
     /// Writes one of our own files under another name first, so that no reader gets half of it.
@@ -401,6 +398,13 @@ impl Stamp {
             mtime: (stat.st_mtime, stat.st_mtime_nsec),
             inode: stat.st_ino,
         }
+    }
+}
+
+fn unlink(folder: &OwnedFd, name: &str) -> Result<(), TreeError> {
+    match unlinkat(folder, name, UnlinkatFlags::NoRemoveDir) {
+        Ok(()) | Err(Errno::ENOENT) => Ok(()),
+        Err(errno) => Err(errno.into()),
     }
 }
 

@@ -11,7 +11,6 @@ use std::os::unix::fs::PermissionsExt;
 
 use sha2::{Digest, Sha256};
 
-use super::blocking;
 use super::places::Places;
 use leaderboard_api::InputBounds;
 use leaderboard_api::text::one_line;
@@ -30,12 +29,9 @@ const PIECE: usize = 256 << 10;
 /// Characters of a path in a sentence: the containers of a Pod share 12 KiB for their termination messages.
 const SHOWN: usize = 60;
 
-/// Why there are no files for the evaluators.
+/// Why there are no files for the evaluators, and what to do.
 #[derive(thiserror::Error, Debug)]
 pub enum CollectError {
-    /// The files that the agent has left.
-    #[error(transparent)]
-    Refused(#[from] Refusal),
     /// A file below the volume's root.
     #[error("{path} on the logs volume can't be used: {error}. Look at the node's disk and the Pod's volumes.")]
     Volume {
@@ -44,12 +40,7 @@ pub enum CollectError {
         /// The system's own text.
         error: TreeError,
     },
-}
-
-/// Why the files of an agent are not taken, and what to do.
-#[derive(thiserror::Error, Clone, Debug, PartialEq, Eq)]
-pub enum Refusal {
-    /// There is none.
+    /// The agent has left none.
     #[error("The agent has left no file in /submission; have it write one there before it ends, and submit again.")]
     Nothing,
     /// One that is no plain file.
@@ -93,8 +84,10 @@ impl CollectError {
     /// For the termination message.
     pub fn verdict(&self) -> WorkspaceVerdict {
         let reason = match self {
-            Self::Refused(_) => WorkspaceReason::InputRefused,
             Self::Volume { .. } => WorkspaceReason::VolumeFailed,
+            Self::Nothing | Self::File { .. } | Self::TooMany { .. } | Self::TooLarge { .. } => {
+                WorkspaceReason::InputRefused
+            }
         };
         WorkspaceVerdict::new(reason, self.to_string())
     }
@@ -109,10 +102,8 @@ pub async fn main(run: Run, places: Places) -> Result<(), CollectError> {
         }
         collected
     };
-    blocking(work)
-        .await
-        .map_err(|error| volume("/", error.into()))
-        .flatten()
+    let done = tokio::task::spawn_blocking(work).await;
+    done.map_err(|error| volume("/", io::Error::other(error).into()))?
 }
 
 fn collect(run: &Run, places: &Places) -> Result<(), CollectError> {
@@ -138,7 +129,7 @@ fn collect(run: &Run, places: &Places) -> Result<(), CollectError> {
             Ok(())
         }
         // The list says that there were some, here or in a Pod before this one.
-        Err(CollectError::Refused(Refusal::Nothing)) if noted.is_some() => {
+        Err(CollectError::Nothing) if noted.is_some() => {
             Err(volume(INPUT, io::Error::other("copied files are gone").into()))
         }
         Err(error) => {
@@ -192,26 +183,26 @@ fn find(tree: &Tree, bounds: &InputBounds) -> Result<BTreeMap<String, Stamp>, Co
         rest.and_then(|rest| rest.strip_prefix('/')).unwrap_or(path).to_owned()
     };
     if let Some((path, why)) = &walk.first {
-        let why_not = io::Error::other(why.to_string());
         return Err(if why.is_the_writers() {
-            refused(&below(path), &why_not)
+            refused(&below(path), why)
         } else {
-            volume(path, why_not.into())
+            volume(path, io::Error::other(*why).into())
         });
     }
     let files: BTreeMap<String, Stamp> = walk.files.iter().map(|(path, stamp)| (below(path), *stamp)).collect();
     let (found, limit) = (files.len(), most_files(bounds));
     if found == 0 {
-        return Err(Refusal::Nothing.into());
+        return Err(CollectError::Nothing);
     }
     if found > limit {
-        return Err(Refusal::TooMany { found, limit }.into());
+        return Err(CollectError::TooMany { found, limit });
     }
     let limit = bounds.max_bytes.bytes();
     let mut left = limit;
     for (path, stamp) in &files {
         let (file, size) = (one_line(path, SHOWN), stamp.size);
-        left = left.checked_sub(size).ok_or(Refusal::TooLarge { file, size, limit })?;
+        let after = left.checked_sub(size);
+        left = after.ok_or(CollectError::TooLarge { file, size, limit })?;
     }
     Ok(files)
 }
@@ -230,10 +221,7 @@ fn copy_all(tree: &Tree, files: &BTreeMap<String, Stamp>) -> Result<Collected, C
 
 /// Removes the list, and then the copies.
 pub(crate) fn forget(tree: &Tree) -> Result<(), (&'static str, TreeError)> {
-    match tree.remove(COLLECTED) {
-        Err(TreeError::Io(error)) if error.kind() == io::ErrorKind::NotFound => {}
-        removed => removed.map_err(|error| (COLLECTED, error))?,
-    }
+    tree.remove(COLLECTED).map_err(|error| (COLLECTED, error))?;
     let cleared = tree.clear(INPUT.trim_end_matches('/'));
     cleared.map_err(|error| (INPUT, error))
 }
@@ -306,7 +294,7 @@ fn unreadable(path: &str, error: TreeError) -> CollectError {
 
 fn refused(path: &str, why: &dyn std::error::Error) -> CollectError {
     let (file, why) = (one_line(path, SHOWN), why.to_string());
-    Refusal::File { file, why }.into()
+    CollectError::File { file, why }
 }
 
 fn volume(path: &str, error: TreeError) -> CollectError {

@@ -167,7 +167,7 @@ fn watch_stop(places: Places, tasks: &Tasks) -> (watch::Receiver<Option<Stop>>, 
 /// Creates one of logcopy's own status files, for which the other containers wait. Returns whether it is there.
 async fn create(file: StatusFile, status: &Path) -> bool {
     let folder = status.to_owned();
-    let created = blocking(move || file.create(&folder)).await.flatten();
+    let created = blocking(move || file.create(&folder)).await;
     if let Err(error) = &created {
         tracing::error!("{} can't be written: {error}", file.name());
     }

@@ -206,7 +206,7 @@ impl Shipper {
         let mark = self.note.marks.get(path).copied().unwrap_or_default();
         // A file that can't be read is the uploader's to complain about.
         let (tree, file) = (Arc::clone(&self.tree), path.to_owned());
-        let Ok(Ok(Some((bytes, mark)))) = blocking(move || next(&tree, &file, mark)).await else {
+        let Ok(Some((bytes, mark))) = blocking(move || next(&tree, &file, mark)).await else {
             return Ok(false);
         };
         let is_full = bytes.len() as u64 == CHUNK;
@@ -314,11 +314,11 @@ impl Shipper {
 
     async fn write_note(&self) {
         let (note, tree) = (self.note.clone(), Arc::clone(&self.tree));
-        let write = move || {
+        let write = move || -> Result<(), TreeError> {
             let bytes = serde_json::to_vec(&note).map_err(std::io::Error::other)?;
             tree.write(NOTE, &bytes)
         };
-        if let Err(error) = blocking(write).await.map_err(TreeError::from).flatten() {
+        if let Err(error) = blocking(write).await {
             tracing::warn!("how far logs were sent can't be noted down: {error}");
         }
     }

@@ -132,7 +132,7 @@ pub async fn main(setting: Setting) -> Result<(), WorkspaceError> {
 
 async fn measure_and_prepare(setting: &Setting) -> Result<Option<Finding>, WorkspaceError> {
     let plan = &setting.run.plan;
-    of_plan(&setting.run.plan).check(&setting.run)?;
+    of_plan(plan).check(&setting.run)?;
     let finding = measure(setting).await?;
     let aws = identity::aws(setting, "workspace").await;
     prepare(setting, &Archive::of_run(&aws, &plan.storage.s3, &plan.run_id)).await?;
@@ -183,34 +183,23 @@ async fn take(setting: &Setting, archive: &Archive, tree: &Arc<Tree>) -> Result<
     let run = &setting.run;
     let mut results = of_plan(&run.plan).results(run, Arc::clone(tree))?;
     let owner = Owner::new(setting.pod_uid.clone()).to_json();
-    match claim(run, archive).await? {
-        Claim::Fresh(of_nobody) => {
-            // Before the prefix has an owner: a Pod that goes on with it must not take them for this run's.
-            restore::remove(archive, of_nobody).await?;
-            // Names the prefix's owner before anything else is in it, so that a Pod that is lost early can be replaced.
-            let report = first_report(run, &setting.pod_uid, &mut *results);
-            let bytes = serde_json::to_vec(&report).unwrap_or_default();
-            archive.put(REPORT_KEY, bytes).await?;
-            archive.put(OWNER_KEY, owner).await?;
-        }
-        Claim::TakeUp => {
-            // The fence first: what a Pod before this one still stores, it stores before it next reads the fence, and what is
-            // restored is then the last of it.
-            archive.put(OWNER_KEY, owner).await?;
-            let restored = restore::restore(results, run, archive, tree).await?;
-            tracing::info!(
-                files = restored.files,
-                bytes = restored.bytes,
-                "restored what was stored"
-            );
-        }
+    if let Some(of_nobody) = of_nobody(run, archive).await? {
+        // Before the prefix has an owner: a Pod that goes on with it must not take them for this run's.
+        restore::remove(archive, of_nobody).await?;
+        // Names the prefix's owner before anything else is in it, so that a Pod that is lost early can be replaced.
+        let report = first_report(run, &setting.pod_uid, &mut *results);
+        let bytes = serde_json::to_vec(&report).unwrap_or_default();
+        archive.put(REPORT_KEY, bytes).await?;
+        archive.put(OWNER_KEY, owner).await?;
+    } else {
+        // The fence first: what a Pod before this one still stores, it stores before it next reads the fence, and what is
+        // restored is then the last of it.
+        archive.put(OWNER_KEY, owner).await?;
+        restore::restore(results, run, archive, tree).await?;
     }
     input::submitted(run, archive, tree).await?;
     let noted = tree.write(PREPARED, setting.pod_uid.as_bytes());
-    noted.map_err(|error| WorkspaceError::Volume {
-        path: PREPARED.to_owned(),
-        error,
-    })
+    noted.map_err(|error| volume(PREPARED, error))
 }
 
 fn is_prepared(tree: &Tree, pod_uid: &str) -> bool {
@@ -218,22 +207,14 @@ fn is_prepared(tree: &Tree, pod_uid: &str) -> bool {
     noted.is_some_and(|(bytes, _)| bytes == pod_uid.as_bytes())
 }
 
-/// Claim on the stored results.
-#[derive(Clone, Debug, PartialEq, Eq)]
-enum Claim {
-    /// There is nothing, but for these files, which no agent of this run has left.
-    Fresh(Vec<Listed>),
-    /// It is ours, or the run goes on with it.
-    TakeUp,
-}
-
-async fn claim(run: &Run, archive: &Archive) -> Result<Claim, WorkspaceError> {
+/// The stored files that no agent of this run has left, where nothing else is stored; `None` where the run goes on with what is.
+async fn of_nobody(run: &Run, archive: &Archive) -> Result<Option<Vec<Listed>>, WorkspaceError> {
     if run.plan.resume || run.attempt > Attempt::FIRST {
-        return Ok(Claim::TakeUp);
+        return Ok(None);
     }
     let stored = last_report(archive).await?;
     if stored.is_some_and(|report| report.submission_uid == run.uid) {
-        return Ok(Claim::TakeUp);
+        return Ok(None);
     }
     // The controller may have taken the fence from a Pod that never came this far, and stored why it failed. A submitted file is there first.
     let controllers = [OWNER_KEY, FAILURE_LOG_KEY];
@@ -245,7 +226,7 @@ async fn claim(run: &Run, archive: &Archive) -> Result<Claim, WorkspaceError> {
     if there.len() <= most && there.iter().all(|object| is_ours(&object.key)) {
         // In the mode Predictions it is the submitted file.
         let is_of_nobody = |object: &Listed| run.plan.agents() == Agents::First && input::is_input(&object.key);
-        return Ok(Claim::Fresh(there.into_iter().filter(is_of_nobody).collect()));
+        return Ok(Some(there.into_iter().filter(is_of_nobody).collect()));
     }
     Err(WorkspaceError::PrefixInUse(place(run, "")))
 }
@@ -291,12 +272,13 @@ fn copy_runner(places: &Places) -> Result<(), WorkspaceError> {
     })
 }
 
+fn volume(path: &str, error: TreeError) -> WorkspaceError {
+    let path = path.to_owned();
+    WorkspaceError::Volume { path, error }
+}
+
 /// Makes the folders, in which a container of any user may write.
 fn folders(setting: &Setting) -> Result<Arc<Tree>, WorkspaceError> {
-    let volume = |path: &str, error| WorkspaceError::Volume {
-        path: path.to_owned(),
-        error,
-    };
     let tree = Tree::open(&setting.places.logs).map_err(|error| volume("/", error.into()))?;
     let (plan, host) = (&setting.run.plan, of_plan(&setting.run.plan).host());
     let of_hosts = Pair::first(plan.workers()).map(|worker| host_folder(host, worker));

@@ -193,7 +193,7 @@ impl Rounds {
             folders.extend(members.map(|member| status.join(member.to_string())));
         }
         // Without a watch the period is all there is.
-        let _ = blocking(move || folders.iter().for_each(|folder| _ = watch.add(folder))).await;
+        let _ = tokio::task::spawn_blocking(move || folders.iter().for_each(|folder| _ = watch.add(folder))).await;
     }
 
     fn pairs(&self) -> usize {
@@ -244,16 +244,16 @@ impl Rounds {
         let read = move || {
             let gathered = lock(&reader).round();
             let files = Files::find(&tree, pairs, host);
-            Found {
+            Ok(Found {
                 logs: files.wanted(&gathered.refused, host),
                 gathered,
                 statuses: protocol::present(&status, u16::try_from(pairs).unwrap_or(u16::MAX), host),
                 activity: files.activity,
                 left_out: files.left_out,
                 agents_fill_disk: files.agents_fill_disk,
-            }
+            })
         };
-        Ok(blocking(read).await?)
+        blocking(read).await
     }
 
     /// Draws the consequences of what was read. Returns how long the next round may wait.
@@ -400,7 +400,7 @@ impl Rounds {
     async fn finish(&mut self, gathered: &Gathered) -> Result<(), LogcopyError> {
         let status = self.setting.places.status();
         let folder = status.clone();
-        blocking(move || StatusFile::Stored.create(&folder)).await??;
+        blocking(move || StatusFile::Stored.create(&folder)).await?;
         self.finished = true;
         tracing::info!("the final report is stored");
         if let Err(error) = self.store_statuses(&[StatusFile::Stored]).await {

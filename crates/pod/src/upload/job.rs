@@ -152,7 +152,7 @@ impl Job {
         let known_size = self.known.as_ref().map_or(0, |known| known.stamp.size);
         let (tree, path) = (Arc::clone(&self.tree), self.wanted.path.clone());
         let counted = self.wanted.stamp.size;
-        let opened = blocking(move || Opened::open(&tree, &path, known_size, counted)).await??;
+        let opened = blocking(move || Opened::open(&tree, &path, known_size, counted)).await?;
         let Some(opened) = opened else {
             return Ok(Outcome::LeftOut("it is gone".to_owned()));
         };

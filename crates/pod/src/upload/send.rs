@@ -19,7 +19,7 @@ use crate::blocking;
 use crate::daily::{Spent, today};
 use leaderboard_aws::archive::{Archive, ArchiveError, Cause};
 use leaderboard_evaluation::Object;
-use leaderboard_evidence::{Stamp, Tree, TreeError};
+use leaderboard_evidence::{Stamp, Tree};
 
 /// Files in the air at once.
 const AT_ONCE: usize = 4;
@@ -334,8 +334,7 @@ impl Uploader {
 
     async fn remember(&self) {
         let (memory, tree) = (self.memory.clone(), Arc::clone(&self.tree));
-        let saved = blocking(move || memory.save(&tree)).await;
-        if let Err(error) = saved.map_err(TreeError::from).flatten() {
+        if let Err(error) = blocking(move || memory.save(&tree)).await {
             tracing::warn!("what is stored can't be noted down, a restart will send it again: {error}");
         }
     }

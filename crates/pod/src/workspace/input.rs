@@ -8,18 +8,18 @@ use std::sync::Arc;
 
 use futures::{StreamExt, TryStreamExt};
 
-use super::restore::{AT_ONCE, download, is_evaluators, remove, unknown, volume};
-use super::{WorkspaceError, place};
+use super::restore::{AT_ONCE, download, is_evaluators, remove, unknown};
+use super::{WorkspaceError, place, volume};
 use crate::blocking;
 use crate::collect::{self, bounds, digest_of, usable};
 use crate::upload::Stored;
 use leaderboard_api::Agents;
 use leaderboard_aws::archive::{Archive, Listed};
-use leaderboard_contract::collected::{Collected, MAX_BYTES};
+use leaderboard_contract::collected::MAX_BYTES;
 use leaderboard_contract::keys::{COLLECTED, INPUT, INPUT_FILE};
 use leaderboard_contract::report::StoredFile;
 use leaderboard_contract::run::{Run, STATUS_FOLDER};
-use leaderboard_evidence::{Tree, TreeError};
+use leaderboard_evidence::Tree;
 use leaderboard_protocol::files::{Mark, Pair, StatusFile};
 
 /// True for the key of what evaluators read, or of its list.
@@ -85,10 +85,24 @@ async fn collected(
     stored: &[Listed],
 ) -> Result<Option<Vec<(String, Stored)>>, WorkspaceError> {
     forget(tree)?;
-    let Some(wanted) = listed(run, archive, stored).await? else {
+    let by_key: BTreeMap<&str, &Listed> = stored.iter().map(|object| (object.key.as_str(), object)).collect();
+    let object = match archive.get(COLLECTED, MAX_BYTES).await {
+        Err(error) if error.is_too_large() => None,
+        object => object?,
+    };
+    let Some(list) = object.and_then(|object| usable(&object.bytes, &bounds(run))) else {
+        tracing::info!("no {COLLECTED} that can be used is stored; the agent runs anew");
         return Ok(None);
     };
-    let fetched = futures::stream::iter(wanted.files)
+    let wanted = list.files.iter().map(|(path, file)| {
+        let object = by_key.get(format!("{INPUT}{path}").as_str())?;
+        (object.size == file.size).then(|| (Listed::clone(object), file.clone()))
+    });
+    let Some(wanted) = wanted.collect::<Option<Vec<_>>>() else {
+        tracing::info!("not all files of {COLLECTED} are stored; the agent runs anew");
+        return Ok(None);
+    };
+    let fetched = futures::stream::iter(wanted)
         .map(|(object, file)| fetch(archive, tree, object, file))
         .buffer_unordered(AT_ONCE);
     let fetched: Vec<Option<(String, Stored)>> = fetched.try_collect().await?;
@@ -97,39 +111,10 @@ async fn collected(
         forget(tree)?;
         return Ok(None);
     };
-    tree.write(COLLECTED, &wanted.list.to_json())
-        .map_err(|error| volume(COLLECTED, error))?;
+    let noted = tree.write(COLLECTED, &list.to_json());
+    noted.map_err(|error| volume(COLLECTED, error))?;
     end_agent(tree)?;
     Ok(Some(fetched))
-}
-
-/// Files of a list, each with its object.
-struct Wanted {
-    list: Collected,
-    files: Vec<(Listed, StoredFile)>,
-}
-
-/// The stored list and its files; `None` unless the run can use it and each file is there by its size.
-async fn listed(run: &Run, archive: &Archive, stored: &[Listed]) -> Result<Option<Wanted>, WorkspaceError> {
-    let by_key: BTreeMap<&str, &Listed> = stored.iter().map(|object| (object.key.as_str(), object)).collect();
-    let is_readable = by_key.get(COLLECTED).is_some_and(|object| object.size <= MAX_BYTES);
-    if !is_readable {
-        return Ok(None);
-    }
-    let object = archive.get(COLLECTED, MAX_BYTES).await?;
-    let Some(list) = object.and_then(|object| usable(&object.bytes, &bounds(run))) else {
-        tracing::warn!("{COLLECTED} can't be used; the agent runs anew");
-        return Ok(None);
-    };
-    let files = list.files.iter().map(|(path, file)| {
-        let object = by_key.get(format!("{INPUT}{path}").as_str())?;
-        (object.size == file.size).then(|| ((*object).clone(), file.clone()))
-    });
-    let files: Option<Vec<(Listed, StoredFile)>> = files.collect();
-    if files.is_none() {
-        tracing::info!("not all files of {COLLECTED} are stored; the agent runs anew");
-    }
-    Ok(files.map(|files| Wanted { list, files }))
 }
 
 /// Downloads a file. `None` if it is not the one with this size and digest.
@@ -150,7 +135,6 @@ async fn fetch(
     };
     let (reading, key) = (Arc::clone(tree), path.clone());
     let found = blocking(move || digest_of(&reading, &key)).await;
-    let found = found.map_err(TreeError::from).flatten();
     let is_it = found.map_err(|error| volume(&path, error))? == Some(file);
     Ok(stored.filter(|_| is_it))
 }

@@ -11,7 +11,7 @@ use std::sync::Arc;
 
 use futures::{StreamExt, TryStreamExt};
 
-use super::{WorkspaceError, input, last_report};
+use super::{WorkspaceError, input, last_report, volume};
 use crate::blocking;
 use crate::daily::Daily;
 use crate::upload::quota::{LEAST, Quota};
@@ -19,7 +19,9 @@ use crate::upload::{Memory, Stored, fingerprint};
 use leaderboard_api::evaluator_result::{MAX_BYTES, parse};
 use leaderboard_api::names::FAILURE_LOG_KEY;
 use leaderboard_aws::archive::{Archive, ArchiveError, Listed};
-use leaderboard_contract::keys::{EVALAI, EVALUATORS, MERGED, REFUSED, SUBMISSION_FOLDER, checkpoint_path, result_path};
+use leaderboard_contract::keys::{
+    EVALAI, EVALUATORS, MERGED, REFUSED, SUBMISSION_FOLDER, checkpoint_path, result_path,
+};
 use leaderboard_contract::report::{OWNER_KEY, REPORT_KEY, Report};
 use leaderboard_contract::run::{Run, STATUS_FOLDER};
 use leaderboard_evaluation::{Results, of_plan};
@@ -31,24 +33,13 @@ const MAX_OBJECTS: usize = 100_000;
 /// Downloads at once.
 pub(super) const AT_ONCE: usize = 4;
 
-/// Restored files.
-#[derive(Clone, Copy, Debug, Default, PartialEq, Eq)]
-pub struct Restored {
-    /// Files.
-    pub files: usize,
-    /// Their bytes.
-    pub bytes: u64,
-    /// Objects with impossible keys or beyond the limit.
-    pub left_out: usize,
-}
-
 /// Downloads what the run goes on with, and removes the stored status files.
 pub async fn restore(
     results: Box<dyn Results>,
     run: &Run,
     archive: &Archive,
     tree: &Arc<Tree>,
-) -> Result<Restored, WorkspaceError> {
+) -> Result<(), WorkspaceError> {
     let statuses = archive.list(&format!("{STATUS_FOLDER}/"), MAX_OBJECTS).await?;
     remove(archive, statuses.objects).await?;
     remove_refused(run, archive).await?;
@@ -61,38 +52,37 @@ pub async fn restore(
     let (limit, workers) = (run.plan.storage.s3.size_limit.bytes(), run.plan.workers());
     let quota = Quota::new(limit, workers, of_plan(&run.plan).host());
     let chosen = choose(objects, &quota, workers);
-    let others = chosen.unknown();
-    let of_workers = chosen.of_workers.len();
+    if chosen.left_out > 0 {
+        tracing::warn!(
+            objects = chosen.left_out,
+            "not restored: impossible keys, or beyond storage.s3.sizeLimit"
+        );
+    }
+    let others: Vec<(String, Stored)> = unknown(chosen.others.iter().chain(&chosen.of_workers)).collect();
     for object in chosen.of_workers {
         let path = of_worker(&object.key).map(checkpoint_path).unwrap_or_default();
         // Not known as stored: it gets a pair's key with the first upload.
         download(archive, tree, object, &path).await?;
     }
-    let stored = download_all(archive, tree, chosen.objects).await?;
+    let downloads = futures::stream::iter(chosen.objects).map(|object| async move {
+        let path = object.key.clone();
+        download(archive, tree, object, &path).await
+    });
+    let stored: Vec<Option<(String, Stored)>> = downloads.buffer_unordered(AT_ONCE).try_collect().await?;
     let removed = blocking(move || results.remove_others()).await;
-    removed
-        .map_err(TreeError::from)
-        .flatten()
-        .map_err(|error| volume("agent", error))?;
+    removed.map_err(|error| volume("agent", error))?;
     let mut memory = Memory {
         stored: stored.into_iter().flatten().collect(),
         sent: Daily::default(),
     };
-    let restored = Restored {
-        files: memory.stored.len().saturating_add(of_workers),
-        bytes: memory.bytes(),
-        left_out: chosen.left_out,
-    };
+    tracing::info!(
+        files = memory.stored.len(),
+        bytes = memory.bytes(),
+        "restored what was stored"
+    );
     // An object that is not restored stays stored all the same, and counts.
     memory.stored.extend(others.into_iter().chain(input));
-    memory.save(tree).map_err(|error| volume("logcopy", error))?;
-    if restored.left_out > 0 {
-        tracing::warn!(
-            objects = restored.left_out,
-            "not restored: impossible keys, or beyond storage.s3.sizeLimit"
-        );
-    }
-    Ok(restored)
+    memory.save(tree).map_err(|error| volume("logcopy", error))
 }
 
 pub(super) async fn remove(archive: &Archive, objects: Vec<Listed>) -> Result<(), WorkspaceError> {
@@ -136,13 +126,6 @@ struct Chosen {
     others: Vec<Listed>,
     /// How many of them are not left there on purpose.
     left_out: usize,
-}
-
-impl Chosen {
-    /// Objects that are not restored as they are.
-    fn unknown(&self) -> Vec<(String, Stored)> {
-        unknown(self.others.iter().chain(&self.of_workers)).collect()
-    }
 }
 
 /// Chooses objects: results and known logs first, then the smallest, so that no flood and no huge file keeps a checkpoint out.
@@ -249,18 +232,7 @@ fn is_foreign_agent(key: &str, pairs: usize) -> bool {
     number.is_some_and(|(number, _)| !(1..=pairs).any(|pair| pair.to_string() == number))
 }
 
-async fn download_all(
-    archive: &Archive,
-    tree: &Arc<Tree>,
-    objects: Vec<Listed>,
-) -> Result<Vec<Option<(String, Stored)>>, WorkspaceError> {
-    let downloads = futures::stream::iter(objects).map(|object| async move {
-        let key = object.key.clone();
-        download(archive, tree, object, &key).await
-    });
-    downloads.buffer_unordered(AT_ONCE).try_collect().await
-}
-
+/// Downloads an object to a path. `None` if it is gone.
 pub(super) async fn download(
     archive: &Archive,
     tree: &Arc<Tree>,
@@ -270,8 +242,7 @@ pub(super) async fn download(
     let local = |error: TreeError| volume(path, error);
     let (creating, key) = (Arc::clone(tree), path.to_owned());
     let created = blocking(move || creating.create(&key)).await;
-    let created = created.map_err(TreeError::from).flatten().map_err(local)?;
-    let mut file = tokio::fs::File::from_std(created);
+    let mut file = tokio::fs::File::from_std(created.map_err(local)?);
     // A little more than the list showed, for an object that was replaced since.
     let limit = object.size.saturating_mul(2).max(1 << 20);
     let Some(size) = archive.download(&object.key, &mut file, limit).await? else {
@@ -280,7 +251,7 @@ pub(super) async fn download(
     drop(file);
     let (reading, key) = (Arc::clone(tree), path.to_owned());
     let read = blocking(move || fingerprint_of(&reading, &key)).await;
-    let Some((fingerprint, stamp)) = read.map_err(TreeError::from).flatten().map_err(local)? else {
+    let Some((fingerprint, stamp)) = read.map_err(local)? else {
         return Ok(None);
     };
     // Known as stored only if it is what the list showed the tag of.
@@ -299,13 +270,6 @@ fn fingerprint_of(tree: &Tree, path: &str) -> Result<Option<(String, Stamp)>, Tr
         return Ok(None);
     };
     Ok(Some((fingerprint(&file, stamp.size)?, stamp)))
-}
-
-pub(super) fn volume(path: &str, error: TreeError) -> WorkspaceError {
-    WorkspaceError::Volume {
-        path: path.to_owned(),
-        error,
-    }
 }
 
 #[cfg(test)]
