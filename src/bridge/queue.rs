@@ -24,8 +24,8 @@ use leaderboard_policy::intake::route::DeadReason;
 
 /// How long a receive waits for a message, in seconds: the longest that SQS allows.
 const LONG_POLL: i32 = 20;
-/// Most messages of one receive and entries of one batch.
-pub const BATCH: usize = 10;
+/// Most messages of one receive, and entries of one batch.
+const BATCH: i32 = 10;
 /// SQS's own default, used when the attribute may not be read.
 const DEFAULT_VISIBILITY: Duration = Duration::from_secs(30);
 
@@ -119,52 +119,41 @@ impl Reader {
         Ok(messages.filter_map(|message| received(message, now)).collect())
     }
 
-    /// Keeps messages invisible for so many seconds from now. A lease that is lost already is no error: the message
+    /// Keeps messages of one receive invisible for so many seconds from now. A lease that is lost already is no error: the message
     /// then comes back, and ingest is safe twice.
     pub async fn hold(&self, receipts: &[&str], seconds: i32) -> Result<(), QueueError> {
-        for chunk in receipts.chunks(BATCH) {
-            let mut request = self.client.change_message_visibility_batch().queue_url(&self.url);
-            for (id, receipt) in chunk.iter().enumerate() {
-                let entry = ChangeMessageVisibilityBatchRequestEntry::builder();
-                let entry = entry
-                    .id(id.to_string())
-                    .receipt_handle(*receipt)
-                    .visibility_timeout(seconds)
-                    .build();
-                request = request.entries(entry.map_err(|error| self.unsendable("ChangeMessageVisibility", &error))?);
-            }
-            self.call("ChangeMessageVisibility", request.send()).await?;
+        let mut request = self.client.change_message_visibility_batch().queue_url(&self.url);
+        for (id, receipt) in receipts.iter().enumerate() {
+            let entry = ChangeMessageVisibilityBatchRequestEntry::builder()
+                .id(id.to_string())
+                .receipt_handle(*receipt)
+                .visibility_timeout(seconds)
+                .build();
+            request = request.entries(entry.map_err(|error| self.unsendable("ChangeMessageVisibility", &error))?);
         }
-        Ok(())
+        self.call("ChangeMessageVisibility", request.send()).await.map(|_| ())
     }
 
-    /// Deletes messages. A single message that can't be deleted comes back and is a repeat then; only a failure of a whole request is
-    /// an error.
+    /// Deletes messages of one receive. A single message that can't be deleted comes back and is a repeat then; only a failure of the
+    /// whole request is an error.
     pub async fn delete(&self, receipts: &[&str]) -> Result<(), QueueError> {
-        for chunk in receipts.chunks(BATCH) {
-            let mut request = self.client.delete_message_batch().queue_url(&self.url);
-            for (id, receipt) in chunk.iter().enumerate() {
-                let entry = DeleteMessageBatchRequestEntry::builder()
-                    .id(id.to_string())
-                    .receipt_handle(*receipt)
-                    .build();
-                request = request.entries(entry.map_err(|error| self.unsendable("DeleteMessage", &error))?);
-            }
-            let output = self.call("DeleteMessage", request.send()).await?;
-            // An invalid receipt means that it is deleted, or was received again and is deleted then.
-            for failed in output
-                .failed()
-                .iter()
-                .filter(|failed| !failed.code().ends_with("ReceiptHandleIsInvalid"))
-            {
-                let (code, text) = (failed.code(), failed.message().unwrap_or_default());
-                tracing::warn!(
-                    queue = self.url,
-                    code,
-                    text,
-                    "a message could not be deleted and will come back"
-                );
-            }
+        if receipts.is_empty() {
+            return Ok(());
+        }
+        let mut request = self.client.delete_message_batch().queue_url(&self.url);
+        for (id, receipt) in receipts.iter().enumerate() {
+            let entry = DeleteMessageBatchRequestEntry::builder()
+                .id(id.to_string())
+                .receipt_handle(*receipt)
+                .build();
+            request = request.entries(entry.map_err(|error| self.unsendable("DeleteMessage", &error))?);
+        }
+        let output = self.call("DeleteMessage", request.send()).await?;
+        // An invalid receipt means that it is deleted, or was received again and is deleted then.
+        let failed = output.failed().iter();
+        for failed in failed.filter(|failed| !failed.code().ends_with("ReceiptHandleIsInvalid")) {
+            let (queue, code, text) = (&self.url, failed.code(), failed.message().unwrap_or_default());
+            tracing::warn!(queue, code, text, "a message could not be deleted and will come back");
         }
         Ok(())
     }
@@ -211,20 +200,20 @@ impl Reader {
         E: ProvideErrorMetadata + std::error::Error + 'static,
     {
         let answer = self.meter.aws("sqs", action, request).await;
-        answer.map_err(|error| QueueError {
-            queue: self.url.clone(),
-            action,
-            fault: fault::of(&error),
-            text: fault::sentence(&error),
-        })
+        answer.map_err(|error| self.failed(action, fault::of(&error), fault::sentence(&error)))
     }
 
     fn unsendable(&self, action: &'static str, error: &aws_sdk_sqs::error::BuildError) -> QueueError {
+        self.failed(action, Fault::Refused, error.to_string())
+    }
+
+    fn failed(&self, action: &'static str, fault: Fault, text: String) -> QueueError {
+        let queue = self.url.clone();
         QueueError {
-            queue: self.url.clone(),
+            queue,
             action,
-            fault: Fault::Refused,
-            text: error.to_string(),
+            fault,
+            text,
         }
     }
 }
@@ -232,7 +221,7 @@ impl Reader {
 /// How many messages to ask for, so that all are ingested within half of their visibility.
 pub fn batch_size(visibility: Duration, each: Duration) -> i32 {
     let fit = visibility.as_millis() / 2 / each.as_millis().max(1);
-    i32::try_from(fit).unwrap_or(i32::MAX).clamp(1, 10)
+    i32::try_from(fit).unwrap_or(i32::MAX).clamp(1, BATCH)
 }
 
 fn received(message: Message, now: i64) -> Option<Received> {

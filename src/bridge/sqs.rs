@@ -1,6 +1,6 @@
 //! A queue in SQS as a source of messages: opened when it is first read, and only read while the API server answers.
 
-use std::collections::{BTreeMap, BTreeSet};
+use std::collections::BTreeMap;
 use std::sync::{Arc, Mutex};
 use std::time::Duration;
 
@@ -35,20 +35,14 @@ pub(super) struct Connection {
 
 /// The queues that Leaderboards name, each reached by the connection of the oldest of them.
 pub(super) fn desired(leaderboards: &[Arc<Leaderboard>]) -> BTreeMap<String, Connection> {
-    let urls: BTreeSet<&String> = leaderboards
-        .iter()
-        .filter_map(|lb| route::queue_of(lb))
-        .map(|queue| &queue.url)
-        .collect();
-    let mut desired = BTreeMap::new();
-    for url in urls {
+    let way = |url: &str| {
         let readers = route::readers(url, leaderboards);
-        if let Some(queue) = readers.first().and_then(|lb| route::queue_of(lb)) {
-            let (region, endpoint) = (queue.region.clone(), queue.endpoint.clone());
-            desired.insert(url.clone(), Connection { region, endpoint });
-        }
-    }
-    desired
+        let queue = route::queue_of(readers.first()?)?;
+        let (region, endpoint) = (queue.region.clone(), queue.endpoint.clone());
+        Some((url.to_owned(), Connection { region, endpoint }))
+    };
+    let queues = leaderboards.iter().filter_map(|lb| route::queue_of(lb));
+    queues.filter_map(|queue| way(&queue.url)).collect()
 }
 
 /// Shows whether the API server answers: a message that is received in vain is a step towards its dead letter.
