@@ -17,8 +17,9 @@ use reqwest::{Client, ClientBuilder, RequestBuilder};
 use url::{Origin, Url};
 
 use super::answer::Silence;
-use super::reach::{NotPublic, Reach, reached};
+use super::reach::{NotPublic, Reach, check, reached};
 use super::transport::{Body, ClientError, Failure, Timeouts, Transport, unsendable};
+use leaderboard_api::ranges;
 
 /// Variables with the address of a proxy, in capital letters.
 const PROXIES: [&str; 3] = ["HTTPS_PROXY", "HTTP_PROXY", "ALL_PROXY"];
@@ -36,7 +37,7 @@ pub struct Network {
 impl Network {
     /// The transport to a server of EvalAI, which is named by its root.
     pub fn connect(api_server: &str, timeouts: Timeouts) -> Result<Arc<dyn Transport>, ClientError> {
-        Ok(Arc::new(Self::new(api_server, timeouts, Reach::default())?))
+        Ok(Arc::new(Self::new(api_server, timeouts, ranges::is_public)?))
     }
 
     pub(super) fn new(api_server: &str, timeouts: Timeouts, reach: Reach) -> Result<Self, ClientError> {
@@ -57,7 +58,7 @@ impl Network {
         let client = if self.server.as_ref() == Some(&url.origin()) {
             &self.own
         } else {
-            self.reach.check(&url).map_err(Failure::NotPublic)?;
+            check(self.reach, &url).map_err(Failure::NotPublic)?;
             &self.other
         };
         Ok(client.request(parts.method, url).headers(parts.headers).body(body))

@@ -1,13 +1,11 @@
 //! Which addresses a stranger may name: those of the internet alone, and none in a network of the operator's.
 //!
-//! Asked by `network`. Pure. An address that stands in the URL itself is looked up by nobody: ask [`Reach::check`] before each request,
-//! and follow no redirect without asking again.
+//! Asked by `network`. Pure. An address that stands in the URL itself is looked up by nobody: ask [`check`] before each request, and follow
+//! no redirect without asking again.
 
 use std::net::{IpAddr, SocketAddr};
 
 use url::Url;
-
-use leaderboard_api::ranges;
 
 /// A host that has no address of the internet.
 #[derive(thiserror::Error, Debug, Clone, PartialEq, Eq)]
@@ -17,41 +15,20 @@ pub struct NotPublic {
     address: IpAddr,
 }
 
-/// Which addresses may be connected to.
-#[derive(Clone, Copy, Debug)]
-pub struct Reach(fn(IpAddr) -> bool);
+/// True for an address that may be connected to.
+pub type Reach = fn(IpAddr) -> bool;
 
-impl Default for Reach {
-    fn default() -> Self {
-        Self(ranges::is_public)
-    }
-}
-
-impl Reach {
-    /// Another rule than the internet's.
-    #[cfg(test)]
-    pub const fn of(rule: fn(IpAddr) -> bool) -> Self {
-        Self(rule)
-    }
-
-    /// Refuses an address in a URL that may not be connected to. A name is judged when it is looked up.
-    pub fn check(self, url: &Url) -> Result<(), NotPublic> {
-        let host = url.host_str().unwrap_or_default();
-        let address = host.trim_start_matches('[').trim_end_matches(']').parse();
-        match address {
-            Ok(address) if !(self.0)(address) => Err(NotPublic {
-                host: host.to_owned(),
-                address,
-            }),
-            _ => Ok(()),
-        }
-    }
+/// Refuses an address in a URL that may not be connected to. A name is judged when it is looked up.
+pub fn check(reach: Reach, url: &Url) -> Result<(), NotPublic> {
+    let host = url.host_str().unwrap_or_default();
+    let address = host.trim_start_matches('[').trim_end_matches(']').parse::<IpAddr>();
+    let found = address.map(|address| SocketAddr::new(address, 0)).into_iter();
+    reached(reach, host, found.collect()).map(|_| ())
 }
 
 /// The addresses of a host that may be connected to. An error: all that were found may not.
 pub(super) fn reached(reach: Reach, host: &str, found: Vec<SocketAddr>) -> Result<Vec<SocketAddr>, NotPublic> {
-    let (public, other): (Vec<SocketAddr>, Vec<SocketAddr>) =
-        found.into_iter().partition(|found| (reach.0)(found.ip()));
+    let (public, other): (Vec<SocketAddr>, Vec<SocketAddr>) = found.into_iter().partition(|found| reach(found.ip()));
     match (public.is_empty(), other.first()) {
         (true, Some(address)) => Err(NotPublic {
             host: host.to_owned(),
@@ -64,6 +41,7 @@ pub(super) fn reached(reach: Reach, host: &str, found: Vec<SocketAddr>) -> Resul
 #[cfg(test)]
 mod tests {
     use super::*;
+    use leaderboard_api::ranges::is_public;
 
     #[test]
     fn an_address_in_a_url_is_judged_however_it_is_written() {
@@ -77,10 +55,10 @@ mod tests {
             "http://[::ffff:10.0.0.1]/",
             "http://[fd00:ec2::254]/",
         ] {
-            assert!(Reach::default().check(&Url::parse(url).unwrap()).is_err(), "{url}");
+            assert!(check(is_public, &Url::parse(url).unwrap()).is_err(), "{url}");
         }
         for url in ["https://1.1.1.1/", "https://example.org/", "http://[2600:1f18::1]/"] {
-            assert_eq!(Reach::default().check(&Url::parse(url).unwrap()), Ok(()), "{url}");
+            assert_eq!(check(is_public, &Url::parse(url).unwrap()), Ok(()), "{url}");
         }
     }
 
@@ -92,7 +70,7 @@ mod tests {
                 .map(|address| (address.parse::<IpAddr>().unwrap(), 0).into())
                 .collect()
         };
-        let reached = |addresses: &[&str]| reached(Reach::default(), "host", found(addresses));
+        let reached = |addresses: &[&str]| reached(is_public, "host", found(addresses));
         assert_eq!(reached(&["1.1.1.1", "10.0.0.1", "::1"]).unwrap(), found(&["1.1.1.1"]));
         assert_eq!(
             reached(&["10.0.0.1", "::1"]).unwrap_err().to_string(),

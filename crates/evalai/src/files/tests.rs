@@ -9,7 +9,6 @@ use tokio::net::TcpListener;
 
 use super::*;
 use crate::network::Network;
-use crate::reach::Reach;
 
 const FILE: &str = r#"{"submitted_image_uri": "registry.example/agent:1"}"#;
 
@@ -62,14 +61,14 @@ impl Server {
 
 async fn read_as(server: &str, url: &str) -> Answer<ImageAnswer> {
     let timeouts = Timeouts::default();
-    let network = Network::new(server, timeouts, Reach::of(is_internet)).unwrap();
+    let network = Network::new(server, timeouts, is_internet).unwrap();
     Files::new(Arc::new(network), timeouts).image(&url.into()).await
 }
 
 /// The same for a file that is the submission itself.
 async fn content_as(server: &str, url: &str) -> Result<Vec<u8>, InputError> {
     let timeouts = Timeouts::default();
-    let network = Network::new(server, timeouts, Reach::of(is_internet)).unwrap();
+    let network = Network::new(server, timeouts, is_internet).unwrap();
     let chunks = Files::new(Arc::new(network), timeouts).open(&url.into()).await?;
     let chunks: Vec<Bytes> = chunks.try_collect().await?;
     Ok(chunks.concat())
