@@ -94,7 +94,7 @@ chart-test: ## Check the chart: its values, what each of them renders, and what 
 
 .PHONY: book chart-docs install-yaml
 book: ## Make a book of the documents, target/book/index.html (builds mdBook the first time)
-	$(LAB) book
+	$(LAB) book $(if $(SEARCH),--search)
 
 chart-docs: ## Write docs/reference and the tables of the chart's values and of the metrics
 	$(LAB) chart-docs

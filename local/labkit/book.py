@@ -20,7 +20,7 @@ from .errors import LabError
 from .settings import Settings
 
 VERSION = "0.5.4"
-# Without search: its index is no part of what is checked. On two cores.
+# Without search, whose index is no part of what is checked. On two cores.
 SECONDS = 40
 SUMMARY = "docs/SUMMARY.md"
 STAGED, BUILT = Path("target/book-source"), Path("target/book")
@@ -30,9 +30,9 @@ COMPLAINT = re.compile(r"^\s*(?:\S+ )?(?:WARN|ERROR) .*$", re.MULTILINE)
 COPIES = ("print.html", "404.html", "toc.html")
 
 
-def make(settings: Settings) -> str:
-    """Builds the book; raises with what mdBook complains about, and with links that lead nowhere."""
-    program = ensure(settings)
+def make(settings: Settings, search: bool = False) -> str:
+    """Builds the book, with or without a search; raises with what mdBook complains about, and with links that lead nowhere."""
+    program = ensure(settings, search)
     repository = settings.repository
     chapters = stage(repository, repository / STAGED)
     argv = [str(program), "build", str(repository)]
@@ -46,9 +46,9 @@ def make(settings: Settings) -> str:
     return f"{chapters} chapters in {BUILT}"
 
 
-def ensure(settings: Settings) -> Path:
-    """mdBook, built once."""
-    folder = settings.cache / f"mdbook-{VERSION}"
+def ensure(settings: Settings, search: bool) -> Path:
+    """mdBook, built once, and once more for books with a search."""
+    folder = settings.cache / f"mdbook-{VERSION}{'-search' if search else ''}"
     program = folder / "bin" / "mdbook"
     with tools.lock(settings.cache / "mdbook.lock", "mdBook"):
         if not program.exists():
@@ -56,6 +56,7 @@ def ensure(settings: Settings) -> Path:
             say(f"building mdBook, once ({SECONDS} s on two cores)")
             # Unoptimized: it is built longer than it ever runs.
             argv = ["cargo", "install", "--locked", "--debug", "--no-default-features", "--version", VERSION]
+            argv += ["--features", "search"] if search else []
             env = {**os.environ, "CARGO_PROFILE_DEV_DEBUG": "0", "CARGO_TARGET_DIR": str(folder / "target")}
             log = settings.logs / "mdbook.log"
             run_long([*argv, "--root", str(folder), "mdbook"], "building mdBook", log, env=env, usual=SECONDS)

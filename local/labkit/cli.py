@@ -85,7 +85,8 @@ def parser() -> argparse.ArgumentParser:
     commands.add_parser(
         "chart-docs", help="write docs/reference and the tables of the chart's values and of the metrics"
     )
-    commands.add_parser("book", help="make a book of the documents with mdBook, and check its links")
+    a_book = commands.add_parser("book", help="make a book of the documents with mdBook, and check its links")
+    a_book.add_argument("--search", action="store_true", help="with a search, as it is published")
     one_file = commands.add_parser("install-yaml", help="print one file that installs the operator without Helm")
     one_file.add_argument("more", nargs="*", metavar="ARGUMENT", help="for `helm template`: -- --set a=b")
     commands.add_parser("version", help="print the version of programs and chart; fails where they differ")
@@ -164,7 +165,7 @@ def run(settings: Settings, arguments: argparse.Namespace) -> int:
             apidocs.update(settings.repository)
             programdocs.update(settings.repository)
         case "book":
-            say(book.make(settings))
+            say(book.make(settings, arguments.search))
         case "install-yaml":
             helm = kube.Kube(tools.ensure(settings, ["helm"]), dict(os.environ))
             print(chartrender.one_file(helm, chartrender.folder(settings.repository), arguments.more), end="")
