@@ -3,13 +3,15 @@
 import functools
 import json
 import os
+import re
 import subprocess
 import tempfile
 import unittest
+from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
 
-from labkit import pythonenv, settings
+from labkit import chartdocs, pythonenv, settings
 
 REPOSITORY = Path(__file__).resolve().parents[2]
 EXAMPLES = REPOSITORY / "examples" / "gitops"
@@ -147,12 +149,34 @@ def seen(program: str, file: str) -> dict[str, str]:
     return {name: health["status"] for name, health in zip(STATES, healths, strict=True)}
 
 
+def terraform_values(text: str) -> dict[str, Any]:
+    """What a file of Terraform encodes as the values of a chart. Each line has one value, as `terraform fmt` leaves it."""
+    lines = re.sub(r"^ *#.*\n", "", text.split("yamlencode({\n")[1].split("})]")[0], flags=re.MULTILINE)
+    named = re.sub(r"(\w+) += ", r'"\1": ', re.sub(r"(?<= )var\.\w+", '"a variable"', lines))
+    found: dict[str, Any] = json.loads("{" + re.sub(r"(?<=[]}\"])\n(?! *}| *$)", ",\n", named) + "}")
+    return found
+
+
+def paths(values: dict[str, Any], above: str = "") -> Iterator[str]:
+    for name, value in values.items():
+        if isinstance(value, dict):
+            yield from paths(value, f"{above}{name}.")
+        else:
+            yield above + name
+
+
 class Manifests(unittest.TestCase):
     def test_other_projects_take_their_kinds(self) -> None:
         files = sorted(str(file) for file in EXAMPLES.glob("*.yaml"))
         self.assertEqual(len(files), 6)
         found = labkit("faults", str(SCHEMAS), *files)
         self.assertEqual(set(found), {f"unknown {kind}" for kind in UNCHECKED})
+
+    def test_terraform_gives_the_chart_values_that_it_has(self) -> None:
+        known = chartdocs.leaves((REPOSITORY / "charts" / "leaderboard-operator" / "values.yaml").read_text())
+        given = set(paths(terraform_values((EXAMPLES / "main.tf").read_text())))
+        self.assertEqual(given - set(known), set())
+        self.assertLessEqual({"controller.roleARN", "namespaces", "allow.queues"}, given)
 
     def test_a_misspelling_is_found(self) -> None:
         text = (EXAMPLES / "external-secret.yaml").read_text()
