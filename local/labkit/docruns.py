@@ -199,6 +199,7 @@ def furnish(repository: Path, home: Path) -> None:
         (home / name).symlink_to(repository / name)
     (home / "examples" / "aws" / "token.json").write_text('{"auth_token": "a-token"}')
     (home / "predictions.csv").write_text("id,category\n")
+    (home / "values.yaml").write_text("namespaces: [leaderboard]\n")
     (home / "local").mkdir()
     (home / "local" / "quickstart").symlink_to(repository / "local" / "quickstart")
     for script in ("local/lab", "examples/contents/check.sh", "examples/participants/try.sh"):
