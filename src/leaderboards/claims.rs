@@ -6,6 +6,7 @@ use std::collections::BTreeSet;
 
 use k8s_openapi::api::batch::v1::Job;
 use kube::api::{DeleteParams, DynamicObject, ListParams, Patch, PatchParams};
+use kube::core::Status;
 use kube::{Api, Client, ResourceExt};
 
 use crate::kubernetes::{CallError, call};
@@ -21,10 +22,10 @@ pub async fn keep(client: &Client, leaderboard: &Leaderboard) -> Claims {
         return Claims::NotRequired;
     };
     let templates = templates(client, leaderboard);
-    match claim {
+    let wrong = match claim {
         ClaimOf::Template(name) => {
             let found = call("the ResourceClaimTemplate", name, templates.get(name)).await;
-            found.map_or_else(|error| absent(name, &error), |_| Claims::InPlace)
+            found.err().map(|error| fault(&error, absent(name, &error)))
         }
         ClaimOf::Devices { .. } => {
             let Some(template) = template(leaderboard) else {
@@ -34,12 +35,11 @@ pub async fn keep(client: &Client, leaderboard: &Leaderboard) -> Claims {
             let params = PatchParams::apply(names::MANAGER_CHILDREN).force();
             let patch = Patch::Apply(&template);
             let applied = templates.patch(&name, &params, &patch);
-            if let Err(error) = call("the ResourceClaimTemplate", &name, applied).await {
-                return not_applied(&name, &error);
-            }
-            Claims::InPlace
+            let applied = call("the ResourceClaimTemplate", &name, applied).await;
+            applied.err().map(|error| fault(&error, not_applied(&name, &error)))
         }
-    }
+    };
+    wrong.unwrap_or(Claims::InPlace)
 }
 
 fn templates(client: &Client, leaderboard: &Leaderboard) -> Api<DynamicObject> {
@@ -47,18 +47,17 @@ fn templates(client: &Client, leaderboard: &Leaderboard) -> Api<DynamicObject> {
     Api::namespaced_with(client.clone(), &namespace, &resource())
 }
 
-/// An answer about an object names it; one about the path does not.
-fn is_unserved(error: &CallError) -> bool {
-    let Some(status) = error.status() else { return false };
-    let names_object = status.details.as_ref().is_some_and(|details| !details.name.is_empty());
-    status.code == 404 && !names_object
+fn fault(error: &CallError, why: String) -> Claims {
+    // An answer about an object names it; one about the path does not.
+    let names_none = |status: &Status| status.details.as_ref().is_none_or(|details| details.name.is_empty());
+    match error.status() {
+        Some(status) if status.code == 404 && names_none(status) => Claims::NotServed,
+        _ => Claims::Missing(why),
+    }
 }
 
-fn absent(name: &str, error: &CallError) -> Claims {
-    if is_unserved(error) {
-        return Claims::NotServed;
-    }
-    Claims::Missing(if error.is_gone() {
+fn absent(name: &str, error: &CallError) -> String {
+    if error.is_gone() {
         format!(
             "There is no ResourceClaimTemplate {name} in this namespace, which gpu.claim.resourceClaimTemplateName names. Apply it, or \
              correct the name."
@@ -68,23 +67,18 @@ fn absent(name: &str, error: &CallError) -> Claims {
             "The ResourceClaimTemplate {name} could not be read: {}",
             sentence(&error.cause())
         )
-    })
+    }
 }
 
-fn not_applied(name: &str, error: &CallError) -> Claims {
-    if is_unserved(error) {
-        return Claims::NotServed;
-    }
+fn not_applied(name: &str, error: &CallError) -> String {
     let cause = sentence(&error.cause());
-    Claims::Missing(match error.status().map(|status| status.code) {
-        Some(403) => format!(
-            "The ResourceClaimTemplate {name} could not be applied: {cause} Give the operator's role list, get, create, patch and delete of \
-             resourceclaimtemplates in this namespace."
-        ),
-        _ => format!(
-            "The ResourceClaimTemplate {name} could not be applied: {cause} Correct gpu.claim if it is the cause."
-        ),
-    })
+    let step = match error.status().map(|status| status.code) {
+        Some(403) => {
+            "Give the operator's role list, get, create, patch and delete of resourceclaimtemplates in this namespace."
+        }
+        _ => "Correct gpu.claim if it is the cause.",
+    };
+    format!("The ResourceClaimTemplate {name} could not be applied: {cause} {step}")
 }
 
 /// Deletes the Leaderboard's other templates that no Job needs any more. A Pod that replaces a lost one claims by the template of its
@@ -105,13 +99,11 @@ pub async fn remove_others(client: &Client, leaderboard: &Leaderboard) -> Result
     let templates = templates(client, leaderboard);
     let found = call("the ResourceClaimTemplates", &name, templates.list_metadata(&params)).await?;
     let uid = uid_of(leaderboard);
-    let mut others = Vec::new();
-    for template in found.items {
+    let mut others = found.items;
+    others.retain(|template| {
         let is_ours = template.owner_references().iter().any(|owner| owner.uid == uid);
-        if is_ours && Some(template.name_any()) != current {
-            others.push(template.name_any());
-        }
-    }
+        is_ours && Some(template.name_any()) != current
+    });
     if others.is_empty() {
         return Ok(());
     }
@@ -123,10 +115,8 @@ pub async fn remove_others(client: &Client, leaderboard: &Leaderboard) -> Result
         .filter(|job| !has_ended(job))
         .flat_map(named)
         .collect();
-    for old in others {
-        if needed.contains(old.as_str()) {
-            continue;
-        }
+    let old = others.iter().map(ResourceExt::name_any);
+    for old in old.filter(|old| !needed.contains(old.as_str())) {
         let params = DeleteParams::default();
         let deleted = templates.delete(&old, &params);
         match call("deleting the ResourceClaimTemplate", &old, deleted).await {
@@ -159,8 +149,6 @@ fn named(job: &Job) -> impl Iterator<Item = &str> {
 
 #[cfg(test)]
 mod tests {
-    use kube::core::Status;
-
     use super::*;
 
     fn refused(code: u16, message: &str, name: Option<&str>) -> CallError {
@@ -181,23 +169,21 @@ mod tests {
         let page = || refused(404, "404 page not found", None);
         let resource = || refused(404, "the server could not find the requested resource", Some(""));
         for error in [page(), resource()] {
-            assert_eq!(absent("t", &error), Claims::NotServed);
-            assert_eq!(not_applied("t", &error), Claims::NotServed);
+            assert_eq!(fault(&error, absent("t", &error)), Claims::NotServed);
+            assert_eq!(fault(&error, not_applied("t", &error)), Claims::NotServed);
         }
         let missing = refused(404, "resourceclaimtemplates.resource.k8s.io \"t\" not found", Some("t"));
-        let Claims::Missing(why) = absent("t", &missing) else {
-            panic!("{missing}");
-        };
+        let why = absent("t", &missing);
+        assert_eq!(fault(&missing, why.clone()), Claims::Missing(why.clone()));
         assert!(
             why.starts_with("There is no ResourceClaimTemplate t in this namespace"),
             "{why}"
         );
         let namespace = refused(404, "namespaces \"gone\" not found", Some("gone"));
-        assert!(matches!(not_applied("t", &namespace), Claims::Missing(_)));
-        let forbidden = not_applied("t", &refused(403, "no", Some("t")));
-        let Claims::Missing(why) = forbidden else {
-            panic!("{forbidden:?}");
-        };
+        assert!(matches!(fault(&namespace, String::new()), Claims::Missing(_)));
+        let forbidden = refused(403, "no", Some("t"));
+        let why = not_applied("t", &forbidden);
+        assert_eq!(fault(&forbidden, why.clone()), Claims::Missing(why.clone()));
         assert!(why.contains("Give the operator's role list, get"), "{why}");
     }
 

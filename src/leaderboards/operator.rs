@@ -26,37 +26,21 @@ const OF_ANOTHER: Duration = Duration::from_mins(1);
 const UNCLAIMED: Duration = Duration::from_secs(2);
 
 /// The installation that drives a Leaderboard.
-#[derive(Clone, Copy, Debug, PartialEq, Eq)]
-enum Driver<'a> {
-    Us,
-    Nobody,
-    Other(&'a str),
-}
-
-fn driver<'a>(leaderboard: &'a Leaderboard, us: &str) -> Driver<'a> {
-    let named = leaderboard
-        .status
-        .as_ref()
-        .and_then(|status| status.operator.as_deref());
-    match named {
-        None => Driver::Nobody,
-        Some(operator) if operator == us => Driver::Us,
-        Some(operator) => Driver::Other(operator),
-    }
+fn driver(leaderboard: &Leaderboard) -> Option<&str> {
+    leaderboard.status.as_ref()?.operator.as_deref()
 }
 
 /// True if this installation drives a Leaderboard.
 pub fn is_ours(leaderboard: &Leaderboard, us: &str) -> bool {
-    driver(leaderboard, us) == Driver::Us
+    driver(leaderboard) == Some(us)
 }
 
 /// How long a Submission of this Leaderboard is left alone. None: this installation drives it, or there is none, and then none can
 /// start anything.
 pub fn left_alone(leaderboard: Option<&Leaderboard>, us: &str) -> Option<Duration> {
-    match driver(leaderboard?, us) {
-        Driver::Us => None,
-        Driver::Nobody => Some(UNCLAIMED),
-        Driver::Other(_) => Some(OF_ANOTHER),
+    match driver(leaderboard?) {
+        None => Some(UNCLAIMED),
+        Some(driver) => (driver != us).then_some(OF_ANOTHER),
     }
 }
 
@@ -68,10 +52,10 @@ pub(super) async fn ours(
     leaderboard: Arc<Leaderboard>,
     us: &str,
 ) -> Result<Result<Arc<Leaderboard>, Duration>, CallError> {
-    match driver(&leaderboard, us) {
-        Driver::Us => Ok(Ok(leaderboard)),
-        Driver::Nobody => claim(client, &leaderboard, us).await,
-        Driver::Other(other) => {
+    match driver(&leaderboard) {
+        None => claim(client, &leaderboard, us).await,
+        Some(driver) if driver == us => Ok(Ok(leaderboard)),
+        Some(other) => {
             let uid = uid_of(leaderboard.as_ref());
             let is_known = state.read(&uid, |entry| entry.other.as_deref() == Some(other));
             if !is_known {

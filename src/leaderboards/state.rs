@@ -175,16 +175,10 @@ impl LeaderboardState {
         self.change(uid, |entry| entry.standings.0 = Some(made.clone()));
     }
 
-    /// True if its status was not written within `age`.
-    pub(super) fn is_older(&self, uid: &str, now: Timestamp, age: Duration) -> bool {
-        self.read(uid, |entry| entry.written)
-            .is_none_or(|(at, _)| now.duration_since(at).unsigned_abs() >= age)
-    }
-
     /// True if the cache, which shows the version `shown`, may lack the last write of the status.
     pub(super) fn awaits_write(&self, uid: &str, shown: u64, now: Timestamp) -> bool {
         let written = self.read(uid, |entry| entry.written);
-        written.is_some_and(|(_, version)| shown < version) && !self.is_older(uid, now, SHOWS)
+        written.is_some_and(|(at, version)| shown < version && now.duration_since(at).unsigned_abs() < SHOWS)
     }
 }
 

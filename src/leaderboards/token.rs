@@ -9,15 +9,10 @@ use leaderboard_evalai::token::{Token, TokenError};
 
 /// Reads the token under a key of a JSON object in AWS Secrets Manager.
 pub async fn of_entry(aws: &Aws, place: &SecretsManagerKey) -> Result<Token, TokenError> {
-    let SecretsManagerKey {
-        id,
-        key,
-        region,
-        endpoint,
-    } = place;
-    let text = secret_text(aws, id, region.as_deref(), endpoint.as_deref()).await;
+    let (id, region, endpoint) = (&place.id, place.region.as_deref(), place.endpoint.as_deref());
+    let text = secret_text(aws, id, region, endpoint).await;
     let text = text.map_err(|why| TokenError::Unreadable { id: id.clone(), why })?;
-    Token::parse(&entry(id, key, &text)?)
+    Token::parse(&entry(id, &place.key, &text)?)
 }
 
 /// The text under a key of the entry's JSON object.
