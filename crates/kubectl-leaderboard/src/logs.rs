@@ -8,7 +8,7 @@ use clap::{Args, ValueEnum};
 use futures::StreamExt;
 use k8s_openapi::api::core::v1::Pod;
 use kube::ResourceExt;
-use leaderboard_api::{Agents, Attempt, RunPlan, State, Submission, names};
+use leaderboard_api::{Attempt, RunPlan, State, Submission, names};
 
 use crate::aws::{Unread, read};
 use crate::cluster::Cluster;
@@ -136,13 +136,13 @@ impl Source {
 pub async fn logs(cluster: &Cluster, wanted: &Logs) -> Result<ExitCode, Error> {
     let submission = cluster.submission(&wanted.name).await?;
     let of = wanted.whose(&submission);
-    let workers = workers(&submission, of);
-    if let Some(worker) = wanted.worker.filter(|worker| *worker == 0 || *worker > workers.max(1)) {
-        return Err(Error::Unfit(no_worker(&wanted.name, worker, workers)));
-    }
     if let Some(other) = of.in_place(facts::plan(&submission)) {
         let name = &wanted.name;
         return Err(Error::Unfit(format!("{name} has no such container. Use --of {other}")));
+    }
+    let workers = workers(&submission, of);
+    if let Some(worker) = wanted.worker.filter(|worker| *worker == 0 || *worker > workers.max(1)) {
+        return Err(Error::Unfit(no_worker(&wanted.name, worker, workers)));
     }
     if wanted.follow && !facts::has_ended(&submission) {
         return follow::follow(cluster, wanted, submission).await;
@@ -189,10 +189,11 @@ pub(super) fn end(submission: &Submission) -> String {
     format!("{}.{next}", facts::named(submission))
 }
 
-/// How many workers have such a container: of an agent that runs first, there is one.
+/// How many workers have such a container.
 fn workers(submission: &Submission, of: Whose) -> usize {
-    facts::plan(submission).map_or(0, |plan| match (of, plan.agents()) {
-        (Whose::Agent, Agents::First) => 1,
+    let plan = facts::plan(submission);
+    plan.map_or(0, |plan| match of {
+        Whose::Agent => plan.agent_count(),
         _ => plan.workers(),
     })
 }
@@ -305,6 +306,7 @@ pub(super) fn in_bucket(
 #[cfg(test)]
 mod tests {
     use super::*;
+    use leaderboard_api::{MergeMethod, PlannedEvaluation};
     use serde_json::{Value, json};
 
     fn frame() -> Frame {
@@ -407,6 +409,13 @@ mod tests {
         ] {
             assert_eq!(wanted(None, plan), expected);
         }
+        // A command that merges their results is one more, without an agent.
+        let mut merged = evaluated.clone();
+        if let PlannedEvaluation::Container(container) = &mut merged.evaluation {
+            container.merge = MergeMethod::Command;
+        }
+        let found = [Whose::Agent, Whose::Evaluator].map(|of| wanted(Some(of), &merged).1);
+        assert_eq!(found, [2, 3]);
         assert_eq!(wanted(Some(Whose::Evaluator), &batch), (Whose::Evaluator, 2));
         let containers = json!({"containers": [{"name": "evaluator-1"}], "initContainers": [{"name": "workspace"}]});
         let pod: Pod = serde_json::from_value(json!({"metadata": {}, "spec": containers})).unwrap();

@@ -55,7 +55,7 @@ use self::cluster::{Cluster, Scope, Target};
 use self::complete::Offer;
 use self::error::Error;
 use self::help::GLOBAL;
-use self::output::{Colour, Format, Output, note, print};
+use self::output::{Colour, Format, Output, formats, note, print};
 
 /// How long a shell waits for names.
 const COMPLETION: Duration = Duration::from_secs(3);
@@ -167,7 +167,7 @@ struct Watched {
     #[command(flatten)]
     scope: Scope,
     /// Output format; wide: more columns.
-    #[arg(short = 'o', long = "output", value_enum, default_value_t, value_name = "FORMAT")]
+    #[arg(short = 'o', long = "output", value_name = "FORMAT", default_value = "text", value_parser = formats(["text", "wide", "json", "yaml"]))]
     format: Format,
     /// Print it again each time it changes, until it has ended.
     #[arg(short, long, requires = "name")]

@@ -29,19 +29,20 @@ pub enum Format {
     Wide,
     Json,
     Yaml,
+    Csv,
 }
 
 /// The flag `-o`.
 #[derive(Args, Clone, Copy, Debug)]
 pub struct Output {
     /// Output format.
-    #[arg(short = 'o', long = "output", value_name = "FORMAT", default_value = "text", value_parser = narrow())]
+    #[arg(short = 'o', long = "output", value_name = "FORMAT", default_value = "text", value_parser = formats(["text", "json", "yaml"]))]
     pub format: Format,
 }
 
-/// The formats of a command without further columns.
-fn narrow() -> impl TypedValueParser<Value = Format> {
-    let parser = PossibleValuesParser::new(["text", "json", "yaml"]);
+/// Those of the formats that a command has.
+pub fn formats<const N: usize>(names: [&'static str; N]) -> impl TypedValueParser<Value = Format> {
+    let parser = PossibleValuesParser::new(names);
     parser.map(|name| Format::from_str(&name, true).unwrap_or_default())
 }
 
@@ -70,7 +71,7 @@ impl Colour {
 /// A value as text in a format for programs; none for the formats of people.
 pub fn document(format: Format, value: &Value) -> Option<Vec<String>> {
     match format {
-        Format::Text | Format::Wide => None,
+        Format::Text | Format::Wide | Format::Csv => None,
         Format::Json => Some(vec![escaped(&format!("{value:#}"), |c| {
             let mut units = [0; 2];
             let units = c.encode_utf16(&mut units);

@@ -4,28 +4,25 @@
 
 use std::process::ExitCode;
 
-use clap::{Args, ValueEnum};
+use clap::Args;
 use jiff::Timestamp;
 use k8s_openapi::apimachinery::pkg::apis::meta::v1::Time;
 use kube::ResourceExt;
-use leaderboard_api::standings::{standings, track_of};
-use leaderboard_api::{Leaderboard, Order, Ranking, Standing, Submission, TrackStatus};
-use serde_json::{Value, json};
+use leaderboard_api::standings::standings;
+use leaderboard_api::{Leaderboard, Ranking, Standing, Submission, TrackStatus};
+use serde::Serialize;
+use serde_json::json;
 
 use crate::cluster::{Cluster, Filter, Scope};
 use crate::commands::frame;
 use crate::csv;
 use crate::error::{Error, no_leaderboards};
 use crate::output::{self, Format, print};
-use crate::table::table;
-use crate::text::{Frame, columns, join};
+use crate::table::{table, whole_width};
+use crate::text::{Frame, columns};
 
 /// Columns to which the name of a team may be cut before a metric is left out.
 const TEAM: usize = 16;
-/// Columns between two cells.
-const GAP: usize = 2;
-/// The team of a submission that has none.
-const NO_TEAM: &str = "(none)";
 
 /// Arguments of `scores`: the standings to print, and their format.
 #[derive(Args, Debug)]
@@ -40,28 +37,17 @@ pub struct Scores {
     all_namespaces: bool,
     /// Output format.
     #[arg(short = 'o', long = "output", value_enum, default_value_t, value_name = "FORMAT")]
-    format: As,
-}
-
-/// Output format of the standings.
-#[derive(ValueEnum, Clone, Copy, Debug, Default, PartialEq, Eq)]
-enum As {
-    #[default]
-    Text,
-    // All metrics, in columns as wide as they are.
-    Wide,
-    Json,
-    Yaml,
-    Csv,
+    format: Format,
 }
 
 /// The standings of one track.
-#[derive(Debug, PartialEq)]
+#[derive(Serialize, Debug, PartialEq)]
 pub(super) struct Board {
     pub(super) namespace: String,
     pub(super) leaderboard: String,
     pub(super) track: String,
     pub(super) ranking: Option<Ranking>,
+    #[serde(rename = "standings")]
     pub(super) rows: Vec<Standing>,
 }
 
@@ -121,9 +107,7 @@ pub(super) fn boards(leaderboards: &[Leaderboard], submissions: &[Submission], t
         for track in tracks.filter(|name| track.is_none_or(|track| track == *name)) {
             let shown = leaderboard.status.iter().flat_map(|status| &status.tracks);
             let stored = shown.into_iter().find(|stored| stored.name == track);
-            let ranking = stored
-                .and_then(|stored| stored.ranking.clone())
-                .or_else(|| own_ranking(track, &its));
+            let ranking = stored.and_then(|stored| stored.ranking.clone());
             let kept = stored.map_or(&[][..], |TrackStatus { standings, .. }| standings);
             let rows = ranking
                 .as_ref()
@@ -140,32 +124,16 @@ pub(super) fn boards(leaderboards: &[Leaderboard], submissions: &[Submission], t
     boards
 }
 
-/// By the score that the results themselves name: before the operator has looked at the Leaderboard, or one of an older version.
-fn own_ranking(track: &str, submissions: &[&Submission]) -> Option<Ranking> {
-    let scores = submissions.iter().filter(|one| track_of(one) == Some(track));
-    let mut names = scores.filter_map(|one| Some(one.status.as_ref()?.score.as_ref()?.name.clone()));
-    let metric = names.next()?;
-    let order = Order::Descending;
-    Some(Ranking { metric, order })
-}
-
-fn printed(boards: &[Board], format: As, frame: Frame) -> Vec<String> {
-    let document = match format {
-        As::Text => None,
-        As::Wide => {
-            return text(
-                boards,
-                Frame {
-                    width: usize::MAX,
-                    ..frame
-                },
-            );
+fn printed(boards: &[Board], format: Format, frame: Frame) -> Vec<String> {
+    match format {
+        // All metrics, in columns as wide as they are.
+        Format::Wide => {
+            let width = usize::MAX;
+            text(boards, Frame { width, ..frame })
         }
-        As::Json => output::document(Format::Json, &value(boards)),
-        As::Yaml => output::document(Format::Yaml, &value(boards)),
-        As::Csv => return comma_separated(boards),
-    };
-    document.unwrap_or_else(|| text(boards, frame))
+        Format::Csv => comma_separated(boards),
+        format => output::document(format, &json!(boards)).unwrap_or_else(|| text(boards, frame)),
+    }
 }
 
 /// For people: a table for each track.
@@ -176,18 +144,13 @@ pub(super) fn text(boards: &[Board], frame: Frame) -> Vec<String> {
         if !lines.is_empty() {
             lines.push(String::new());
         }
-        let namespace = if is_qualified {
-            format!("{}/", board.namespace)
+        let by = board.ranking.as_ref().map(|ranking| format!(": {ranking}"));
+        let title = format!("{}, track {}{}", board.leaderboard, board.track, by.unwrap_or_default());
+        lines.push(if is_qualified {
+            format!("{}/{title}", board.namespace)
         } else {
-            String::new()
-        };
-        let title = format!("{namespace}{}, track {}", board.leaderboard, board.track);
-        let by = board
-            .ranking
-            .as_ref()
-            .map(|ranking| format!(": {ranking}"))
-            .unwrap_or_default();
-        lines.push(join(&[&format!("{title}{by}")]));
+            title
+        });
         if board.rows.is_empty() {
             lines.push("No result ranks yet.".to_owned());
         } else {
@@ -216,44 +179,28 @@ fn of_board(board: &Board, frame: Frame) -> Vec<String> {
 }
 
 fn cells(rows: &[Standing], metric: &str, metrics: &[&str]) -> (Vec<String>, Vec<Vec<String>>) {
-    let title = |text: &str| text.to_uppercase();
-    let head = ["RANK".to_owned(), "TEAM".to_owned(), title(metric)];
-    let head = head.into_iter().chain(metrics.iter().map(|name| title(name)));
-    let head = head.chain(["SUBMISSION".to_owned(), "WHEN".to_owned()]);
+    let head = ["RANK", "TEAM", metric].into_iter().chain(metrics.iter().copied());
+    let head = head.chain(["SUBMISSION", "WHEN"]).map(str::to_uppercase);
     let row = |row: &Standing| {
-        let team = if row.team.is_empty() { NO_TEAM } else { &row.team };
-        let first = [row.rank.to_string(), team.to_owned(), row.score.text.clone()];
-        let others = metrics
-            .iter()
-            .map(|name| row.metric(name).unwrap_or_default().to_owned());
-        let last = [
-            row.submission.clone(),
-            row.finished_at.as_ref().map(minute).unwrap_or_default(),
-        ];
-        first.into_iter().chain(others).chain(last).collect()
+        let team = if row.team.is_empty() { "(none)" } else { &row.team };
+        let mut cells = vec![row.rank.to_string(), team.to_owned(), row.score.text.clone()];
+        cells.extend(
+            metrics
+                .iter()
+                .map(|name| row.metric(name).unwrap_or_default().to_owned()),
+        );
+        cells.push(row.submission.clone());
+        cells.push(row.finished_at.as_ref().map(minute).unwrap_or_default());
+        cells
     };
     (head.collect(), rows.iter().map(row).collect())
 }
 
 /// True if a table fits with only the names of teams cut, to `TEAM` columns.
 fn fits(head: &[String], rows: &[Vec<String>], width: usize) -> bool {
-    let widest = |column: usize| {
-        let cells = rows.iter().filter_map(|row| row.get(column));
-        cells
-            .chain(head.get(column))
-            .map(|cell| columns(cell))
-            .max()
-            .unwrap_or(0)
-    };
-    let of_column = |column: usize| {
-        if column == 1 {
-            widest(column).min(TEAM)
-        } else {
-            widest(column)
-        }
-    };
-    let cells: usize = (0..head.len()).map(|column| of_column(column) + GAP).sum();
-    cells.saturating_sub(GAP) <= width
+    let teams = rows.iter().filter_map(|row| row.get(1));
+    let widest = teams.map(|team| columns(team)).max().unwrap_or(0);
+    whole_width(head, rows) <= width.saturating_add(widest.saturating_sub(TEAM))
 }
 
 fn minute(time: &Time) -> String {
@@ -271,42 +218,29 @@ fn metric_names<'a>(rows: impl IntoIterator<Item = &'a Standing>) -> Vec<&'a str
     names
 }
 
-/// The standings as JSON.
-pub(super) fn value(boards: &[Board]) -> Value {
-    let item = |board: &Board| {
-        json!({
-            "namespace": board.namespace, "leaderboard": board.leaderboard, "track": board.track,
-            "ranking": board.ranking, "standings": board.rows,
-        })
-    };
-    Value::Array(boards.iter().map(item).collect())
-}
-
 /// The standings for a spreadsheet: one line for each row of all tracks.
 pub(super) fn comma_separated(boards: &[Board]) -> Vec<String> {
     let metrics = metric_names(boards.iter().flat_map(|board| &board.rows));
-    let head = ["namespace", "leaderboard", "track", "rank", "team", "metric", "score"];
-    let head = head
-        .iter()
-        .chain(&metrics)
-        .chain(&["submission", "attempt", "submitted", "finished"]);
-    let mut lines = vec![csv::line(head.copied())];
+    let mut head = vec!["namespace", "leaderboard", "track", "rank", "team", "metric", "score"];
+    head.extend(&metrics);
+    head.extend(["submission", "attempt", "submitted", "finished"]);
+    let mut lines = vec![csv::line(head)];
     let exact = |time: Option<&Time>| time.map(|time| exact(time.0)).unwrap_or_default();
     for board in boards {
         for row in &board.rows {
             let rank = row.rank.to_string();
             let attempt = row.attempt.map(|attempt| attempt.to_string()).unwrap_or_default();
             let (submitted, finished) = (exact(row.submitted_at.as_ref()), exact(row.finished_at.as_ref()));
-            let first = [&board.namespace, &board.leaderboard, &board.track, &rank, &row.team];
-            let score = [row.score.name.as_str(), row.score.value.as_str()];
-            let others = metrics.iter().map(|name| row.metric(name).unwrap_or_default());
-            let last = [row.submission.as_str(), &attempt, &submitted, &finished];
-            let cells = first
-                .into_iter()
-                .map(String::as_str)
-                .chain(score)
-                .chain(others)
-                .chain(last);
+            let mut cells = vec![
+                board.namespace.as_str(),
+                &board.leaderboard,
+                &board.track,
+                &rank,
+                &row.team,
+            ];
+            cells.extend([row.score.name.as_str(), &row.score.value]);
+            cells.extend(metrics.iter().map(|name| row.metric(name).unwrap_or_default()));
+            cells.extend([row.submission.as_str(), &attempt, &submitted, &finished]);
             lines.push(csv::line(cells));
         }
     }

@@ -144,24 +144,28 @@ fn systems(status: &SubmissionStatus) -> String {
     sentence(&texts.collect::<Vec<_>>().join(", "))
 }
 
+/// Columns of the list, and those of `-o wide`.
+const HEAD: [&str; 7] = ["NAME", "STATE", "REASON", "PROGRESS", "SCORE", "SINCE", "QUEUE"];
+const WIDE: [&str; 6] = ["LEADERBOARD", "TRACK", "TEAM", "ATTEMPT", "CRASHES", "NODE"];
+
 /// One line of each submission: running ones first, then waiting ones by place, then ended ones, the latest first.
 pub fn lines(submissions: &[Submission], is_qualified: bool, is_wide: bool, frame: Frame) -> Vec<String> {
     let now = frame.now;
     let mut all: Vec<&Submission> = submissions.iter().collect();
     all.sort_by_key(|one| order(one, now));
-    let mut head = vec!["NAME", "STATE", "REASON", "PROGRESS", "SCORE", "SINCE", "QUEUE"];
-    if is_qualified {
-        head.insert(0, "NAMESPACE");
-    }
-    if is_wide {
-        head.extend(["LEADERBOARD", "TRACK", "TEAM", "ATTEMPT", "CRASHES", "NODE"]);
-    }
+    let head = [&["NAMESPACE"][..], &HEAD, &WIDE].concat();
+    // `-o wide` is printed whole: the person has the space, or accepts broken lines.
+    let (left_out, width) = if is_wide {
+        (0, usize::MAX)
+    } else {
+        (WIDE.len(), frame.width)
+    };
+    let shown = usize::from(!is_qualified)..head.len() - left_out;
     let rows: Vec<Vec<String>> = all
         .into_iter()
-        .map(|one| row(one, is_qualified, is_wide, now))
+        .map(|one| row(one, now)[shown.clone()].to_vec())
         .collect();
-    // `-o wide` is printed whole: the person has the space, or accepts broken lines.
-    table(&head, &rows, if is_wide { usize::MAX } else { frame.width })
+    table(&head[shown], &rows, width)
 }
 
 fn order(submission: &Submission, now: Timestamp) -> (u8, i64, String) {
@@ -179,12 +183,14 @@ fn order(submission: &Submission, now: Timestamp) -> (u8, i64, String) {
     (class, within, submission.name_any())
 }
 
-fn row(submission: &Submission, is_qualified: bool, is_wide: bool, now: Timestamp) -> Vec<String> {
+fn row(submission: &Submission, now: Timestamp) -> Vec<String> {
     let status = facts::status(submission);
     let text = |text: Option<&str>| text.unwrap_or_default().to_owned();
     let since = facts::since(submission).or_else(|| submission.creation_timestamp().map(|made| made.0));
     let since = since.map(|at| age(at, now));
-    let mut row = vec![
+    let crashes: i32 = status.workers.iter().map(|worker| worker.crashes).sum();
+    vec![
+        submission.namespace().unwrap_or_default(),
         submission.name_any(),
         status.known_state().map_or("(new)", State::as_str).to_owned(),
         facts::reason(status, "").trim_end_matches(':').to_owned(),
@@ -192,22 +198,13 @@ fn row(submission: &Submission, is_qualified: bool, is_wide: bool, now: Timestam
         text(status.score.as_ref().map(|score| score.text.as_str())),
         since.unwrap_or_default(),
         status.waiting.as_deref().map(place).unwrap_or_default(),
-    ];
-    if is_qualified {
-        row.insert(0, submission.namespace().unwrap_or_default());
-    }
-    if is_wide {
-        let crashes: i32 = status.workers.iter().map(|worker| worker.crashes).sum();
-        row.extend([
-            submission.spec.leaderboard_name.clone(),
-            text(track_of(submission)),
-            submission.team_name().unwrap_or_default(),
-            status.attempt.map(|attempt| attempt.to_string()).unwrap_or_default(),
-            crashes.to_string(),
-            text(status.node_name.as_deref()),
-        ]);
-    }
-    row
+        submission.spec.leaderboard_name.clone(),
+        text(track_of(submission)),
+        submission.team_name().unwrap_or_default(),
+        status.attempt.map(|attempt| attempt.to_string()).unwrap_or_default(),
+        crashes.to_string(),
+        text(status.node_name.as_deref()),
+    ]
 }
 
 /// `#3, 20m-35m`: the place in line, and how long it may take.

@@ -55,6 +55,11 @@ fn narrowed(mut head: Vec<String>, mut rows: Vec<Vec<String>>, width: usize) -> 
     (head, rows)
 }
 
+/// Columns of a table whose cells are not cut.
+pub(super) fn whole_width(head: &[String], rows: &[Vec<String>]) -> usize {
+    total(&widths(head, rows, usize::MAX))
+}
+
 /// Columns of a line.
 fn total(widths: &[usize]) -> usize {
     widths.iter().sum::<usize>() + GAP * widths.len().saturating_sub(1)

@@ -1,21 +1,24 @@
 //! `top`: who uses the slots of each Leaderboard and who waits, by team. Pure.
 
+use std::cmp::Reverse;
 use std::collections::{BTreeMap, BTreeSet};
 
 use kube::ResourceExt;
 use leaderboard_api::{Leaderboard, State, Submission};
+use serde::Serialize;
 use serde_json::{Value, json};
 
 use super::facts;
 use super::table::table;
 use super::text::Frame;
 
-/// Leaderboard and team.
-type Key = (String, String, String);
-
 /// The submissions of one team in one Leaderboard.
-#[derive(Clone, Debug, Default)]
+#[derive(Serialize, Debug, Default)]
+#[serde(rename_all = "camelCase")]
 struct Use {
+    namespace: String,
+    leaderboard: String,
+    team: String,
     /// Submissions with a slot, also while their Pod starts.
     running: usize,
     waiting: usize,
@@ -26,20 +29,22 @@ struct Use {
     crashes: i64,
 }
 
-fn uses(submissions: &[Submission]) -> Vec<(Key, Use)> {
-    let mut uses: BTreeMap<Key, Use> = BTreeMap::new();
+fn uses(submissions: &[Submission]) -> Vec<Use> {
+    let mut uses: BTreeMap<(String, String, String), Use> = BTreeMap::new();
     for one in submissions {
+        let (namespace, leaderboard) = (one.namespace().unwrap_or_default(), one.spec.leaderboard_name.clone());
         let team = if one.spec.check {
             "(check)".to_owned()
         } else {
             one.team_name().unwrap_or_else(|| "(none)".to_owned())
         };
-        let key = (
-            one.namespace().unwrap_or_default(),
-            one.spec.leaderboard_name.clone(),
+        let key = (namespace.clone(), leaderboard.clone(), team.clone());
+        let each = uses.entry(key).or_insert_with(|| Use {
+            namespace,
+            leaderboard,
             team,
-        );
-        let each = uses.entry(key).or_default();
+            ..Use::default()
+        });
         let status = facts::status(one);
         match status.known_state() {
             Some(State::Running | State::Resumed) => each.running += 1,
@@ -54,16 +59,9 @@ fn uses(submissions: &[Submission]) -> Vec<(Key, Use)> {
         let crashes = status.workers.iter().map(|worker| i64::from(worker.crashes));
         each.crashes += crashes.sum::<i64>();
     }
-    let mut all: Vec<(Key, Use)> = uses.into_iter().collect();
-    let within = |each: &Use| {
-        let load = (each.running, each.waiting);
-        std::cmp::Reverse(load)
-    };
-    all.sort_by(|(a, x), (b, y)| {
-        (&a.0, &a.1)
-            .cmp(&(&b.0, &b.1))
-            .then_with(|| within(x).cmp(&within(y)).then_with(|| a.2.cmp(&b.2)))
-    });
+    let mut all: Vec<Use> = uses.into_values().collect();
+    let load = |each: &Use| Reverse((each.running, each.waiting));
+    all.sort_by_cached_key(|each| (each.namespace.clone(), each.leaderboard.clone(), load(each)));
     all
 }
 
@@ -88,8 +86,10 @@ pub fn lines(submissions: &[Submission], leaderboards: &[Leaderboard], frame: Fr
     for board in leaderboards {
         boards.insert((board.namespace().unwrap_or_default(), board.name_any()), (0, 0));
     }
-    for ((namespace, board, _), each) in &uses {
-        let entry = boards.entry((namespace.clone(), board.clone())).or_default();
+    for each in &uses {
+        let entry = boards
+            .entry((each.namespace.clone(), each.leaderboard.clone()))
+            .or_default();
         (entry.0, entry.1) = (entry.0 + each.running, entry.1 + each.waiting);
     }
     let rows: Vec<Vec<String>> = boards
@@ -111,8 +111,9 @@ pub fn lines(submissions: &[Submission], leaderboards: &[Leaderboard], frame: Fr
     lines
 }
 
-fn of_teams(uses: &[(Key, Use)], is_qualified: bool, frame: Frame) -> Vec<String> {
-    let mut head = vec![
+fn of_teams(uses: &[Use], is_qualified: bool, frame: Frame) -> Vec<String> {
+    let head = [
+        "NAMESPACE",
         "LEADERBOARD",
         "TEAM",
         "RUNNING",
@@ -122,24 +123,20 @@ fn of_teams(uses: &[(Key, Use)], is_qualified: bool, frame: Frame) -> Vec<String
         "CANCELLED",
         "CRASHES",
     ];
-    let mut rows: Vec<Vec<String>> = uses.iter().map(|(key, each)| row(key, each)).collect();
-    if is_qualified {
-        head.insert(0, "NAMESPACE");
-        for (row, ((namespace, ..), _)) in rows.iter_mut().zip(uses) {
-            row.insert(0, namespace.clone());
-        }
-    }
-    table(&head, &rows, frame.width)
+    let left_out = usize::from(!is_qualified);
+    let rows: Vec<Vec<String>> = uses.iter().map(|each| row(each).split_off(left_out)).collect();
+    table(&head[left_out..], &rows, frame.width)
 }
 
-fn row((_, board, team): &Key, each: &Use) -> Vec<String> {
+fn row(each: &Use) -> Vec<String> {
     let waiting = match each.first_in_line {
         Some(place) => format!("{} (#{place})", each.waiting),
         None => each.waiting.to_string(),
     };
     vec![
-        board.clone(),
-        team.clone(),
+        each.namespace.clone(),
+        each.leaderboard.clone(),
+        each.team.clone(),
         each.running.to_string(),
         waiting,
         each.finished.to_string(),
@@ -151,13 +148,5 @@ fn row((_, board, team): &Key, each: &Use) -> Vec<String> {
 
 /// The table as JSON.
 pub fn value(submissions: &[Submission]) -> Value {
-    let uses = uses(submissions);
-    let items = uses.iter().map(|((namespace, leaderboard, team), each)| {
-        json!({
-            "namespace": namespace, "leaderboard": leaderboard, "team": team, "running": each.running, "waiting": each.waiting,
-            "firstInLine": each.first_in_line, "finished": each.finished, "failed": each.failed,
-            "cancelled": each.cancelled, "crashes": each.crashes,
-        })
-    });
-    Value::Array(items.collect())
+    json!(uses(submissions))
 }
