@@ -108,10 +108,8 @@ impl Known<'_> {
             format!("--log-limit={HOST_LOG_LIMIT}"),
         ];
         let port = self.port().map(|port| format!("--port={port}"));
-        let resume = if self.asked.resume { "1" } else { "" };
         let own = [
             ("RESULTS", RESULTS.to_owned()),
-            ("RESUME", resume.to_owned()),
             ("ATTEMPT", self.asked.attempt.to_string()),
         ];
         let results = Mount::Own {
@@ -229,7 +227,7 @@ fn folder(data: &Data<'_>) -> (&'static str, String) {
     (data.variable, data.volume.read.to_owned())
 }
 
-/// Words as they reach the runner, which expands them: RESUME is then what it is in this round.
+/// Words as they reach the runner, which expands them: it alone knows RESUME, which is of this round.
 fn literals(words: &[String]) -> Vec<String> {
     words.iter().map(|word| literal(word)).collect()
 }
@@ -262,18 +260,18 @@ mod tests {
         serde_json::from_value(spec).unwrap()
     }
 
-    fn of_second_worker(spec: &LeaderboardSpec, resume: bool) -> Option<Workload> {
-        of(spec, &fixtures::container_run().plan, resume, 2)
+    fn of_second_worker(spec: &LeaderboardSpec) -> Option<Workload> {
+        of(spec, &fixtures::container_run().plan, 2)
     }
 
-    fn of(spec: &LeaderboardSpec, plan: &RunPlan, resume: bool, worker: u16) -> Option<Workload> {
+    fn of(spec: &LeaderboardSpec, plan: &RunPlan, worker: u16) -> Option<Workload> {
         let asked = Asked {
             spec,
             track: spec.tracks.first(),
             plan,
             attempt: Attempt(3),
             deadlines: spec.deadlines,
-            resume,
+            resume: true,
             has_gpus: false,
         };
         workload(&asked, Pair::new(worker).unwrap())
@@ -286,7 +284,7 @@ mod tests {
 
     #[test]
     fn the_agent_finds_the_evaluator_of_its_own_worker_and_sees_nothing_else_of_it() {
-        let Workload { host, agent } = of_second_worker(&spec(Some(5000)), true).unwrap();
+        let Workload { host, agent } = of_second_worker(&spec(Some(5000))).unwrap();
         let agent = agent.unwrap();
         assert_eq!(host.flags[0], "--port=5100");
         assert_eq!(host.command, ["python3", "$$(RESUME)"]);
@@ -303,7 +301,7 @@ mod tests {
                 "{name}"
             );
         }
-        for (name, of_host) in [("RESULTS", "/results"), ("RESUME", "1"), ("ATTEMPT", "3")] {
+        for (name, of_host) in [("RESULTS", "/results"), ("ATTEMPT", "3")] {
             assert_eq!(
                 (value(&host, name), value(&agent, name)),
                 (Some(of_host), None),
@@ -370,7 +368,7 @@ mod tests {
             more["mode"] = mode.into();
             let spec = spec_with(&more);
             let plan = fixtures::run_of_mode(spec.evaluation.container().unwrap().mode).plan;
-            let of_worker = |worker| of(&spec, &plan, false, worker).unwrap().agent;
+            let of_worker = |worker| of(&spec, &plan, worker).unwrap().agent;
             let agent = of_worker(1);
             let found = agent.as_ref().map(given);
             let found = found.as_ref().map(|(env, mounts)| {
@@ -399,9 +397,9 @@ mod tests {
             more["mode"] = mode.into();
             let spec = spec_with(&more);
             let mode = spec.evaluation.container().unwrap().mode;
-            let host = of(&spec, &fixtures::run_of_mode(mode).plan, false, 2).unwrap().host;
+            let host = of(&spec, &fixtures::run_of_mode(mode).plan, 2).unwrap().host;
             let (mut env, mut mounts) = (
-                [&OF_WORKER[..], &["RESULTS", "RESUME", "ATTEMPT"]].concat(),
+                [&OF_WORKER[..], &["RESULTS", "ATTEMPT"]].concat(),
                 vec!["evaluators/2+ /results"],
             );
             if input {
@@ -443,16 +441,15 @@ mod tests {
         ] {
             let mut plan = fixtures::run_of_mode(mode).plan;
             plan.image = None;
-            assert_eq!(of(&spec(None), &plan, false, 1).is_some(), has_workers, "{mode:?}");
+            assert_eq!(of(&spec(None), &plan, 1).is_some(), has_workers, "{mode:?}");
         }
     }
 
     #[test]
     fn without_a_port_the_agent_gets_no_address() {
-        let Workload { host, agent } = of_second_worker(&spec(None), false).unwrap();
+        let Workload { host, agent } = of_second_worker(&spec(None)).unwrap();
         assert!(!host.flags.iter().any(|flag| flag.starts_with("--port")));
         assert_eq!((value(&host, ADDRESS), value(&agent.unwrap(), ADDRESS)), (None, None));
-        assert_eq!(value(&host, "RESUME"), Some(""));
     }
 
     #[test]

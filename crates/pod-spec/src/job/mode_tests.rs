@@ -224,7 +224,6 @@ fn evaluators_and_the_agent_find_their_folders_by_variables() {
         ("TRACK", "test"),
         ("PHASE", "7"),
         ("RESULTS", "/results"),
-        ("RESUME", "1"),
         ("ATTEMPT", "2"),
         ("DATASET", "/dataset"),
         ("LABELS", "/labels"),
