@@ -59,6 +59,9 @@ pub enum MergeMethod {
     Mean,
     /// Each metric is the sum of all workers.
     Sum,
+    /// The evaluator's command once more, with `WORKER=merge`. It begins when the results of all workers are final, reads what they have left,
+    /// and writes the result of the run.
+    Command,
 }
 
 /// The evaluation by a container of the host's.
@@ -195,6 +198,14 @@ impl Default for InputBounds {
     }
 }
 
+impl ContainerPlan {
+    /// The number of the worker whose command merges the results of all before it, if there is one.
+    pub fn merger(&self) -> Option<usize> {
+        let sharing = usize::try_from(self.workers).unwrap_or(1);
+        (self.merge == MergeMethod::Command).then(|| sharing.saturating_add(1))
+    }
+}
+
 impl ContainerEvaluation {
     /// True if an agent gets the dataset.
     pub fn agent_has_dataset(&self) -> bool {
@@ -268,7 +279,7 @@ impl ScoreMetric {
 pub struct ContainerPlan {
     /// Mode in which the evaluator and the participant's image meet.
     pub mode: EvaluationMode,
-    /// Number of workers, each with an evaluator of its own; in Interactive with an agent, too.
+    /// Number of workers that share the work, each with an evaluator of its own; in Interactive with an agent, too.
     pub workers: i32,
     /// Treatment of the results of several workers.
     pub merge: MergeMethod,

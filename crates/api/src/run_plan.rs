@@ -28,11 +28,44 @@ impl RunPlan {
     }
 
     /// How many workers share the work.
-    pub fn workers(&self) -> usize {
+    pub fn sharing(&self) -> usize {
         match &self.evaluation {
             PlannedEvaluation::Carla(carla) => carla.slices.len(),
             PlannedEvaluation::Container(container) => usize::try_from(container.workers).unwrap_or(1),
         }
+    }
+
+    /// The number of the worker whose command merges the results of all others, if there is one. It is the last, and has no agent.
+    pub fn merger(&self) -> Option<usize> {
+        self.container().and_then(ContainerPlan::merger)
+    }
+
+    /// How many workers there are, the one that merges among them.
+    pub fn workers(&self) -> usize {
+        self.merger().unwrap_or_else(|| self.sharing())
+    }
+
+    /// How agents stand to the container of the host of one worker, which counts from 1.
+    pub fn agents_of(&self, worker: usize) -> Agents {
+        if self.merger() == Some(worker) {
+            Agents::Absent
+        } else {
+            self.agents()
+        }
+    }
+
+    /// True if this worker has an agent. One that runs before all evaluators is the first worker's.
+    pub fn has_agent(&self, worker: usize) -> bool {
+        match self.agents_of(worker) {
+            Agents::Beside => true,
+            Agents::First => worker == 1,
+            Agents::Absent => false,
+        }
+    }
+
+    /// How many workers have an agent.
+    pub fn agent_count(&self) -> usize {
+        (1..=self.workers()).filter(|worker| self.has_agent(*worker)).count()
     }
 
     /// The plan of CARLA's evaluation, if it is one.
@@ -199,5 +232,28 @@ mod tests {
         let carla = plan.carla().unwrap();
         assert_eq!(carla.slices, [RouteSlice { first: 4, last: 4 }]);
         assert_eq!((carla.routes, carla.repetitions, plan.total_of(1)), (1, 1, 1));
+    }
+
+    #[test]
+    fn the_worker_that_merges_comes_last_and_has_no_agent() {
+        for (mode, merge, agents) in [
+            ("Interactive", "Mean", vec![1, 2]),
+            ("Interactive", "Command", vec![1, 2]),
+            ("Batch", "Sum", vec![1]),
+            ("Batch", "Command", vec![1]),
+            ("Predictions", "Command", vec![]),
+        ] {
+            let container = json!({"mode": mode, "workers": 2, "merge": merge, "score": {"metric": "m"}, "image": "e"});
+            let plan = json!({
+                "runId": "7", "track": "t", "storage": {"s3": {"bucket": "b"}}, "image": "a:1", "container": container,
+            });
+            let plan: RunPlan = serde_json::from_value(plan).unwrap();
+            let merger = (merge == "Command").then_some(3);
+            assert_eq!((plan.sharing(), plan.merger()), (2, merger), "{mode} {merge}");
+            assert_eq!(plan.workers(), merger.unwrap_or(2), "{mode} {merge}");
+            let found: Vec<usize> = (1..=plan.workers()).filter(|worker| plan.has_agent(*worker)).collect();
+            assert_eq!((found.len(), &found), (plan.agent_count(), &agents), "{mode} {merge}");
+            assert_eq!(plan.of_check().merger(), merger.map(|_| 2), "{mode} {merge}");
+        }
     }
 }

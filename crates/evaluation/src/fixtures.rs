@@ -93,6 +93,15 @@ pub fn run_of_mode(mode: EvaluationMode) -> Run {
     run
 }
 
+/// The same, whose results a command merges.
+pub fn merging_run(mode: EvaluationMode) -> Run {
+    let mut run = run_of_mode(mode);
+    if let PlannedEvaluation::Container(container) = &mut run.plan.evaluation {
+        container.merge = MergeMethod::Command;
+    }
+    run
+}
+
 /// A result with an accuracy over the units `done` of `total`, which is final if none is missing.
 pub fn result(done: u32, total: u32, accuracy: f64) -> String {
     let splits = serde_json::json!([{"name": "test", "metrics": {"accuracy": accuracy}}]);

@@ -8,7 +8,6 @@ use std::fmt::Debug;
 use std::path::PathBuf;
 use std::sync::Arc;
 
-use leaderboard_api::Agents;
 use leaderboard_contract::keys::results_path;
 use leaderboard_contract::report::{RefusedResults, ReportWorker};
 use leaderboard_contract::run::{Run, STATUS_FOLDER};
@@ -76,6 +75,7 @@ pub(crate) struct Merged {
 #[derive(Debug)]
 struct Worker<F> {
     pair: Pair,
+    has_agent: bool,
     good: Option<F>,
     seen: Option<Stamp>,
     /// The copy as it was read last.
@@ -102,7 +102,6 @@ pub(crate) struct Gatherer<K: Kind> {
     kind: K,
     tree: Arc<Tree>,
     status: PathBuf,
-    agents: Agents,
     workers: Vec<Worker<K::Found>>,
     merged: Option<Arc<Summary>>,
     texts: Arc<Texts>,
@@ -116,7 +115,7 @@ impl<K: Kind> Results for Gatherer<K> {
         let seen: Vec<WorkerSeen> = self
             .workers
             .iter()
-            .map(|worker| WorkerSeen::read(&self.status, worker.pair, K::HOST, self.agents))
+            .map(|worker| WorkerSeen::read(&self.status, worker.pair, K::HOST, worker.has_agent))
             .collect();
         let mut changed = false;
         for index in 0..self.workers.len() {
@@ -154,6 +153,7 @@ impl<K: Kind> Gatherer<K> {
         let kind = K::of(run)?;
         let workers = Pair::first(run.plan.workers()).map(|pair| Worker {
             pair,
+            has_agent: run.plan.has_agent(pair.get().into()),
             good: None,
             seen: None,
             kept: None,
@@ -162,7 +162,6 @@ impl<K: Kind> Gatherer<K> {
         });
         let mut gatherer = Self {
             status: tree.path().join(STATUS_FOLDER),
-            agents: run.plan.agents(),
             workers: workers.collect(),
             kind,
             tree,

@@ -5,7 +5,7 @@ use std::path::Path;
 use std::sync::Arc;
 
 use bytes::Bytes;
-use leaderboard_api::{Agents, Metric, WorkerState};
+use leaderboard_api::{Metric, WorkerState};
 use leaderboard_contract::keys::EVALAI;
 use leaderboard_contract::report::{Outcome, RefusedResults, ReportWorker, StoredFile};
 use leaderboard_protocol::files::{Host, Pair, Progress};
@@ -33,12 +33,7 @@ pub struct WorkerSeen {
 }
 
 impl WorkerSeen {
-    pub(crate) fn read(status: &Path, pair: Pair, kind: Host, agents: Agents) -> Self {
-        let has_agent = match agents {
-            Agents::Beside => true,
-            Agents::First => pair.index() == 0,
-            Agents::Absent => false,
-        };
+    pub(crate) fn read(status: &Path, pair: Pair, kind: Host, has_agent: bool) -> Self {
         let agent = has_agent.then(|| Progress::read(status, pair.agent()));
         let host = Progress::read(status, pair.host(kind));
         let done = match kind {

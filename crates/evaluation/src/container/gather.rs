@@ -37,7 +37,7 @@ impl Kind for Evaluators {
         };
         let plan = run.plan.container();
         let plan = plan.ok_or_else(|| refused("it is of another kind of evaluation", OF_VERSIONS))?;
-        if run.plan.workers() == 0 {
+        if run.plan.sharing() == 0 {
             return Err(refused("it has no worker", OF_VERSIONS));
         }
         // A status could not show it, and the run would end without a score.
@@ -54,7 +54,11 @@ impl Kind for Evaluators {
 
     fn read(&self, worker: Pair, bytes: &[u8]) -> Result<Option<ResultFile>, Ending> {
         let of_worker = |why: String| RefusedResults::new(Some(worker.get().into()), why);
-        let read = parse(bytes).and_then(|found| found.check_score(&self.0.score).map(|()| found));
+        let has_score = |found: &ResultFile| match self.0.merger() {
+            Some(_) if !self.merges(worker) => Ok(()),
+            _ => found.check_score(&self.0.score),
+        };
+        let read = parse(bytes).and_then(|found| has_score(&found).map(|()| found));
         match read {
             Ok(ResultFile { refused: Some(why), .. }) => Err(Ending::Invalid(of_worker(why))),
             Ok(found) => Ok(Some(found)),
@@ -71,6 +75,8 @@ impl Kind for Evaluators {
     }
 
     fn reported(&self, worker: Pair, good: Option<&ResultFile>) -> ReportWorker {
+        // The units are those of the others.
+        let good = good.filter(|_| !self.merges(worker));
         let (done, total) = good.map(|good| (good.done, good.total)).unwrap_or_default();
         ReportWorker {
             id: worker.get().into(),
@@ -92,13 +98,23 @@ impl Kind for Evaluators {
     fn merge(&self, workers: &[Option<&ResultFile>]) -> Result<Merged, Ending> {
         let merged = merge(self.0.merge, workers).map_err(|error| unusable(&error))?;
         let texts = merged.texts();
-        let objects = [(RESULTS, texts.results.clone()), (STDOUT, merged.stdout(workers))];
+        let objects = [
+            (RESULTS, texts.results.clone()),
+            (STDOUT, merged.stdout(self.0.merger(), workers)),
+        ];
         let has_results = workers.iter().any(Option::is_some);
         Ok(Merged {
             summary: has_results.then(|| merged.summary(&self.0.score)),
             texts,
             objects: objects.map(|(key, text)| (key.to_owned(), Object::new(text))).into(),
         })
+    }
+}
+
+impl Evaluators {
+    /// True for the worker whose result is that of the run.
+    fn merges(&self, worker: Pair) -> bool {
+        self.0.merger() == Some(worker.get().into())
     }
 }
 
@@ -110,5 +126,7 @@ fn unusable(error: &MergeError) -> Ending {
     Ending::Unusable(RefusedResults::new(worker, error.to_string()))
 }
 
+#[cfg(test)]
+mod command_tests;
 #[cfg(test)]
 mod tests;

@@ -14,7 +14,7 @@ use serde_json::{Value, json};
 use super::failed_nodes::{HOSTNAME, REQUIRED};
 use super::{JobInput, variable};
 use crate::gpu_claims::{source, template_name};
-use leaderboard_api::{Agents, GpuSource, LeaderboardSpec, names};
+use leaderboard_api::{Agents, GpuSource, LeaderboardSpec, RunPlan, names};
 use leaderboard_protocol::files::{Member, Pair, Side};
 use leaderboard_protocol::graphics::{INDEX, Needs};
 
@@ -23,6 +23,14 @@ const CAPABILITIES: &str = "NVIDIA_DRIVER_CAPABILITIES";
 const NO_DEVICE: &str = "void";
 /// Prefix of the resources of NVIDIA's device plugin: whole GPUs, shared ones, MIG slices.
 const RESOURCES: &str = "nvidia.com/";
+/// The source of a container's GPU. A command that merges results has none.
+pub(super) fn source_of<'a>(spec: &'a LeaderboardSpec, plan: &RunPlan, member: Member) -> GpuSource<'a> {
+    if plan.merger() == Some(member.pair.get().into()) {
+        return GpuSource::None;
+    }
+    source(spec)
+}
+
 /// The variables of a container of a worker.
 pub(super) fn variables(source: GpuSource<'_>, member: Member) -> Vec<EnvVar> {
     let index = member.pair.index().to_string();
@@ -73,7 +81,7 @@ pub(super) fn resources(
     }
 }
 
-/// One claim for each worker, which its two containers share.
+/// One claim for each worker that shares the work, for its two containers.
 pub(super) fn claims(input: &JobInput<'_>) -> Option<Vec<PodResourceClaim>> {
     let GpuSource::Claim(claim) = source(input.spec()) else {
         return None;
@@ -85,7 +93,7 @@ pub(super) fn claims(input: &JobInput<'_>) -> Option<Vec<PodResourceClaim>> {
         resource_claim_name: None,
         resource_claim_template_name: Some(template.clone()),
     };
-    Some(Pair::first(input.workers()).map(of_worker).collect())
+    Some(Pair::first(input.plan.sharing()).map(of_worker).collect())
 }
 
 fn claim_name(worker: Pair) -> String {

@@ -14,6 +14,7 @@ pub fn gpus(spec: &LeaderboardSpec, track: Option<&Track>, plan: &RunPlan) -> i6
     let source = source(spec);
     let of_member = |member: Member| {
         let hosts = spec.given(track, workers::part(member.side));
+        let source = gpu::source_of(spec, plan, member);
         let resources = gpu::resources(source, plan.agents(), member, hosts.and_then(|hosts| hosts.resources));
         json!({"name": member.to_string(), "resources": resources})
     };
@@ -32,10 +33,10 @@ pub fn gpus(spec: &LeaderboardSpec, track: Option<&Track>, plan: &RunPlan) -> i6
     requested.saturating_add(claimed(source, plan))
 }
 
-/// One device for each worker.
+/// One device for each worker that shares the work.
 fn claimed(source: GpuSource<'_>, plan: &RunPlan) -> i64 {
     match source {
-        GpuSource::Claim(_) => i64::try_from(plan.workers()).unwrap_or(i64::MAX),
+        GpuSource::Claim(_) => i64::try_from(plan.sharing()).unwrap_or(i64::MAX),
         GpuSource::None | GpuSource::PerContainer(_) | GpuSource::NodeIndex(_) => 0,
     }
 }

@@ -17,16 +17,7 @@ pub(super) fn workloads(input: &JobInput<'_>) -> Vec<Workload> {
 pub(super) fn members(plan: &RunPlan) -> impl Iterator<Item = Member> {
     let host = leaderboard_evaluation::of_plan(plan).host();
     let hosts = Pair::first(plan.workers()).map(move |worker| worker.host(host));
-    hosts.chain(Pair::first(agents(plan)).map(Pair::agent))
-}
-
-/// Number of agents.
-pub(super) fn agents(plan: &RunPlan) -> usize {
-    match plan.agents() {
-        Agents::Beside => plan.workers(),
-        Agents::First => 1,
-        Agents::Absent => 0,
-    }
+    hosts.chain(Pair::first(plan.agent_count()).map(Pair::agent))
 }
 
 /// True for an init container: an agent that ends before the hosts' containers start.

@@ -120,10 +120,6 @@ impl JobInput<'_> {
         }
     }
 
-    fn workers(&self) -> usize {
-        self.plan.workers()
-    }
-
     fn submission_name(&self) -> &str {
         self.submission.metadata.name.as_deref().unwrap_or_default()
     }

@@ -391,6 +391,45 @@ fn an_agent_that_runs_first_has_a_gpu_as_the_evaluators_after_it() {
 }
 
 #[test]
+fn the_one_that_merges_stands_beside_the_evaluators_without_an_agent_or_a_gpu() {
+    let claim = json!({"resourceClaimTemplateName": "t"});
+    for gpu in [
+        json!(null),
+        json!({"resourceName": GPU}),
+        json!({"mode": "NodeIndex", "resourceName": GPU}),
+        json!({"mode": "Claim", "claim": claim}),
+    ] {
+        for mode in MODES {
+            let of = |merge: &str| case_with(json!({"mode": mode, "merge": merge}), &json!({"gpu": gpu}));
+            let (case, without) = (of("Command"), of("Mean"));
+            let job = case.json();
+            let mut expected = names(&without.json(), "containers").join(",");
+            expected = expected.replace("evaluator-2", "evaluator-2,evaluator-3");
+            assert_eq!(names(&job, "containers").join(","), expected, "{mode} {gpu}");
+            let merger = container(&job, "evaluator-3");
+            let (words, mut env) = started(merger, &[]);
+            assert_eq!(env["NVIDIA_VISIBLE_DEVICES"], "void", "{mode} {gpu}");
+            assert_eq!(merger["resources"]["limits"].get(GPU), None, "{mode} {gpu}");
+            assert_eq!(merger["resources"].get("claims"), None, "{mode} {gpu}");
+            let (runs, _) = behind_runner(&words, &mut env);
+            assert!(
+                runs.alone && !words.iter().any(|word| word.contains("-gpu=")),
+                "{words:?}"
+            );
+            let claims = |case: &Case| pod(&case.json())["resourceClaims"].clone();
+            assert_eq!(claims(&case), claims(&without), "{mode} {gpu}");
+            let counted =
+                |case: &Case| super::gpus(&case.leaderboard.spec, case.leaderboard.spec.tracks.first(), &case.plan);
+            assert_eq!(counted(&case), counted(&without), "{mode} {gpu}");
+            let mounts = mounts(merger);
+            for mount in ["logs/evaluators/3+ /results", "logs/evaluators /parts"] {
+                assert!(mounts.contains(&mount.to_owned()), "{mode}: {mounts:?}");
+            }
+        }
+    }
+}
+
+#[test]
 fn an_overlay_and_the_hosts_settings_reach_an_agent_that_runs_first() {
     let check = json!({"name": "check", "image": "c"});
     let overlay = json!({"spec": {"initContainers": [

@@ -236,6 +236,13 @@ fn the_job_of_a_submitted_file_is_as_committed() {
 }
 
 #[test]
+fn the_job_of_two_evaluators_whose_results_a_command_merges_is_as_committed() {
+    let container = json!({"workers": 2, "port": 9000, "merge": "Command"});
+    let gpu = json!({"mode": "NodeIndex", "resourceName": "nvidia.com/gpu"});
+    golden("merge-2.json", &Case::container(container, &json!({"gpu": gpu})));
+}
+
+#[test]
 #[expect(clippy::useless_vec, reason = "an array of Leaderboards is too large for the stack")]
 fn the_job_has_no_field_that_kubernetes_does_not_know() {
     let data = json!({"image": {"reference": "d"}});

@@ -100,7 +100,7 @@ fn memory(member: Member, size: u64) -> Volume {
 
 /// Most bytes of the `logs` volume.
 fn logs_limit(input: &JobInput<'_>) -> u64 {
-    let agents = u64::try_from(members::agents(input.plan)).unwrap_or(u64::MAX);
+    let agents = u64::try_from(input.plan.agent_count()).unwrap_or(u64::MAX);
     let agent_logs = agents.saturating_mul(input.spec().agent.log_size_limit.bytes());
     let bounds = input.plan.container().and_then(|own| own.input.as_ref());
     // What an agent leaves is copied for the evaluators.

@@ -6,7 +6,6 @@ use serde_json::Value;
 use super::members::{is_first, members, role};
 use super::security::context;
 use super::{JobInput, gpu, variable, volumes};
-use crate::gpu_claims::source;
 use crate::layout::STATUS;
 use leaderboard_api::Part;
 use leaderboard_contract::run::{RUNNER, TOOLS};
@@ -28,7 +27,8 @@ pub(super) fn first(input: &JobInput<'_>, workloads: &[Workload]) -> Option<Cont
 }
 
 fn container(input: &JobInput<'_>, member: Member, role: &Role) -> Option<Container> {
-    let (gpus, agents, name) = (source(input.spec()), input.plan.agents(), member.to_string());
+    let (agents, name) = (input.plan.agents(), member.to_string());
+    let gpus = gpu::source_of(input.spec(), input.plan, member);
     let hosts = input.spec().given(input.track(), part(member.side))?;
     let env = role.env.iter().map(|(name, value)| variable(name, value));
     let env = env.chain(gpu::variables(gpus, member)).collect();

@@ -16,7 +16,7 @@ use k8s_openapi::apimachinery::pkg::apis::meta::v1::Time;
 use super::failure;
 use super::status::PlanBuilder;
 use super::waits::Wait;
-use super::workers::{agents_of, cause_of, host_of, pair_with};
+use super::workers::{agents_beside, cause_of, host_of, pair_with};
 use crate::report_digest::clamp;
 use crate::view::{ContainerView, EndView, PodView};
 use ends::{
@@ -147,9 +147,10 @@ fn is_awaited(at: Option<Timestamp>, now: Timestamp) -> bool {
 
 /// Counts the crashes of each worker and remembers the last one: its Pod may be gone when the cause is looked for.
 pub(super) fn note_crashes(status: &mut SubmissionStatus, pod: &PodView, now: Timestamp) {
-    let (kind, agents) = (host_of(status), agents_of(status));
+    let kind = host_of(status);
     let ids: BTreeSet<i32> = pod.containers.iter().filter_map(|c| pair_of(&c.name)).collect();
     for id in ids {
+        let agents = agents_beside(status, id);
         let its = pod.containers.iter().filter(|c| pair_of(&c.name) == Some(id));
         let counted = its.map(|its| count_crashes(its, agents)).max().unwrap_or(0);
         let crash = last_crash_of(pod, (kind, agents), id, now);
@@ -244,7 +245,7 @@ fn worker_entry(status: &mut SubmissionStatus, id: i32) -> &mut WorkerStatus {
 /// The failure of a pair that has crashed as often as it may, or cannot start at all. It waits until the cause is settled.
 pub(super) fn too_many(draft: &mut PlanBuilder<'_>) -> Option<Failure> {
     let limit = draft.retries().per_worker.saturating_add(1);
-    let sides = (host_of(&draft.status), agents_of(&draft.status));
+    let kind = host_of(&draft.status);
     let is_too_many = |worker: &&WorkerStatus| {
         worker.crashes >= limit || (worker.crashes > 0 && cause_of(worker).is_some_and(is_hopeless))
     };
@@ -254,6 +255,7 @@ pub(super) fn too_many(draft: &mut PlanBuilder<'_>) -> Option<Failure> {
             continue;
         };
         let pod = draft.view.pod.as_ref();
+        let sides = (kind, agents_beside(&draft.status, worker.id));
         let crash = pod.and_then(|pod| last_crash_of(pod, sides, worker.id, draft.now()));
         // Further failures while the other side's end is awaited put the end of the run off no further.
         match crash.filter(|crash| !crash.is_settled && worker.crashes <= limit) {

@@ -2,7 +2,7 @@
 //!
 //! No text for a participant names a file, an object or a machine of the hosts.
 
-use super::workers::{agents_of, cause_of, pair_with};
+use super::workers::{agents_beside, cause_of, pair_with};
 use crate::report_digest::{ReportDigest, clamp};
 use crate::view::ObservedNode;
 use leaderboard_api::text::sentence;
@@ -195,7 +195,7 @@ pub(super) fn is_refusal(status: &SubmissionStatus, found: &Failure, report: &Re
 
 pub(super) fn of_worker(worker: &WorkerStatus, cause: EndReason, status: &SubmissionStatus) -> Failure {
     let (id, node, words) = (worker.id, status.node_name.as_deref(), words(status.plan.as_ref()));
-    let agents = agents_of(status);
+    let agents = agents_beside(status, id);
     let times = match worker.crashes {
         1 => "once".to_owned(),
         crashes => format!("{crashes} times"),

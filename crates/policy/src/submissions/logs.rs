@@ -21,7 +21,7 @@ pub(super) fn log_places(status: &SubmissionStatus, pod: Option<&PodView>) -> Ve
     };
     let kind = host_of(status);
     let host = pair.host(kind).to_string();
-    let (own, own_log) = participants_log(agents_of(status), kind, pair);
+    let (own, own_log) = participants_log(status, kind, pair);
     let on_node = |container: &str| pod.and_then(|pod| on_node(pod, container));
     let found = match failure.reason.known() {
         Some(Reason::SimulationCrashed | Reason::EvaluatorFailed) => {
@@ -50,13 +50,14 @@ pub(super) fn log_places(status: &SubmissionStatus, pod: Option<&PodView>) -> Ve
 }
 
 /// The container whose log explains a failure of the participant's, and the key of that log: the evaluator's, where no program of theirs runs.
-fn participants_log(agents: Agents, kind: Host, pair: Pair) -> (String, String) {
-    let pair = match agents {
-        Agents::Absent => return (pair.host(kind).to_string(), host_log(kind, pair)),
-        // One agent for all workers.
-        Agents::First => Pair::new(1).unwrap_or(pair),
-        Agents::Beside => pair,
-    };
+fn participants_log(status: &SubmissionStatus, kind: Host, pair: Pair) -> (String, String) {
+    if agents_of(status) == Agents::Absent {
+        return (pair.host(kind).to_string(), host_log(kind, pair));
+    }
+    let plan = status.plan.as_ref();
+    let has_agent = plan.is_none_or(|plan| plan.has_agent(pair.get().into()));
+    // One agent runs for all evaluators, and none for a command that merges.
+    let pair = if has_agent { pair } else { Pair::new(1).unwrap_or(pair) };
     (pair.agent().to_string(), agent_log(pair))
 }
 

@@ -16,6 +16,13 @@ pub(super) fn agents_of(status: &SubmissionStatus) -> Agents {
     status.plan.as_ref().map_or(Agents::Beside, RunPlan::agents)
 }
 
+/// How they stand to the host's container of one worker.
+pub(super) fn agents_beside(status: &SubmissionStatus, id: i32) -> Agents {
+    let plan = status.plan.as_ref();
+    let of_worker = |plan: &RunPlan| plan.agents_of(usize::try_from(id).unwrap_or_default());
+    plan.map_or(Agents::Beside, of_worker)
+}
+
 pub(super) fn pair_with(id: i32) -> Option<Pair> {
     u16::try_from(id).ok().and_then(Pair::new)
 }

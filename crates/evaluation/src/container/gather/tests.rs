@@ -19,7 +19,7 @@ use crate::fixtures::{container_run, put_result, put_status, result, run, run_of
 use crate::judge::{Judge, Outside, Situation};
 use crate::{Gathered, Results};
 
-struct Volume {
+pub(super) struct Volume {
     folder: tempfile::TempDir,
     tree: Arc<Tree>,
     gatherer: Gatherer,
@@ -33,10 +33,14 @@ impl Volume {
     }
 
     fn of_mode(mode: EvaluationMode) -> Self {
+        Self::of(&run_of_mode(mode))
+    }
+
+    pub(super) fn of(run: &Run) -> Self {
         let folder = tempfile::tempdir().unwrap();
         let tree = Arc::new(Tree::open(folder.path()).unwrap());
         Self {
-            gatherer: Gatherer::new(&run_of_mode(mode), Arc::clone(&tree)).unwrap(),
+            gatherer: Gatherer::new(run, Arc::clone(&tree)).unwrap(),
             judge: Judge::default(),
             folder,
             tree,
@@ -44,7 +48,7 @@ impl Volume {
         }
     }
 
-    fn path(&self) -> &Path {
+    pub(super) fn path(&self) -> &Path {
         self.folder.path()
     }
 
@@ -52,13 +56,13 @@ impl Volume {
         self.path().join(result_path(Pair::new(worker).unwrap()))
     }
 
-    fn done(&self, workers: &[u16]) {
+    pub(super) fn done(&self, workers: &[u16]) {
         for worker in workers {
             put_status(self.path(), Side::Host(HOST), *worker, Mark::Done);
         }
     }
 
-    fn round(&mut self) -> (Gathered, Situation) {
+    pub(super) fn round(&mut self) -> (Gathered, Situation) {
         self.now += 10;
         let gathered = self.gatherer.round();
         let outside = Outside {
@@ -72,7 +76,7 @@ impl Volume {
     }
 }
 
-fn text<'a>(gathered: &'a Gathered, key: &str) -> &'a str {
+pub(super) fn text<'a>(gathered: &'a Gathered, key: &str) -> &'a str {
     std::str::from_utf8(&gathered.objects[key].bytes).unwrap()
 }
 

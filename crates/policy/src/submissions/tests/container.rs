@@ -7,7 +7,7 @@ use super::log::places;
 use crate::submissions::Plan;
 use leaderboard_api::FailureClass::{Infrastructure, Participant};
 use leaderboard_api::State::{Failed, Finished, Pending, Running};
-use leaderboard_api::{Attempt, FailedNode, Failure, Metric, Progress, Reason, State};
+use leaderboard_api::{Attempt, Evaluation, FailedNode, Failure, MergeMethod, Metric, Progress, Reason, State};
 use leaderboard_contract::report::{Outcome, RefusedResults, Report, ReportWorker};
 
 /// Words that only CARLA has.
@@ -358,6 +358,64 @@ fn a_submission_that_the_evaluator_refuses_is_the_participants() {
     };
     let failure = ends_with(rejected, Failed, Reason::NotEligible).status.failure.unwrap();
     assert_eq!(failure.class, Participant);
+}
+
+/// A run like `under_way` whose results a third evaluator merges.
+fn merging() -> World {
+    let mut world = local();
+    if let Evaluation::Container(container) = &mut world.leaderboard().evaluation {
+        container.merge = MergeMethod::Command;
+    }
+    let mut world = world.with_job();
+    see_workers(&mut world);
+    world.see_alone(running("evaluator-3"));
+    world.go_to(10);
+    world.pass_to(Running, Reason::Running);
+    world
+}
+
+#[test]
+fn a_command_that_merges_and_fails_is_an_evaluator_beside_no_agent() {
+    for (what, expected) in [
+        ("exited", "it ended without a final result."),
+        ("noResult", "it had no final result in time."),
+    ] {
+        let mut world = merging();
+        world.see_alone(ended("evaluator-3", 0, what, 1, 50));
+        let worker = world.pass_to(Running, Reason::Running).status.workers.pop().unwrap();
+        assert_eq!((worker.id, worker.crashes), (3, 1), "{what}");
+        world.see_alone(ended("evaluator-3", 3, what, 1, 100));
+        let plan = world.pass_to(Running, Reason::Stopping);
+        assert_eq!(places(&plan), ["node evaluator-3"]);
+        speaks_of_no_other_kind(&plan);
+        let failure = plan.status.failure.unwrap();
+        assert_eq!(
+            (failure.class, failure.reason.known()),
+            (Infrastructure, Some(Reason::EvaluatorFailed))
+        );
+        let expected = format!("The evaluator of worker 3 failed 4 times: {expected}");
+        assert_eq!((failure.message.as_str(), failure.worker), (expected.as_str(), Some(3)));
+        world.leaderboard().retries.infrastructure = 9;
+        world.complete();
+        world.report(told(10));
+        world.pass_to(Pending, Reason::Replacing);
+    }
+}
+
+#[test]
+fn a_refusal_by_the_command_that_merges_is_the_participants_with_the_log_of_an_agent() {
+    let mut world = merging();
+    world.leaderboard().retries.infrastructure = 0;
+    world.complete();
+    world.report(Report {
+        is_final: true,
+        refused: Some(RefusedResults::new(Some(3), "Both files have row 7.")),
+        ..told(10)
+    });
+    let plan = world.pass_to(Failed, Reason::InvalidResults);
+    assert_eq!(places(&plan)[0], "s3 agent/agent1/leaderboard.log");
+    let failure = plan.status.failure.unwrap();
+    assert_eq!((failure.class, failure.worker), (Participant, Some(3)));
 }
 
 #[test]
