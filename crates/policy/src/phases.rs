@@ -78,21 +78,21 @@ pub struct Ended {
 pub fn ended(view: &View, new: &SubmissionStatus) -> Vec<Ended> {
     let Some(attempt) = new.attempt else { return Vec::new() };
     let before = view.submission.status.as_ref();
-    let mut found = Found(Vec::new());
-    if before.is_none_or(|before| before.attempt.is_none()) {
-        let created = created(view);
-        found.add(Phase::Intake, Some(sent(view).unwrap_or(created)), created);
-    }
     let is_same = |before: &&SubmissionStatus| before.attempt == Some(attempt);
-    let step = Step {
+    let mut step = Step {
         view,
         old: restarted(&view.submission, new).or(before.filter(is_same)),
         new,
+        ended: Vec::new(),
     };
-    step.to_job(&mut found);
-    step.of_job(&mut found);
-    step.to_end(&mut found);
-    found.0
+    if before.is_none_or(|before| before.attempt.is_none()) {
+        let created = created(view);
+        step.add(Phase::Intake, Some(sent(view).unwrap_or(created)), created);
+    }
+    step.to_job();
+    step.of_job();
+    step.to_end();
+    step.ended
 }
 
 /// The status of the attempt that a restart ends with `new`: all that ends then is of that attempt.
@@ -101,9 +101,16 @@ pub fn restarted<'a>(submission: &'a Submission, new: &SubmissionStatus) -> Opti
     (old.has_run() && new.is_restart() && old.attempt < new.attempt).then_some(old)
 }
 
-struct Found(Vec<Ended>);
+/// From one status of an attempt to the next.
+struct Step<'a> {
+    view: &'a View,
+    /// None: the attempt is new.
+    old: Option<&'a SubmissionStatus>,
+    new: &'a SubmissionStatus,
+    ended: Vec<Ended>,
+}
 
-impl Found {
+impl Step<'_> {
     /// Adds nothing if the start is unknown.
     fn add(&mut self, phase: Phase, start: Option<Timestamp>, end: Timestamp) {
         let ended = start.map(|start| Ended {
@@ -111,26 +118,16 @@ impl Found {
             start: start.min(end),
             end,
         });
-        self.0.extend(ended);
+        self.ended.extend(ended);
     }
-}
 
-/// From one status of an attempt to the next.
-struct Step<'a> {
-    view: &'a View,
-    /// None: the attempt is new.
-    old: Option<&'a SubmissionStatus>,
-    new: &'a SubmissionStatus,
-}
-
-impl Step<'_> {
-    fn to_job(&self, found: &mut Found) {
+    fn to_job(&mut self) {
         let (old, new) = (self.old, self.new);
         let accepted = new.times.accepted.as_ref().map(|time| time.0);
         if let Some(accepted) = accepted
             && old.is_none_or(|old| old.times.accepted.is_none())
         {
-            found.add(Phase::Accept, self.begun(), accepted);
+            self.add(Phase::Accept, self.begun(), accepted);
         }
         if new.job_name.is_some() && old.and_then(|old| old.job_name.as_ref()) != new.job_name.as_ref() {
             let pause = old.and_then(|old| old.next_retry_time.as_ref());
@@ -139,11 +136,11 @@ impl Step<'_> {
             } else {
                 accepted
             };
-            found.add(Phase::Wait, start, self.view.now);
+            self.add(Phase::Wait, start, self.view.now);
         }
     }
 
-    fn of_job(&self, found: &mut Found) {
+    fn of_job(&mut self) {
         let Some(started) = self.started() else { return };
         let had_run = self.old.is_some_and(has_run);
         let is_over = self.is_job_over();
@@ -151,23 +148,23 @@ impl Step<'_> {
             let scheduled = self.view.pod.as_ref().and_then(|pod| pod.scheduled);
             let created = self.view.job.ours().and_then(|job| job.created);
             if let Some(scheduled) = scheduled {
-                found.add(Phase::Schedule, created, scheduled);
+                self.add(Phase::Schedule, created, scheduled);
             }
-            found.add(Phase::Start, scheduled, started);
+            self.add(Phase::Start, scheduled, started);
         }
         if is_over {
             let end = self.new.times.finished.as_ref().filter(|_| self.new.has_ended());
             let end = end.map(|time| time.0).or(self.view.ended_at());
-            found.add(Phase::Run, Some(started), end.unwrap_or(self.view.now));
+            self.add(Phase::Run, Some(started), end.unwrap_or(self.view.now));
         }
     }
 
-    fn to_end(&self, found: &mut Found) {
+    fn to_end(&mut self) {
         let finished = self.new.end();
         if let Some(end) = finished.filter(|_| !self.old.is_some_and(SubmissionStatus::has_ended)) {
-            found.add(Phase::Attempt, self.begun(), end.last_transition_time.0);
+            self.add(Phase::Attempt, self.begun(), end.last_transition_time.0);
         } else if restarted(&self.view.submission, self.new).is_some() {
-            found.add(Phase::Attempt, self.begun(), self.view.now);
+            self.add(Phase::Attempt, self.begun(), self.view.now);
         }
         let over = self.new.times.finished.as_ref().map(|time| time.0);
         for (type_, phase) in [
@@ -183,7 +180,7 @@ impl Step<'_> {
             let Some(is) = is else { continue };
             let published = self.new.times.published.as_ref().filter(|_| phase == Phase::Publish);
             let end = published.unwrap_or(&is.last_transition_time).0;
-            found.add(phase, over, end);
+            self.add(phase, over, end);
         }
     }
 
