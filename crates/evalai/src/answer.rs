@@ -95,7 +95,7 @@ impl<T> Answer<T> {
         }
     }
 
-    /// This end with another content.
+    /// This answer, or what follows from its content.
     pub fn and_then<U>(self, f: impl FnOnce(T) -> Answer<U>) -> Answer<U> {
         match self {
             Self::Done(content) => f(content),
@@ -104,6 +104,11 @@ impl<T> Answer<T> {
             Self::Throttled(wait) => Answer::Throttled(wait),
             Self::Unanswered(silence) => Answer::Unanswered(silence),
         }
+    }
+
+    /// This answer with another content.
+    pub fn map<U>(self, f: impl FnOnce(T) -> U) -> Answer<U> {
+        self.and_then(|content| Answer::Done(f(content)))
     }
 
     /// This answer to a request that every host of a challenge may make, and that is about nothing else: EvalAI refuses

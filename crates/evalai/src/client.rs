@@ -145,7 +145,7 @@ impl Client {
         let request = self.request(method, path, body.into());
         answer(&*self.transport, request, end, LARGEST_ROW, Need::Status)
             .await
-            .and_then(|_| Answer::Done(()))
+            .map(|_| ())
     }
 
     fn request(&self, method: Method, path: &str, body: Bytes) -> Result<http::Request<Bytes>, Silence> {

@@ -121,7 +121,7 @@ pub(super) async fn read(response: Response<Body>, end: Instant, largest: usize,
         Err(Unread::TooLarge) => return Answer::unusable(code, "more than is read of an answer"),
         Err(Unread::Broken(silence)) => return Answer::Unanswered(silence),
     };
-    classify(code, retry_after.as_deref(), &body).and_then(|()| Answer::Done((code, body)))
+    classify(code, retry_after.as_deref(), &body).map(|()| (code, body))
 }
 
 enum Unread {

@@ -38,11 +38,12 @@ impl Queue {
             (Request::Get(subject), Reply::Row(answer)) => self.took_row(subject, ticket.requested, answer, &now),
             (Request::Image(subject, _), Reply::Image(answer)) => self.took_image(subject, answer, &now),
             (request, Reply::Written(answer)) => self.wrote(request, answer, &now),
-            (request, reply) => self.took_of_challenge(request, ticket.requested, reply, &now),
+            (Request::List { challenge, purpose, .. }, Reply::Rows(answer)) => {
+                self.took_list((*challenge, *purpose), ticket.requested, answer, &now);
+            }
+            (request, reply) => self.took_of_check(request, reply, &now),
         }
-        if let Some(subject) = ticket.request.submission() {
-            self.drop_lane(subject.pk, &now);
-        }
+        self.tidy_lanes(&now);
     }
 
     /// The row of a submission shows what is no longer so: if its end is waited for, it is read again soon.
@@ -77,14 +78,10 @@ impl Queue {
                 let news = self.token_refused.is_none();
                 self.token_refused = Some((refusal.message.clone(), now.at + TOKEN_PAUSE));
                 if news {
-                    self.changes
-                        .extend(self.served.keys().cloned().map(Changed::Leaderboard));
+                    self.wake_leaderboards(|_| true);
                 }
             }
-            Answer::Done(()) if self.token_refused.take().is_some() => {
-                self.changes
-                    .extend(self.served.keys().cloned().map(Changed::Leaderboard));
-            }
+            Answer::Done(()) if self.token_refused.take().is_some() => self.wake_leaderboards(|_| true),
             _ => {}
         }
     }

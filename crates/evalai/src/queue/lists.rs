@@ -12,7 +12,7 @@ use super::sub::Sub;
 use super::{Now, Queue};
 use crate::answer::{About, Answer};
 use crate::request::{Purpose, Reply, Request};
-use crate::row::{Challenge, Row, Split};
+use crate::row::{Challenge, Row};
 use crate::types::{Changed, Key, SweepRow, Swept};
 use leaderboard_api::evalai_status::Status;
 use leaderboard_api::names;
@@ -41,45 +41,6 @@ fn kind_of(row: &Row, since: Timestamp) -> Swept {
 }
 
 impl Queue {
-    /// Takes in what is not about one submission.
-    pub(super) fn took_of_challenge(&mut self, request: &Request, requested: Duration, reply: Reply, now: &Now) {
-        match (request, reply) {
-            (Request::List { challenge, purpose, .. }, Reply::Rows(answer)) => {
-                self.took_list((*challenge, *purpose), requested, answer, now);
-            }
-            (Request::Phases(id), Reply::Phases(answer)) => {
-                self.took_of_check(*id, answer, now, |check, phases| {
-                    check.phases = Some(phases);
-                });
-            }
-            (Request::Splits(id), Reply::Splits(answer)) => {
-                self.took_of_check(*id, answer, now, |check, splits: Vec<Split>| {
-                    check.splits = Some(splits);
-                });
-            }
-            (Request::DatasetSplit(id, split), Reply::DatasetSplit(answer)) => {
-                // Not every host may read it: the phase's only leaderboard is taken then.
-                let answer = or_hidden(answer, |split| split.codename);
-                self.took_of_check(*id, answer, now, |check, codename| {
-                    check.codenames.insert(*split, codename);
-                });
-            }
-            (Request::PhaseSplit(id, split), Reply::PhaseSplit(answer)) => {
-                let answer = or_hidden(answer, |split| split.is_descending);
-                self.took_of_check(*id, answer, now, |check, is_descending| {
-                    check.descending.insert(*split, is_descending);
-                });
-            }
-            (Request::Challenge(id), Reply::Challenge(answer)) => {
-                let answer = or_hidden(answer, |challenge| challenge);
-                self.took_of_check(*id, answer, now, |check, settings| {
-                    check.settings = Some(settings.unwrap_or_default());
-                });
-            }
-            _ => {}
-        }
-    }
-
     /// From when on a list reaches: never the whole table, which is costly for the server.
     pub(super) fn list_after(&self, id: i64, purpose: Purpose) -> Option<Timestamp> {
         match purpose {
@@ -98,7 +59,7 @@ impl Queue {
         }
     }
 
-    fn took_list(&mut self, list: (i64, Purpose), requested: Duration, answer: Answer<Vec<Row>>, now: &Now) {
+    pub(super) fn took_list(&mut self, list: (i64, Purpose), requested: Duration, answer: Answer<Vec<Row>>, now: &Now) {
         let (id, purpose) = list;
         let Some(challenge) = self.challenges.get_mut(&id) else {
             return;
@@ -207,24 +168,26 @@ impl Queue {
         });
     }
 
-    fn took_of_check<T>(
-        &mut self,
-        id: i64,
-        answer: Answer<T>,
-        now: &Now,
-        take: impl FnOnce(&mut super::poll::ChallengeCheck, T),
-    ) {
+    /// Takes in what a challenge's leaderboards are.
+    pub(super) fn took_of_check(&mut self, request: &Request, reply: Reply, now: &Now) {
+        let (Request::Phases(id)
+        | Request::Splits(id)
+        | Request::DatasetSplit(id, _)
+        | Request::PhaseSplit(id, _)
+        | Request::Challenge(id)) = request
+        else {
+            return;
+        };
         let every = self.timing.check;
-        let Some(challenge) = self.challenges.get_mut(&id) else {
+        let Some(challenge) = self.challenges.get_mut(id) else {
             return;
         };
         let check = &mut challenge.check;
         let before = (check.catalog.clone(), check.error.clone());
-        match answer {
-            Answer::Done(content) => {
-                take(check, content);
+        match check.take(request, reply) {
+            Answer::Done(()) => {
                 check.poll.done(now.at, now.at, Duration::ZERO);
-                if check.request(id).is_none() {
+                if check.request(*id).is_none() {
                     check.poll.done(now.at, now.at, every);
                     check.close(now.wall);
                 }
@@ -238,18 +201,8 @@ impl Queue {
             }
         }
         if before != (check.catalog.clone(), check.error.clone()) {
-            let of = self.served.iter().filter(|(_, target)| target.challenge == id);
-            self.changes
-                .extend(of.map(|(key, _)| Changed::Leaderboard(key.clone())));
+            self.wake_leaderboards(|target| target.challenge == *id);
         }
-    }
-}
-
-/// What an answer shows; none where EvalAI does not show it to this token's user.
-fn or_hidden<T, U>(answer: Answer<T>, take: impl FnOnce(T) -> U) -> Answer<Option<U>> {
-    match answer {
-        Answer::Refused(refusal) if refusal.about != About::Token => Answer::Done(None),
-        other => other.and_then(|content| Answer::Done(Some(take(content)))),
     }
 }
 

@@ -226,9 +226,16 @@ impl Queue {
         }
         self.open = true;
         let waiting = self.subs.iter().filter(|(_, sub)| sub.next_write().is_some());
-        let waiting = waiting.map(|(key, _)| Changed::Submission(key.clone()));
-        let boards = self.served.keys().cloned().map(Changed::Leaderboard);
-        self.changes.extend(waiting.chain(boards));
+        self.changes
+            .extend(waiting.map(|(key, _)| Changed::Submission(key.clone())));
+        self.wake_leaderboards(|_| true);
+    }
+
+    /// Wakes the Leaderboards whose way to EvalAI is one of these.
+    fn wake_leaderboards(&mut self, is_meant: impl Fn(&Target) -> bool) {
+        let meant = self.served.iter().filter(|(_, target)| is_meant(target));
+        self.changes
+            .extend(meant.map(|(key, _)| Changed::Leaderboard(key.clone())));
     }
 
     /// Asks whether an attempt may run, and for its image where the object has none. This and the two below return whether
@@ -289,19 +296,16 @@ impl Queue {
                 self.pks.remove(&sub.pk);
             }
         }
-        let pks = &self.pks;
-        self.lanes
-            .retain(|pk, lane| lane.busy.is_some() || lane.hold_until > now.at || pks.contains_key(pk));
+        self.tidy_lanes(&now);
         self.drop_unused(sub.target.challenge);
         Some(sub)
     }
 
     /// A lane that nothing uses needs no memory.
-    fn drop_lane(&mut self, pk: i64, now: &Now) {
-        let is_idle = |lane: &Lane| lane.busy.is_none() && lane.hold_until <= now.at;
-        if !self.pks.contains_key(&pk) && self.lanes.get(&pk).is_some_and(is_idle) {
-            self.lanes.remove(&pk);
-        }
+    fn tidy_lanes(&mut self, now: &Now) {
+        let pks = &self.pks;
+        self.lanes
+            .retain(|pk, lane| lane.busy.is_some() || lane.hold_until > now.at || pks.contains_key(pk));
     }
 
     /// A challenge that no Leaderboard serves and no submission is of needs no memory.

@@ -10,7 +10,7 @@ use super::{Now, Queue, Ticket};
 use crate::answer::{About, Answer};
 use crate::budget::Budget;
 use crate::request::{Reply, Request};
-use crate::types::{Changed, InboxTrouble, Key};
+use crate::types::{InboxTrouble, Key};
 
 /// These requests are one in so many of a token's.
 const SHARE: u32 = 3;
@@ -107,10 +107,7 @@ impl Queue {
         if let Request::Receive(name) = &ticket.request
             && self.passing.received(name, &answer, now.at)
         {
-            let reads = |name: &Option<String>, wanted: &str| name.as_deref() == Some(wanted);
-            let readers = self.served.iter().filter(|(_, target)| reads(&target.inbox, name));
-            self.changes
-                .extend(readers.map(|(key, _)| Changed::Leaderboard(key.clone())));
+            self.wake_leaderboards(|target| target.inbox.as_ref() == Some(name));
         }
         self.passing.answers.push((number, reply));
     }

@@ -7,8 +7,9 @@ use std::time::Duration;
 
 use jiff::Timestamp;
 
+use crate::answer::{About, Answer};
 use crate::labels::Catalog;
-use crate::request::{Purpose, Request};
+use crate::request::{Purpose, Reply, Request};
 use crate::row::{self, Phase, Split};
 use crate::types::Target;
 use leaderboard_base::backoff::Backoff;
@@ -168,6 +169,25 @@ impl ChallengeCheck {
         })
     }
 
+    /// Takes in what an answer shows, and returns its end. Not every host may read a split or the settings: the phase's only leaderboard is
+    /// taken then, and what EvalAI usually says.
+    pub fn take(&mut self, request: &Request, reply: Reply) -> Answer<()> {
+        match (request, reply) {
+            (_, Reply::Phases(answer)) => answer.map(|phases| self.phases = Some(phases)),
+            (_, Reply::Splits(answer)) => answer.map(|splits| self.splits = Some(splits)),
+            (Request::DatasetSplit(_, id), Reply::DatasetSplit(answer)) => or_hidden(answer).map(|split| {
+                self.codenames.insert(*id, split.map(|split| split.codename));
+            }),
+            (Request::PhaseSplit(_, id), Reply::PhaseSplit(answer)) => or_hidden(answer).map(|split| {
+                self.descending.insert(*id, split.map(|split| split.is_descending));
+            }),
+            (_, Reply::Challenge(answer)) => {
+                or_hidden(answer).map(|settings| self.settings = Some(settings.unwrap_or_default()))
+            }
+            (_, reply) => reply.answer(),
+        }
+    }
+
     /// Closes a whole reading.
     pub fn close(&mut self, at: Timestamp) {
         let (Some(phases), Some(splits)) = (self.phases.take(), self.splits.take()) else {
@@ -185,5 +205,13 @@ impl ChallengeCheck {
             descending,
             settings: settings.unwrap_or_default(),
         });
+    }
+}
+
+/// What an answer shows; none where EvalAI does not show it to this token's user.
+fn or_hidden<T>(answer: Answer<T>) -> Answer<Option<T>> {
+    match answer {
+        Answer::Refused(refusal) if refusal.about != About::Token => Answer::Done(None),
+        other => other.map(Some),
     }
 }

@@ -8,7 +8,6 @@ use jiff::Timestamp;
 
 use super::{Now, Queue};
 use crate::answer::Answer;
-use crate::types::Changed;
 
 /// So long without an answer is worth a word: a server that is restarted is back before.
 const SHOWN_AFTER: Duration = Duration::from_mins(1);
@@ -29,7 +28,7 @@ impl Queue {
             Answer::Broken(why) => why,
             Answer::Done(()) | Answer::Refused(_) | Answer::Throttled(_) => {
                 if self.silent.take().is_some_and(|silent| silent.is_shown) {
-                    self.wake_leaderboards();
+                    self.wake_leaderboards(|_| true);
                 }
                 return;
             }
@@ -41,7 +40,7 @@ impl Queue {
         });
         let is_long = now.at.saturating_sub(silent.since.at) >= SHOWN_AFTER;
         if is_long && !std::mem::replace(&mut silent.is_shown, is_long) {
-            self.wake_leaderboards();
+            self.wake_leaderboards(|_| true);
         }
     }
 
@@ -49,10 +48,5 @@ impl Queue {
     pub fn silence(&self) -> Option<(Timestamp, &str)> {
         let silent = self.silent.as_ref().filter(|silent| silent.is_shown)?;
         Some((silent.since.wall, &silent.why))
-    }
-
-    fn wake_leaderboards(&mut self) {
-        let boards = self.served.keys().cloned();
-        self.changes.extend(boards.map(Changed::Leaderboard));
     }
 }
