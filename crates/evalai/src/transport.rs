@@ -157,7 +157,4 @@ pub(super) fn unsendable(error: &dyn std::error::Error) -> Silence {
 }
 
 #[cfg(test)]
-pub(crate) mod memory;
-
-#[cfg(test)]
-mod tests;
+pub(crate) mod tests;

@@ -5,7 +5,7 @@ use http::header::HeaderValue;
 use tokio::time::sleep;
 
 use super::*;
-use crate::transport::memory::{begun, server, whole};
+use crate::transport::tests::memory::{begun, server, whole};
 
 const URL: &str = "https://storage.example/x.csv?X-Amz-Signature=5ec2e7";
 

@@ -1,5 +1,7 @@
 //! How long answers are waited for, and what those show that do not come, or not whole. Time is the test's own.
 
+pub(crate) mod memory;
+
 use std::sync::atomic::{AtomicUsize, Ordering};
 
 use futures::future::{self, FutureExt};
@@ -7,7 +9,7 @@ use futures::stream::{self, StreamExt};
 use http::header::{HeaderValue, LOCATION};
 use tokio::time::sleep;
 
-use super::memory::{begun, server, whole};
+use self::memory::{begun, server, whole};
 use super::*;
 use crate::client::Client;
 use crate::files::Files;

@@ -6,7 +6,7 @@ use http::Method;
 use super::tokens::{board, cancelled};
 use super::*;
 use crate::transport::Transport;
-use crate::transport::memory::{self, whole};
+use crate::transport::tests::memory::{self, whole};
 
 /// A server that answers what is read at once, and a write so late; never without a time.
 fn server(writes_take: Option<Duration>, wrote: mpsc::UnboundedSender<()>) -> Arc<dyn Transport> {

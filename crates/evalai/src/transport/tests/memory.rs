@@ -3,7 +3,7 @@
 use futures::future::FutureExt;
 use futures::stream::{self, StreamExt};
 
-use super::*;
+use super::super::*;
 
 struct Memory<F>(F);
 
