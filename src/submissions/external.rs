@@ -3,6 +3,7 @@
 
 use std::collections::HashMap;
 use std::sync::{Arc, Mutex};
+use std::time::Duration;
 
 use kube::ResourceExt;
 
@@ -65,26 +66,33 @@ impl ExternalSystems {
     }
 
     /// The last known state of a submission in EvalAI. None for a submission that is not of EvalAI.
-    pub fn evalai_view(&self, leaderboard: Option<&Leaderboard>, submission: &Submission) -> Option<EvalaiView> {
+    pub fn evalai_view(
+        &self,
+        leaderboard: Option<&Leaderboard>,
+        submission: &Submission,
+        waited: Duration,
+    ) -> Option<EvalaiView> {
         let evalai = submission.spec.evalai?;
-        let writes_from = self.hub.writes_from();
-        let Some(seen) = self.hub.view(&key_of(submission)) else {
-            let ready = leaderboard.is_some_and(|l| self.target(l).is_some());
-            let error = (!ready).then(|| "the Leaderboard's token is not known yet; see its status".to_owned());
-            return Some(EvalaiView {
-                error,
-                writes_from,
-                cancelled_as_of: leaderboard
-                    .and_then(|board| self.hub.cancelled_as_of(&key_of(board), evalai.submission)),
+        let view = if let Some(seen) = self.hub.view(&key_of(submission)) {
+            let observes = leaderboard.is_some_and(|board| board.spec.observes());
+            let wants_image = wants_image(submission, leaderboard);
+            EvalaiView {
+                shows_partial: leaderboard.is_some_and(|board| self.hub.shows_partial(&key_of(board), evalai.phase)),
+                ..map_view(&as_observed(seen, observes), submission, wants_image)
+            }
+        } else {
+            let cancelled_as_of = |board: &Leaderboard| self.hub.cancelled_as_of(&key_of(board), evalai.submission);
+            let is_ready = leaderboard.is_some_and(|board| self.target(board).is_some());
+            EvalaiView {
+                error: (!is_ready).then(|| "the Leaderboard's token is not known yet; see its status".to_owned()),
+                cancelled_as_of: leaderboard.and_then(cancelled_as_of),
                 ..EvalaiView::default()
-            });
+            }
         };
-        let observes = leaderboard.is_some_and(|board| board.spec.observes());
-        let wants_image = wants_image(submission, leaderboard);
         Some(EvalaiView {
-            writes_from,
-            shows_partial: leaderboard.is_some_and(|board| self.hub.shows_partial(&key_of(board), evalai.phase)),
-            ..map_view(&as_observed(seen, observes), submission, wants_image)
+            waited,
+            writes_from: self.hub.writes_from(),
+            ..view
         })
     }
 

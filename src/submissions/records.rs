@@ -80,10 +80,8 @@ pub fn start(
 
 /// An error of the table passes for this row when it passes for the others.
 fn failure(error: &TableError) -> Failure {
-    Failure {
-        is_refused: !error.is_of_the_table(),
-        why: error.to_string(),
-    }
+    let (is_refused, why) = (!error.is_of_the_table(), error.to_string());
+    Failure { is_refused, why }
 }
 
 /// Writes the newest row of an object, unless a newer one is known. Safe to call in each reconcile.

@@ -68,20 +68,15 @@ impl PartialEq for Report {
 
 /// The object that is stored where a report belongs.
 #[derive(Clone, Debug, PartialEq)]
-pub enum Stored {
-    Nothing,
-    /// Another object's report.
-    Foreign {
-        etag: Option<String>,
-    },
-    Report {
-        etag: Option<String>,
-        digest: Arc<ReportDigest>,
-    },
+pub struct Stored {
+    etag: Option<String>,
+    /// None: it is another object's report.
+    digest: Option<Arc<ReportDigest>>,
 }
 
 impl Ask for Report {
-    type Answer = Stored;
+    /// None: there is none.
+    type Answer = Option<Stored>;
     const AT_ONCE: usize = 512;
     const AT_ONCE_OF_A_SERVICE: usize = 64;
     const LONGEST: Duration = Duration::from_secs(10);
@@ -92,7 +87,7 @@ impl Ask for Report {
         self.files.service()
     }
 
-    fn again(&self, result: &Result<Stored, Failure>, _failures: u32, _waited: Duration) -> Option<Duration> {
+    fn again(&self, result: &Result<Option<Stored>, Failure>, _failures: u32, _waited: Duration) -> Option<Duration> {
         match result {
             _ if self.demand.stage == Stage::Live => Some(self.demand.period),
             Ok(_) => None,
@@ -116,33 +111,27 @@ impl Ask for Report {
 }
 
 /// Reads it, unless the bucket holds the one that is known.
-pub async fn read(aws: Aws, asked: Asked<Report>) -> Result<Stored, Failure> {
-    let known = asked.last.as_ref().and_then(|last| last.result.as_ref().as_ref().ok());
-    let etag = match known {
-        Some(Stored::Foreign { etag } | Stored::Report { etag, .. }) => etag.as_deref(),
-        Some(Stored::Nothing) | None => None,
-    };
+pub async fn read(aws: Aws, asked: Asked<Report>) -> Result<Option<Stored>, Failure> {
+    let last = asked.last.as_ref().and_then(|last| last.result.as_ref().as_ref().ok());
+    let known = last.and_then(Option::as_ref);
+    let etag = known.and_then(|known| known.etag.as_deref());
     let files = &asked.question.files;
     let archive = files.archive(&aws);
     let object = match archive.get_if_none_match(REPORT_KEY, etag, MAX_BYTES as u64).await {
-        Ok(Fetched::NotModified) => return Ok(known.cloned().unwrap_or(Stored::Nothing)),
-        Ok(Fetched::Absent) => return Ok(Stored::Nothing),
+        Ok(Fetched::NotModified) => return Ok(known.cloned()),
+        Ok(Fetched::Absent) => return Ok(None),
         Ok(Fetched::Found(object)) => object,
         Err(error) => return Err(silent(&error)),
     };
-    let etag = object.etag;
     let uid = files.former_uid.as_ref().unwrap_or(&asked.about.uid);
-    match ReportDigest::read(&object.bytes, uid) {
-        Ok(Some(digest)) => Ok(Stored::Report {
-            etag,
-            digest: Arc::new(digest),
-        }),
-        Ok(None) => Ok(Stored::Foreign { etag }),
-        Err(error) => {
-            tracing::warn!(%error, "a stored report is not used");
-            Err(Failure::silent(error.to_string()))
-        }
-    }
+    let digest = ReportDigest::read(&object.bytes, uid).map_err(|error| {
+        tracing::warn!(%error, "a stored report is not used");
+        Failure::silent(error.to_string())
+    })?;
+    Ok(Some(Stored {
+        etag: object.etag,
+        digest: digest.map(Arc::new),
+    }))
 }
 
 /// A bucket that refuses may be opened again at any moment, and what it held before still counts then.
@@ -160,7 +149,8 @@ pub fn seen(lookup: &Lookup<Report>, job: JobNumber, pod: Option<&str>) -> Repor
     let stage = last.map(|last| &last.question.demand).filter(|asked| is_of(asked));
     ReportView {
         stored: last.map_or(ObservedReport::NotRead, |last| match last.result.as_ref() {
-            Ok(stored) => shown(stored, job.attempt, last.question.files.former_uid.is_some()),
+            Ok(None) => ObservedReport::Absent,
+            Ok(Some(stored)) => shown(stored, job.attempt, last.question.files.former_uid.is_some()),
             Err(failure) => ObservedReport::Unreadable(failure.why.clone()),
         }),
         stage: stage.map(|asked| asked.stage),
@@ -171,12 +161,10 @@ pub fn seen(lookup: &Lookup<Report>, job: JobNumber, pod: Option<&str>) -> Repor
 /// The report as that of an attempt. `is_former`: the report is older than the object, which was restored from a backup. It may be of a
 /// later attempt than the object knows. Its own Pods store reports of its attempt alone.
 fn shown(stored: &Stored, wanted: Attempt, is_former: bool) -> ObservedReport {
-    match stored {
-        Stored::Nothing => ObservedReport::Absent,
-        Stored::Report { digest, .. } if digest.attempt == wanted || (is_former && digest.attempt > wanted) => {
-            ObservedReport::Ours(Arc::clone(digest))
-        }
-        Stored::Foreign { .. } | Stored::Report { .. } => ObservedReport::Foreign,
+    let is_ours = |digest: &&Arc<ReportDigest>| digest.attempt == wanted || (is_former && digest.attempt > wanted);
+    match stored.digest.as_ref().filter(is_ours) {
+        Some(digest) => ObservedReport::Ours(Arc::clone(digest)),
+        None => ObservedReport::Foreign,
     }
 }
 

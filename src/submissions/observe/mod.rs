@@ -22,7 +22,7 @@ use causes::Causes;
 use leaderboard_api::{Leaderboard, Submission, SubmissionStatus};
 use leaderboard_base::clock::Clock;
 use leaderboard_policy::submissions::job_name;
-use leaderboard_policy::view::{EvalaiView, NodeView, ObservedJob, PodView, View};
+use leaderboard_policy::view::{NodeView, ObservedJob, PodView, View};
 use workers::Workers;
 
 /// The sources of a submission's view.
@@ -49,39 +49,29 @@ pub fn observe(uses: Uses<'_>, submission: Arc<Submission>, is_policy_in_place: 
     let pod_uid = pod.as_ref().map(|pod| pod.uid.as_str());
     let (key, number) = (uid(submission.as_ref()), status.map(SubmissionStatus::job_number));
     let number = number.unwrap_or_default();
+    let board = leaderboard.as_deref();
+    let waited = uses.memory.evalai_waited(&submission);
+    let may_create = matches!(job, ObservedJob::Absent { .. } | ObservedJob::Foreign);
     View {
         now,
         // Comparing it takes longer than reading the rest.
-        is_policy_in_place: may_create(&job) && leaderboard.as_deref().is_some_and(is_policy_in_place),
-        not_allowed: leaderboard.as_deref().and_then(|board| uses.external.refusal(board)),
+        is_policy_in_place: may_create && board.is_some_and(is_policy_in_place),
+        not_allowed: board.and_then(|board| uses.external.refusal(board)),
         row: workers.rows.get(key),
         input: workers.inputs.get(key),
-        turn: uses.slots.turn(&submission, leaderboard.as_deref()),
+        turn: uses.slots.turn(&submission, board),
         node: node(uses, pod.as_ref()),
         report: reports::seen(&workers.reports.get(key), number, pod_uid),
         fence: fences::seen(&workers.fences.get(key), number),
         log: failure_log::seen(&workers.logs.get(key), number, is_over),
-        evalai: uses
-            .external
-            .evalai_view(leaderboard.as_deref(), &submission)
-            .map(|evalai| EvalaiView {
-                waited: uses.memory.evalai_waited(&submission),
-                ..evalai
-            }),
-        record: leaderboard
-            .as_deref()
-            .and_then(|board| uses.external.record_view(board, &submission)),
+        evalai: uses.external.evalai_view(board, &submission, waited),
+        record: board.and_then(|board| uses.external.record_view(board, &submission)),
         written_ago: uses.memory.since_write(&submission),
         submission,
         leaderboard,
         job,
         pod,
     }
-}
-
-/// True if a Job may be made now.
-fn may_create(job: &ObservedJob) -> bool {
-    matches!(job, ObservedJob::Absent { .. } | ObservedJob::Foreign)
 }
 
 /// The Job that the present attempt should have, and its newest Pod.
@@ -102,7 +92,7 @@ fn children(uses: Uses<'_>, submission: &Submission) -> (ObservedJob, Option<Pod
         };
         return (job, None);
     };
-    if !is_owned_by(&found, submission) {
+    if !found.metadata.is_owned_by(uid(submission)) {
         return (ObservedJob::Foreign, None);
     }
     uses.memory.forget_job(submission);
@@ -124,9 +114,4 @@ fn children(uses: Uses<'_>, submission: &Submission) -> (ObservedJob, Option<Pod
 fn node(uses: Uses<'_>, pod: Option<&PodView>) -> NodeView {
     let name = pod.filter(|pod| pod.needs_node()).and_then(|pod| pod.node.as_deref());
     name.map(|name| node::watched(uses.stores, name)).unwrap_or_default()
-}
-
-fn is_owned_by(job: &Job, submission: &Submission) -> bool {
-    job.metadata
-        .is_owned_by(submission.metadata.uid.as_deref().unwrap_or_default())
 }

@@ -30,7 +30,7 @@ pub(super) fn watched(stores: &Stores, name: &str) -> NodeView {
         return NodeView::default();
     };
     let found = nodes.store.get(&ObjectRef::new(name));
-    found.map_or_else(gone, |node| of(&node))
+    found.map_or_else(|| in_state(ObservedNode::Gone), |node| of(&node))
 }
 
 /// Wakes the submissions of a node when it falls silent, reports again, is about to go or goes. All Pods are walked then, which is
@@ -40,12 +40,13 @@ pub async fn wake(mut nodes: WatchEvents<Node>, pods: Store<Pod>, wake: Wake<Sub
     while let Some(event) = nodes.next().await {
         let name: &str = &event.object.metadata.name;
         let (before, now) = if event.is_gone {
-            (known.remove(name), gone())
+            (known.remove(name), in_state(ObservedNode::Gone))
         } else {
             let now = of(&event.object);
             (known.insert(name.into(), now.clone()), now)
         };
-        if before.unwrap_or_else(healthy) != now {
+        // Before it is first observed, it counts as one that reports.
+        if before.unwrap_or_else(|| in_state(ObservedNode::Reports)) != now {
             let pods = pods.state();
             let of_node = pods.iter().filter(|pod| pod.spec.node_name.as_deref() == Some(name));
             of_node
@@ -55,19 +56,10 @@ pub async fn wake(mut nodes: WatchEvents<Node>, pods: Store<Pod>, wake: Wake<Sub
     }
 }
 
-fn gone() -> NodeView {
-    NodeView {
-        state: ObservedNode::Gone,
-        ..NodeView::default()
-    }
-}
-
-/// A node of which there is nothing to be known.
-fn healthy() -> NodeView {
-    NodeView {
-        state: ObservedNode::Reports,
-        ..NodeView::default()
-    }
+/// A node whose end is not announced.
+fn in_state(state: ObservedNode) -> NodeView {
+    let leaving = None;
+    NodeView { state, leaving }
 }
 
 fn of(node: &Node) -> NodeView {

@@ -39,19 +39,19 @@ fn key(uid: &str) -> ObjectKey {
     }
 }
 
-fn found(done: u32) -> Stored {
+fn found(done: u32) -> Option<Stored> {
     let digest = ReportDigest {
         attempt: Attempt(1),
         done,
         ..ReportDigest::default()
     };
-    Stored::Report {
+    Some(Stored {
         etag: Some(done.to_string()),
-        digest: Arc::new(digest),
-    }
+        digest: Some(Arc::new(digest)),
+    })
 }
 
-fn failed(why: &str) -> Result<Stored, Failure> {
+fn failed(why: &str) -> Result<Option<Stored>, Failure> {
     Err(Failure::silent(why))
 }
 
@@ -91,13 +91,13 @@ impl Bench {
         self.state.next(self.now).is_none()
     }
 
-    fn answer(&mut self, work: &Work<Report>, answer: Result<Stored, Failure>) -> bool {
+    fn answer(&mut self, work: &Work<Report>, answer: Result<Option<Stored>, Failure>) -> bool {
         self.state.done(work, answer, self.now)
     }
 
     /// Reads what is due now.
     #[track_caller]
-    fn read(&mut self, answer: Result<Stored, Failure>) -> bool {
+    fn read(&mut self, answer: Result<Option<Stored>, Failure>) -> bool {
         let work = self.begin();
         self.answer(&work, answer)
     }
