@@ -13,7 +13,6 @@ mod priority;
 pub mod probe;
 mod reach;
 pub mod standing;
-mod standings;
 pub mod state;
 pub mod token;
 mod tried_pods;
@@ -173,7 +172,7 @@ fn observe(
         results: census.results,
         named: hub.labels(&key).0.map(|labels| labels.rankings),
         generation: leaderboard.metadata.generation,
-        cancelled: standings::cancelled(hub, &key, leaderboard),
+        cancelled: standing::cancelled(hub, &key, leaderboard),
     };
     let is_new = uses.policies.state.is_news(&uid_of(leaderboard.as_ref()), &made);
     let view = LeaderboardView {

@@ -1,5 +1,6 @@
 //! How a Leaderboard stands with EvalAI: what its token is, and what EvalAI's client has read of its challenge. Reads memory alone.
 
+use std::collections::BTreeSet;
 use std::sync::Arc;
 
 use jiff::Timestamp;
@@ -8,7 +9,8 @@ use k8s_openapi::apimachinery::pkg::apis::meta::v1::Time;
 use super::reach::capitalized;
 use crate::runtime::objects::key_of;
 use leaderboard_api::text::sentence;
-use leaderboard_api::{EvalaiBacklog, EvalaiUse, Leaderboard};
+use leaderboard_api::{EvalaiBacklog, EvalaiUse, Leaderboard, names};
+use leaderboard_base::object_key::ObjectKey;
 use leaderboard_evalai::token::Token;
 use leaderboard_evalai::{Hub, InboxTrouble, Labels, Usage};
 use leaderboard_policy::ask::Failure;
@@ -90,6 +92,20 @@ pub(super) fn evalai_use(usage: Usage) -> EvalaiUse {
             last_expected_time: Time(at),
         }),
     }
+}
+
+/// Submissions of stored rows that EvalAI shows as cancelled, deleted ones included: retention takes those out of the cache.
+pub(super) fn cancelled(hub: &Hub, key: &ObjectKey, leaderboard: &Leaderboard) -> BTreeSet<String> {
+    if leaderboard.spec.evalai.is_none() {
+        return BTreeSet::new();
+    }
+    let tracks = leaderboard.status.iter().flat_map(|status| &status.tracks);
+    let names = tracks
+        .flat_map(|track| &track.standings)
+        .map(|row| row.submission.as_str());
+    let is_cancelled =
+        |name: &&str| names::id_of_submission(name).is_some_and(|id| hub.cancelled_as_of(key, id).is_some());
+    names.filter(is_cancelled).map(str::to_owned).collect()
 }
 
 #[cfg(test)]
