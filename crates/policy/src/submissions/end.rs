@@ -106,11 +106,14 @@ fn wait_for_bucket(draft: &mut PlanBuilder<'_>, why: &str) -> bool {
 
 /// Ends as Cancelled; nothing needs to be stopped any more. `when` goes on with the sentence.
 pub(super) fn cancelled(draft: &mut PlanBuilder<'_>, when: &str) {
-    let reason = cancel_reason(draft);
-    let what = if reason == Reason::EndedInEvalAI {
-        "EvalAI ended the submission"
+    let (reason, what) = if draft.spec().cancel {
+        (Reason::Cancelled, "The submission was cancelled")
+    } else if draft.is_deleting() {
+        (Reason::Deleted, "The submission was cancelled")
+    } else if draft.is_ended_in_evalai() {
+        (Reason::EndedInEvalAI, "EvalAI ended the submission")
     } else {
-        "The submission was cancelled"
+        (Reason::Cancelled, "The submission was cancelled")
     };
     close_as(draft, reason, &format!("{what}{when}."));
 }
@@ -119,19 +122,6 @@ pub(super) fn cancelled(draft: &mut PlanBuilder<'_>, when: &str) {
 pub(super) fn close_as(draft: &mut PlanBuilder<'_>, reason: Reason, message: &str) {
     draft.status.failure = None;
     close(draft, reason, message);
-}
-
-/// Why a cancelled submission was cancelled.
-fn cancel_reason(draft: &PlanBuilder<'_>) -> Reason {
-    if draft.spec().cancel {
-        Reason::Cancelled
-    } else if draft.is_deleting() {
-        Reason::Deleted
-    } else if draft.is_ended_in_evalai() {
-        Reason::EndedInEvalAI
-    } else {
-        Reason::Cancelled
-    }
 }
 
 fn cause(draft: &PlanBuilder<'_>, report: Option<&ReportDigest>, job_end: Option<&JobEnd>) -> Failure {

@@ -120,20 +120,17 @@ fn missing_policy(draft: &PlanBuilder<'_>) -> Option<(String, bool)> {
 
 /// True if no Job may be made at the moment, because of its Leaderboard.
 pub(super) fn is_held_up(draft: &mut PlanBuilder<'_>) -> bool {
-    if draft.leaderboard().is_none() {
-        let message = draft.no_leaderboard();
-        let message = draft.stall(Reason::LeaderboardNotFound, &message);
-        draft.show(Reason::LeaderboardNotFound, message);
-        draft.look_again(Wait::SLOT);
-        return true;
-    }
-    if let Some((missing, _)) = missing_policy(draft) {
-        draft.stall_with(Reason::NotIsolated, &missing);
-        draft.show(Reason::NotIsolated, missing);
-        draft.look_again(Wait::SLOT);
-        return true;
-    }
-    false
+    let (reason, why) = if draft.leaderboard().is_none() {
+        (Reason::LeaderboardNotFound, draft.no_leaderboard())
+    } else if let Some((missing, _)) = missing_policy(draft) {
+        (Reason::NotIsolated, missing)
+    } else {
+        return false;
+    };
+    draft.stall_with(reason, &why);
+    draft.show(reason, why);
+    draft.look_again(Wait::SLOT);
+    true
 }
 
 /// Why an end of what was held back is written to no other system.

@@ -219,10 +219,8 @@ impl<'a> PlanBuilder<'a> {
     /// The status of a new attempt, with what was pinned and what earlier attempts reached.
     fn start_status(&mut self, wanted: Attempt) {
         let old = std::mem::take(&mut self.status);
-        let is_lost = old
-            .failure
-            .as_ref()
-            .is_some_and(|failure| failure.reason == Reason::InputMissing);
+        let failure = old.failure.as_ref();
+        let is_lost = failure.is_some_and(|failure| failure.reason == Reason::InputMissing);
         // Objects that Pods from before a restore have stored belong to earlier attempts.
         let submission_uid = self.submission().metadata.uid.clone();
         let next = |plan: RunPlan| RunPlan {
