@@ -54,7 +54,7 @@ impl EvaluationMode {
 #[derive(Serialize, Deserialize, JsonSchema, Clone, Copy, Debug, Default, PartialEq, Eq)]
 pub enum MergeMethod {
     /// Each metric is the mean of all workers, weighted by the units that each has done. A metric that is no mean over units, such as F1,
-    /// needs one worker.
+    /// needs Command or one worker.
     #[default]
     Mean,
     /// Each metric is the sum of all workers.
