@@ -7,6 +7,7 @@ use std::collections::{HashMap, HashSet};
 use std::hash::Hasher;
 use std::sync::Arc;
 
+use futures::future::ready;
 use futures::stream::{self, BoxStream, StreamExt, select_all};
 use k8s_openapi::api::networking::v1::NetworkPolicy;
 use kube::ResourceExt;
@@ -36,13 +37,8 @@ pub(super) fn of_submissions(
 ) -> Events<Submission> {
     let boards = Arc::clone(&shared.queues.leaderboards);
     let store = shared.context.stores.submissions.clone();
-    let by_store = move |urgency: fn(&Submission) -> Class| {
-        let store = store.clone();
-        move |object| Some(ranked(&store, object, urgency))
-    };
-    let of_evalai = by_store(urgency::of_evalai);
     let of_evalai = move |change| match change {
-        Changed::Submission(key) => of_evalai(reference(&key)),
+        Changed::Submission(key) => Some(ranked(&store, reference(&key), urgency::of_evalai)),
         Changed::Leaderboard(key) => {
             boards.add(&reference::<Leaderboard>(&key), Class::Refresh);
             None
@@ -258,17 +254,11 @@ fn reference<K: kube::Resource<DynamicType = ()>>(key: &ObjectKey) -> ObjectRef<
     ObjectRef::new(&key.name).within(&key.namespace)
 }
 
-fn mapped<E, R, I>(
+fn mapped<E: 'static, R: Send + 'static>(
     events: impl futures::Stream<Item = E> + Send + 'static,
-    map: impl FnMut(E) -> I + Send + 'static,
-) -> BoxStream<'static, R>
-where
-    E: 'static,
-    R: Send + 'static,
-    I: IntoIterator<Item = R> + Send + 'static,
-    I::IntoIter: Send,
-{
-    events.map(map).flat_map(stream::iter).boxed()
+    mut map: impl FnMut(E) -> Option<R> + Send + 'static,
+) -> BoxStream<'static, R> {
+    events.filter_map(move |event| ready(map(event))).boxed()
 }
 
 fn received<T: Send + 'static>(

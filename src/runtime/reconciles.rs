@@ -142,7 +142,7 @@ async fn reconcile_known(turn: Turn, submission: Arc<Submission>, shared: Arc<Sh
     if let Some(wait) = operator::left_alone(board.as_deref(), &context.settings.operator) {
         let metrics = &shared.telemetry.metrics;
         metrics.reconciled(SUBMISSION, Reason::OtherOperator.as_str(), started.elapsed());
-        return After::In(jittered(wait, 0.2), Class::Refresh);
+        return After::In(jittered(wait, SPREAD), Class::Refresh);
     }
     let work = async {
         let policies = shared.context.policies();
@@ -228,7 +228,7 @@ fn finish(
         Ok((requeue, class)) => {
             shared.backoff.forget(&uid);
             metrics.reconciled(kind, "ok", started.elapsed());
-            After::In(requeue.unwrap_or_else(jittered_resync), class)
+            After::In(requeue.unwrap_or_else(|| jittered(RESYNC, SPREAD)), class)
         }
         Err((error, class)) => {
             metrics.reconciled(kind, "error", started.elapsed());
@@ -236,11 +236,6 @@ fn finish(
             After::In(shared.backoff.failed(&uid), class)
         }
     }
-}
-
-/// Spreads the resync of many objects.
-fn jittered_resync() -> Duration {
-    jittered(RESYNC, SPREAD)
 }
 
 #[cfg(test)]

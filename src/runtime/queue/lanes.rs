@@ -44,53 +44,34 @@ const PATIENCE: Duration = Duration::from_secs(5);
 /// Number of others that go first while an aged lower class waits.
 const OTHERS_FIRST: u32 = 3;
 
-/// All that is ready, by class. New ones are kept apart by namespace, since one namespace may have no permit left.
+/// All that is ready.
 #[derive(Debug, Default)]
 pub(super) struct Lanes {
-    urgent: Lane,
-    new: HashMap<Arc<str>, Lane>,
-    refresh: Lane,
+    /// By class and namespace: one namespace may have no permit left.
+    lanes: [HashMap<Arc<str>, Lane>; 3],
     /// How many others went first since each class has aged.
     passed_over: [u32; 3],
 }
 
 impl Lanes {
     pub(super) fn insert(&mut self, class: Class, place: DueKey, key: Key) {
-        match class {
-            Class::Urgent => self.urgent.insert(place, key),
-            Class::New => self
-                .new
-                .entry(Arc::clone(&key.namespace))
-                .or_default()
-                .insert(place, key),
-            Class::Refresh => self.refresh.insert(place, key),
-        };
+        let lane = self.lanes[class as usize].entry(Arc::clone(&key.namespace));
+        lane.or_default().insert(place, key);
     }
 
     pub(super) fn remove(&mut self, class: Class, place: DueKey, key: &Key) {
-        match class {
-            Class::Urgent => self.urgent.remove(&place),
-            Class::New => self.remove_new(place, &key.namespace),
-            Class::Refresh => self.refresh.remove(&place),
-        };
-    }
-
-    fn remove_new(&mut self, place: DueKey, namespace: &Arc<str>) -> Option<Key> {
-        let lane = self.new.get_mut(namespace)?;
-        let key = lane.remove(&place);
-        if lane.is_empty() {
-            self.new.remove(namespace);
+        let lanes = &mut self.lanes[class as usize];
+        if let Some(lane) = lanes.get_mut(&key.namespace) {
+            lane.remove(&place);
+            if lane.is_empty() {
+                lanes.remove(&key.namespace);
+            }
         }
-        key
     }
 
     /// How many wait in each class.
     pub(super) fn depth(&self) -> [usize; 3] {
-        [
-            self.urgent.len(),
-            self.new.values().map(Lane::len).sum(),
-            self.refresh.len(),
-        ]
+        self.lanes.each_ref().map(|lanes| lanes.values().map(Lane::len).sum())
     }
 
     /// Takes out what is next. `may_begin`: which classes may begin now; `has_permit`: the namespaces that may create a Job.
@@ -120,14 +101,10 @@ impl Lanes {
     }
 
     fn head(&self, class: Class, has_permit: impl Fn(&str) -> bool) -> Option<(DueKey, Key)> {
-        let first = |lane: &Lane| lane.first_key_value().map(|(place, key)| (*place, key.clone()));
-        match class {
-            Class::Urgent => first(&self.urgent),
-            Class::Refresh => first(&self.refresh),
-            Class::New => {
-                let open = self.new.iter().filter(|(namespace, _)| has_permit(namespace));
-                open.filter_map(|(_, lane)| first(lane)).min_by_key(|(place, _)| *place)
-            }
-        }
+        let lanes = self.lanes[class as usize].iter();
+        let open = lanes.filter(|(namespace, _)| class != Class::New || has_permit(namespace));
+        let heads = open.filter_map(|(_, lane)| lane.first_key_value());
+        let (place, key) = heads.min_by_key(|(place, _)| **place)?;
+        Some((*place, key.clone()))
     }
 }
