@@ -1,14 +1,11 @@
 //! Facts of any object: its key, its owner, and its mark as ours. Pure.
 
-use std::fmt;
-
 use kube::runtime::reflector::ObjectRef;
 use kube::{Resource, ResourceExt};
 use tracing::Span;
 
 use leaderboard_api::{Leaderboard, Submission, names};
 use leaderboard_base::object_key::ObjectKey;
-use leaderboard_base::spans as about;
 use leaderboard_base::spans::LogSpan;
 
 /// Puts an object into its work queue.
@@ -50,30 +47,19 @@ pub fn key_of(object: &impl ResourceExt) -> ObjectKey {
 
 /// Span of all log lines about a submission.
 pub fn span_of(submission: &Submission) -> Span {
-    let spec = &submission.spec;
-    about::submission(
-        full_name(submission),
-        &spec.leaderboard_name,
-        submission.present_attempt().0,
-        uid(submission),
-    )
+    log_span_of(submission).span()
 }
 
 /// Span for a task that works for a submission later.
 pub fn log_span_of(submission: &Submission) -> LogSpan {
-    let spec = &submission.spec;
+    let meta = &submission.metadata;
+    let (namespace, name) = (meta.namespace.as_deref(), meta.name.as_deref());
     LogSpan::of(
-        full_name(submission),
-        &spec.leaderboard_name,
+        format_args!("{}/{}", namespace.unwrap_or_default(), name.unwrap_or_default()),
+        &submission.spec.leaderboard_name,
         submission.present_attempt().0,
         uid(submission),
     )
-}
-
-fn full_name(submission: &Submission) -> impl fmt::Display {
-    let meta = &submission.metadata;
-    let (namespace, name) = (meta.namespace.as_deref(), meta.name.as_deref());
-    fmt::from_fn(move |f| write!(f, "{}/{}", namespace.unwrap_or_default(), name.unwrap_or_default()))
 }
 
 /// The Leaderboard that a Submission names.

@@ -11,20 +11,7 @@ use tracing::field::Empty;
 
 use super::trace_id::TraceId;
 
-/// The span of a submission that has an object. `submission` is `namespace/name`.
-///
-/// The span has level ERROR: a filter that lets an error through lets its fields through as well.
-pub fn submission(submission: impl fmt::Display, leaderboard: &str, attempt: i64, uid: &str) -> Span {
-    tracing::error_span!(
-        "submission",
-        %submission,
-        leaderboard,
-        attempt,
-        trace_id = %TraceId::of(uid)
-    )
-}
-
-/// The span of a submission whose object may not be there yet. Its attempt and its trace follow by [`identify`].
+/// The span of a submission whose object may not be there yet. `submission` is `namespace/name`. Its attempt and its trace follow by [`identify`].
 pub fn incoming(submission: impl fmt::Display, leaderboard: &str) -> Span {
     tracing::error_span!("submission", %submission, leaderboard, attempt = Empty, trace_id = Empty)
 }
@@ -52,7 +39,7 @@ struct Fields {
 }
 
 impl LogSpan {
-    /// That of [`submission`].
+    /// That of a submission that has an object. `submission` is `namespace/name`.
     pub fn of(submission: impl fmt::Display, leaderboard: &str, attempt: i64, uid: &str) -> Self {
         Self(Some(Arc::new(Fields {
             submission: submission.to_string().into(),
@@ -62,17 +49,16 @@ impl LogSpan {
         })))
     }
 
-    /// To be entered for the work's lines.
+    /// To be entered for the work's lines. It has level ERROR: a filter that lets an error through lets its fields through as well.
     pub fn span(&self) -> Span {
-        self.0.as_deref().map_or_else(Span::none, |fields| {
-            let Fields {
-                submission: name,
-                leaderboard,
-                attempt,
-                uid,
-            } = fields;
-            submission(name, leaderboard, *attempt, uid)
-        })
+        let Some(of) = &self.0 else { return Span::none() };
+        tracing::error_span!(
+            "submission",
+            submission = %of.submission,
+            leaderboard = &*of.leaderboard,
+            attempt = of.attempt,
+            trace_id = %TraceId::of(&of.uid)
+        )
     }
 }
 
