@@ -41,12 +41,7 @@ impl Readiness {
 
     /// Every part of the process has set its checks once: from now on they alone count.
     pub fn registered(&self) {
-        self.remove(START);
-    }
-
-    /// A check that no longer applies.
-    pub fn remove(&self, name: &str) {
-        lock(&self.0).remove(name);
+        lock(&self.0).remove(START);
     }
 
     /// The missing parts in the order of names, one `name: sentence` each. Empty: ready.
@@ -95,7 +90,7 @@ mod tests {
         ];
         assert_eq!(readiness.missing(), both);
         readiness.set("submissions synced", Ok(()));
-        readiness.remove("custom resources");
+        readiness.set("custom resources", Ok(()));
         assert!(readiness.missing().is_empty());
     }
 }
