@@ -7,17 +7,17 @@ use std::io::Write as _;
 use std::process::ExitCode;
 
 use clap::Args;
-use leaderboard_results::{Metric, Source, metrics};
+use leaderboard_results::{Format, Metric, Source, metrics};
 use serde::Serialize;
 
-use super::offline::FormatName;
+use super::offline::formats;
 
 /// Print the metric labels that a phase of the CARLA Leaderboard needs, as the schema of its leaderboard in EvalAI.
 #[derive(Args, Debug)]
 pub(super) struct Labels {
     /// Leaderboard 1.0 (v1) or 2.0 (v2).
-    #[arg(long, value_enum)]
-    format: FormatName,
+    #[arg(long, value_parser = formats())]
+    format: Format,
 }
 
 /// `leaderboard[].schema` of a challenge's configuration.
@@ -35,7 +35,7 @@ struct Order {
 
 impl Labels {
     pub(super) fn run(&self) -> ExitCode {
-        let all = metrics(self.format.into());
+        let all = metrics(self.format);
         let Some(schema) = schema(all).and_then(|schema| serde_json::to_string_pretty(&schema).ok()) else {
             eprintln!("leaderboard-operator labels: the format has no metrics");
             return ExitCode::FAILURE;
@@ -60,7 +60,6 @@ fn schema(all: &'static [Metric]) -> Option<Schema> {
 #[cfg(test)]
 mod tests {
     use super::*;
-    use leaderboard_results::Format;
     use serde_json::json;
 
     #[test]

@@ -5,7 +5,8 @@ use std::io::{ErrorKind, Read as _, Write as _};
 use std::path::{Path, PathBuf};
 use std::process::ExitCode;
 
-use clap::{Args, ValueEnum};
+use clap::Args;
+use clap::builder::{PossibleValuesParser, TypedValueParser};
 use leaderboard_results::{Files, Format, Merged, PairProgress, Plan, Refusal, Slice, Verify, offline};
 
 use crate::crds;
@@ -33,26 +34,17 @@ pub(super) fn print_crds() -> ExitCode {
     }
 }
 
-#[derive(ValueEnum, Clone, Copy, Debug)]
-pub(super) enum FormatName {
-    V1,
-    V2,
+/// The formats by their names.
+pub(super) fn formats() -> impl TypedValueParser<Value = Format> {
+    PossibleValuesParser::new(["v1", "v2"]).map(|name| if name == "v1" { Format::V1 } else { Format::V2 })
 }
 
-impl From<FormatName> for Format {
-    fn from(name: FormatName) -> Self {
-        match name {
-            FormatName::V1 => Self::V1,
-            FormatName::V2 => Self::V2,
-        }
-    }
-}
-
-#[derive(ValueEnum, Clone, Copy, Debug)]
-enum VerifyName {
-    Disabled,
-    Warn,
-    Refuse,
+fn verifications() -> impl TypedValueParser<Value = Verify> {
+    PossibleValuesParser::new(["disabled", "warn", "refuse"]).map(|name| match name.as_str() {
+        "disabled" => Verify::Disabled,
+        "warn" => Verify::Warn,
+        _ => Verify::Refuse,
+    })
 }
 
 /// Exit codes of `results`, for its help.
@@ -63,8 +55,8 @@ pub(super) const EXIT_CODES: &str = "Exit code 0: the four files are written. 2:
 #[derive(Args, Debug)]
 pub(super) struct Results {
     /// Format of the checkpoints.
-    #[arg(long, value_enum)]
-    format: FormatName,
+    #[arg(long, value_parser = formats())]
+    format: Format,
     /// Folder for agent_results.json, results.json, stdout.txt and metadata.json.
     #[arg(long)]
     out: PathBuf,
@@ -85,8 +77,8 @@ pub(super) struct Results {
     #[arg(long)]
     as_original: bool,
     /// What to do about scores that do not follow from the infractions.
-    #[arg(long, value_enum, default_value = "warn")]
-    verify: VerifyName,
+    #[arg(long, value_parser = verifications(), default_value = "warn")]
+    verify: Verify,
     /// The workers' files in order; an absent file is a worker without results.
     #[arg(required = true)]
     inputs: Vec<PathBuf>,
@@ -181,16 +173,10 @@ impl Results {
     }
 
     fn plan(&self) -> Result<Plan, Failure> {
-        let format = Format::from(self.format);
-        let verify = match self.verify {
-            VerifyName::Disabled => Verify::Disabled,
-            VerifyName::Warn => Verify::Warn,
-            VerifyName::Refuse => Verify::Refuse,
-        };
         let plan = Plan {
             as_original: self.as_original,
-            verify,
-            ..Plan::lenient(format)
+            verify: self.verify,
+            ..Plan::lenient(self.format)
         };
         let pairs: Vec<Slice> = self.slices()?.into_iter().map(of_plan).collect();
         if pairs.is_empty() {
@@ -201,7 +187,7 @@ impl Results {
                 )),
             };
         }
-        let usual = match format {
+        let usual = match self.format {
             Format::V1 => 5,
             Format::V2 => 1,
         };
@@ -278,49 +264,29 @@ fn write_all(out: &Path, merged: &str, files: &Files) -> Result<(), Failure> {
         ("stdout.txt", files.stdout_txt.as_str()),
     ];
     texts.extend(files.metadata_json.as_deref().map(|text| ("metadata.json", text)));
-    let places: Vec<OutputFile> = texts.iter().map(|(name, _)| OutputFile::of(out, name)).collect();
-    let staged = places
-        .iter()
-        .zip(&texts)
-        .try_for_each(|(place, (_, text))| place.stage(text));
-    let done = staged.and_then(|()| places.iter().try_for_each(OutputFile::take));
+    let staged = |name: &str| out.join(format!(".{name}.{}", std::process::id()));
+    let each = |step: &dyn Fn(&Path, &Path, &str) -> std::io::Result<()>| {
+        texts.iter().try_for_each(|(name, text)| {
+            let target = out.join(name);
+            step(&target, &staged(name), text).map_err(|error| failed(&target, "written", error))
+        })
+    };
+    let done = each(&stage).and_then(|()| each(&|target, staged, _| fs::rename(staged, target)));
     if done.is_err() {
-        for place in &places {
+        for (name, _) in &texts {
             // The files that this call wrote go; most of them may not be there.
-            let _ = fs::remove_file(&place.staged);
+            let _ = fs::remove_file(staged(name));
         }
     }
     done
 }
 
-/// Where a file goes, and where it waits until the others are ready.
-struct OutputFile {
-    target: PathBuf,
-    staged: PathBuf,
-}
-
-impl OutputFile {
-    fn of(out: &Path, name: &str) -> Self {
-        Self {
-            target: out.join(name),
-            staged: out.join(format!(".{name}.{}", std::process::id())),
-        }
+fn stage(target: &Path, staged: &Path, text: &str) -> std::io::Result<()> {
+    // The one thing a rename does not replace.
+    if target.is_dir() {
+        return Err(ErrorKind::IsADirectory.into());
     }
-
-    fn stage(&self, text: &str) -> Result<(), Failure> {
-        let write = || {
-            // The one thing a rename does not replace.
-            if self.target.is_dir() {
-                return Err(ErrorKind::IsADirectory.into());
-            }
-            let mut file = File::create_new(&self.staged)?;
-            file.write_all(text.as_bytes())?;
-            file.sync_all()
-        };
-        write().map_err(|error| failed(&self.target, "written", error))
-    }
-
-    fn take(&self) -> Result<(), Failure> {
-        fs::rename(&self.staged, &self.target).map_err(|error| failed(&self.target, "written", error))
-    }
+    let mut file = File::create_new(staged)?;
+    file.write_all(text.as_bytes())?;
+    file.sync_all()
 }
