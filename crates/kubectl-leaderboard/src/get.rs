@@ -15,7 +15,7 @@ use crate::commands::frame;
 use crate::error::{Error, of_bucket};
 use crate::output::{ask, print};
 use crate::table::table;
-use crate::text::{Frame, age, clean, size, wrap};
+use crate::text::{Frame, age, clean, counted, size, wrap};
 use crate::{bucket, facts, foreign};
 
 /// Arguments of `get`: the submission, and the folder for its files.
@@ -84,7 +84,7 @@ async fn download(
             folder.display()
         )));
     }
-    let text = format!("Copying {} of {results} to {}.", counted(stored), folder.display());
+    let text = format!("Copying {} of {results} to {}.", sum(stored), folder.display());
     print(&wrap(&text, frame().width));
     // A folder that begins like a flag or like an address is a folder all the same.
     let place = Path::new(".").join(folder).display().to_string();
@@ -143,10 +143,9 @@ pub(super) fn stays_within(key: &str) -> bool {
     key.split('/').all(is_plain) && key.chars().all(is_safe)
 }
 
-fn counted(stored: &[Stored]) -> String {
+fn sum(stored: &[Stored]) -> String {
     let bytes = stored.iter().map(|one| one.1).sum();
-    let objects = if stored.len() == 1 { "object" } else { "objects" };
-    format!("{} {objects} ({})", stored.len(), size(bytes))
+    format!("{} ({})", counted(stored.len(), "object"), size(bytes))
 }
 
 /// The objects with their sizes and ages.
@@ -164,7 +163,7 @@ pub(super) fn lines(submission: &Submission, stored: &[Stored], frame: Frame) ->
     let mut lines = table(&["SIZE", "AGE", "NAME"], &rows.collect::<Vec<_>>(), frame.width);
     let next = format!(
         "{}. `{} --download DIR` copies all.",
-        counted(stored),
+        sum(stored),
         facts::command("get", submission)
     );
     lines.push(String::new());

@@ -9,7 +9,7 @@ use crate::change::Request;
 use crate::cluster::Filter;
 use crate::facts;
 use crate::table::table;
-use crate::text::{Frame, age, wrap};
+use crate::text::{Frame, age, counted, wrap};
 
 /// Which submissions.
 #[derive(Args, Debug)]
@@ -107,7 +107,7 @@ impl Resume {
         };
         let text = format!(
             "None of {} {what}. `kubectl leaderboard status -n {namespace}` lists all.",
-            counted(number)
+            counted(number, "submission")
         );
         wrap(&text, frame.width)
     }
@@ -129,7 +129,7 @@ pub fn lines(chosen: &[&Submission], frame: Frame) -> Vec<String> {
 /// The table, and a sentence about the effect without `--dry-run`.
 pub fn dry_run(verb: &str, chosen: &[&Submission], frame: Frame) -> Vec<String> {
     let mut lines = lines(chosen, frame);
-    let number = counted(chosen.len());
+    let number = counted(chosen.len(), "submission");
     lines.extend([
         String::new(),
         format!("Would {verb} {number}. Without --dry-run it does."),
@@ -165,7 +165,7 @@ fn row(one: &Submission, now: Timestamp) -> Vec<String> {
 /// Asks for a yes.
 pub fn question(verb: &str, number: usize) -> String {
     let (first, rest) = verb.split_at(1);
-    format!("{}{rest} {}?", first.to_uppercase(), counted(number))
+    format!("{}{rest} {}?", first.to_uppercase(), counted(number, "submission"))
 }
 
 /// The sum after a line for each submission: how many were requested, and how many were refused.
@@ -177,15 +177,7 @@ pub fn summary(requested: usize, chosen: usize, namespace: &str, frame: Frame) -
     };
     let text = format!(
         "Requested for {requested} of {}.{refused} To follow them: `kubectl leaderboard status -n {namespace}`.",
-        counted(chosen)
+        counted(chosen, "submission")
     );
     wrap(&text, frame.width)
-}
-
-/// `1 submission`, `38 submissions`.
-pub fn counted(number: usize) -> String {
-    match number {
-        1 => "1 submission".to_owned(),
-        number => format!("{number} submissions"),
-    }
 }

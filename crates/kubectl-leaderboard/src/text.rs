@@ -160,17 +160,8 @@ pub(super) fn cut(text: &str, width: usize) -> String {
 
 /// The end of a text, of at most so many columns.
 pub(super) fn cut_start(text: &str, width: usize) -> String {
-    if columns(text) <= width {
-        return text.to_owned();
-    }
-    let mut kept = String::new();
-    for letter in text.chars().rev() {
-        if columns(&kept) + letter.width().unwrap_or(0) + 1 > width {
-            break;
-        }
-        kept.insert(0, letter);
-    }
-    format!("…{}", kept.trim_start())
+    let backwards = |text: &str| text.chars().rev().collect::<String>();
+    backwards(&cut(&backwards(text), width))
 }
 
 /// A text with blanks up to so many columns.
@@ -193,6 +184,11 @@ pub(super) fn log_line(line: &str) -> String {
 pub(super) fn join(parts: &[&str]) -> String {
     let parts: Vec<&str> = parts.iter().copied().filter(|part| !part.is_empty()).collect();
     parts.join(" ")
+}
+
+/// A number of things: `1 object`, `2 objects`.
+pub(super) fn counted(number: usize, one: &str) -> String {
+    format!("{number} {one}{}", if number == 1 { "" } else { "s" })
 }
 
 /// `2026-11-01 10:00:00 UTC (3m20s ago)`.

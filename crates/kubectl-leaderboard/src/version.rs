@@ -13,7 +13,7 @@ use crate::commands::frame;
 use crate::dashboard::{operator_namespace, replicas};
 use crate::error::Error;
 use crate::output::{self, Output, print};
-use crate::text::Frame;
+use crate::text::{Frame, counted};
 
 /// This program's version.
 const OWN: &str = env!("CARGO_PKG_VERSION");
@@ -103,11 +103,8 @@ pub(super) fn lines(own: &str, operator: Option<(&str, &Running)>, frame: Frame)
         page.row("Operator", &format!("has no replica in namespace {namespace}."));
     }
     for ((version, image), replicas) in running {
-        let many = if *replicas == 1 { "replica" } else { "replicas" };
-        page.row(
-            "Operator",
-            &format!("{version}, {replicas} {many} in namespace {namespace}"),
-        );
+        let replicas = counted(*replicas, "replica");
+        page.row("Operator", &format!("{version}, {replicas} in namespace {namespace}"));
         page.whole("Image", image);
     }
     let others: Vec<&str> = running

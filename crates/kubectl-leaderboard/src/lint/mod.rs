@@ -26,6 +26,7 @@ use crate::error::Error;
 use crate::import::text_of;
 use crate::near;
 use crate::output::{code, paragraphs, print};
+use crate::text::counted;
 
 /// The manifests.
 #[derive(Args, Debug)]
@@ -77,7 +78,7 @@ pub(super) fn lines(file: &str, findings: &[Finding], checked: &Checked) -> Vec<
         .iter()
         .map(|one| format!("{file}:{}: {}", one.line, one.text))
         .collect();
-    let objects = |number: usize| format!("{number} object{}", if number == 1 { "" } else { "s" });
+    let objects = |number| counted(number, "object");
     let mut parts = Vec::new();
     match (checked.valid, checked.faulty, findings.len()) {
         (0, 0, 0) if checked.others == 0 => parts.push("no object".to_owned()),
@@ -85,8 +86,8 @@ pub(super) fn lines(file: &str, findings: &[Finding], checked: &Checked) -> Vec<
         (valid, 0, 0) => parts.push(format!("{} valid", objects(valid))),
         (_, 0, _) => parts.push("not readable".to_owned()),
         (valid, faulty, faults) => parts.push(format!(
-            "{faults} fault{} in {faulty} of {}",
-            if faults == 1 { "" } else { "s" },
+            "{} in {faulty} of {}",
+            counted(faults, "fault"),
             objects(valid + faulty)
         )),
     }
@@ -160,12 +161,7 @@ impl Kinds {
         if group != GROUP {
             return None;
         }
-        let fault = |path: &str, text: String| {
-            Some(vec![Fault {
-                path: path.to_owned(),
-                text,
-            }])
-        };
+        let fault = |path: &str, text: String| Some(vec![Fault::at(path, text)]);
         if version != VERSION {
             return fault(
                 "apiVersion",
@@ -183,7 +179,7 @@ impl Kinds {
         // The API server leaves out a status that comes with a manifest.
         let (mut spec, metadata) = (object["spec"].take(), named(object["metadata"].take()));
         if spec.is_null() {
-            faults.extend(fault("", "spec is missing".to_owned())?);
+            faults.push(Fault::at("", "spec is missing".to_owned()));
             return Some(faults);
         }
         schema::check(&schema["properties"]["spec"], &mut spec, "spec", &mut faults);
@@ -238,18 +234,16 @@ fn name_fault(metadata: &Value) -> Option<Fault> {
         (Some(name), _) => ("name", name),
         (None, Some(start)) => ("generateName", start.trim_end_matches('-')),
         (None, None) => {
-            let text = "metadata.name is missing".to_owned();
-            return Some(Fault {
-                path: "metadata".to_owned(),
-                text,
-            });
+            return Some(Fault::at("metadata", "metadata.name is missing".to_owned()));
         }
     };
     let is_plain = |c: char| c.is_ascii_lowercase() || c.is_ascii_digit() || "-.".contains(c);
     let is_end = |c: char| !"-.".contains(c);
     let is_well = name.len() <= 253 && name.chars().all(is_plain) && name.starts_with(is_end) && name.ends_with(is_end);
-    (!is_well).then(|| Fault {
-        path: format!("metadata.{field}"),
-        text: format!("metadata.{field} is {name:?}. It must be of small letters, digits, - and ., and begin and end with a letter or a digit"),
+    (!is_well).then(|| {
+        let text = format!(
+            "metadata.{field} is {name:?}. It must be of small letters, digits, - and ., and begin and end with a letter or a digit"
+        );
+        Fault::at(&format!("metadata.{field}"), text)
     })
 }

@@ -5,12 +5,20 @@ use regex::Regex;
 use serde_json::{Map, Value};
 
 use crate::near;
+use crate::text::counted;
 
 /// A fault, with the path of the value that has it.
 #[derive(Debug, PartialEq, Eq)]
 pub struct Fault {
     pub path: String,
     pub text: String,
+}
+
+impl Fault {
+    pub fn at(path: &str, text: String) -> Self {
+        let path = path.to_owned();
+        Self { path, text }
+    }
 }
 
 /// All faults of a value. A null that stands for a default is taken out, as the API server does.
@@ -46,10 +54,7 @@ pub fn check(schema: &Value, value: &mut Value, path: &str, faults: &mut Vec<Fau
             Value::Null | Value::Bool(_) => {}
         }
     }
-    faults.extend(found.into_iter().map(|text| Fault {
-        path: path.to_owned(),
-        text,
-    }));
+    faults.extend(found.into_iter().map(|text| Fault::at(path, text)));
 }
 
 fn has_type(schema: &Value, value: &Value) -> bool {
@@ -103,19 +108,14 @@ fn object(schema: &Value, fields: &mut Map<String, Value>, path: &str, faults: &
         .flatten()
         .filter_map(Value::as_str);
     for name in required.filter(|name| !fields.contains_key(*name)) {
-        faults.push(Fault {
-            path: path.to_owned(),
-            text: format!("{} is missing", at(name)),
-        });
+        faults.push(Fault::at(path, format!("{} is missing", at(name))));
     }
     faults.extend(union(schema, fields, path));
-    let most = schema["maxProperties"]
-        .as_u64()
-        .filter(|most| fields.len() as u64 > *most);
-    faults.extend(most.map(|most| Fault {
-        path: path.to_owned(),
-        text: format!("{path} has {} entries. It may have {most}", fields.len()),
-    }));
+    let count = fields.len();
+    if let Some((least, bound)) = bound(schema, ["minProperties", "maxProperties"], count) {
+        let text = format!("{path} has {count} entries. It must have {least} {bound}");
+        faults.push(Fault::at(path, text));
+    }
     let names: Vec<String> = known.keys().cloned().collect();
     for (name, value) in fields.iter_mut() {
         let more = &schema["additionalProperties"];
@@ -126,10 +126,8 @@ fn object(schema: &Value, fields: &mut Map<String, Value>, path: &str, faults: &
         } else if more != true && schema["x-kubernetes-preserve-unknown-fields"] != true {
             let near = near::names(name, &names);
             let next = near.first().map(|near| format!(". Did you mean {near}?"));
-            faults.push(Fault {
-                path: at(name),
-                text: format!("there is no field {}{}", at(name), next.unwrap_or_default()),
-            });
+            let text = format!("there is no field {}{}", at(name), next.unwrap_or_default());
+            faults.push(Fault::at(&at(name), text));
         }
     }
 }
@@ -148,27 +146,25 @@ fn union(schema: &Value, fields: &Map<String, Value>, path: &str) -> Option<Faul
         [] => format!("{path} has none of {}. It must have one", members.join(" and ")),
         _ => format!("{path} has {}. It may have one of them", set.join(" and ")),
     };
-    Some(Fault {
-        path: path.to_owned(),
-        text,
-    })
+    Some(Fault::at(path, text))
+}
+
+/// The bound that a number does not keep.
+fn bound(schema: &Value, [least, most]: [&str; 2], number: usize) -> Option<(&'static str, usize)> {
+    let of = |key: &str| usize::try_from(schema[key].as_u64()?).ok();
+    let least = of(least).filter(|least| number < *least);
+    let most = of(most).filter(|most| number > *most);
+    least
+        .map(|least| ("at least", least))
+        .or(most.map(|most| ("at most", most)))
 }
 
 /// A fault of a list itself: its length, or two items with one key.
 fn list(schema: &Value, items: &[Value], path: &str) -> Option<Fault> {
-    let fault = |path: String, text: String| Some(Fault { path, text });
-    let length = items.len() as u64;
-    if let Some(least) = schema["minItems"].as_u64().filter(|least| length < *least) {
-        return fault(
-            path.to_owned(),
-            format!("{path} has {length} items. It must have at least {least}"),
-        );
-    }
-    if let Some(most) = schema["maxItems"].as_u64().filter(|most| length > *most) {
-        return fault(
-            path.to_owned(),
-            format!("{path} has {length} items. It may have at most {most}"),
-        );
+    let length = items.len();
+    if let Some((least, bound)) = bound(schema, ["minItems", "maxItems"], length) {
+        let text = format!("{path} has {length} items. It must have {least} {bound}");
+        return Some(Fault::at(path, text));
     }
     let keys = schema["x-kubernetes-list-map-keys"].as_array()?;
     let key_of = |item: &Value| {
@@ -182,17 +178,13 @@ fn list(schema: &Value, items: &[Value], path: &str) -> Option<Fault> {
     let key: Vec<&str> = key.iter().flatten().map(String::as_str).collect();
     let path = format!("{path}[{index}]");
     let text = format!("{path} has the name of another item: {}", key.join(", "));
-    fault(path, text)
+    Some(Fault { path, text })
 }
 
 /// The first rule of the schema that a text breaks, as the words after "must". None if it keeps all.
 fn string(schema: &Value, text: &str) -> Option<String> {
-    let length = text.chars().count() as u64;
-    if let Some(least) = schema["minLength"].as_u64().filter(|least| length < *least) {
-        return Some(format!("have at least {}", characters(least)));
-    }
-    if let Some(most) = schema["maxLength"].as_u64().filter(|most| length > *most) {
-        return Some(format!("have at most {}", characters(most)));
+    if let Some((least, bound)) = bound(schema, ["minLength", "maxLength"], text.chars().count()) {
+        return Some(format!("have {least} {}", counted(bound, "character")));
     }
     if schema["format"] == "date-time" && text.parse::<Timestamp>().is_err() {
         return Some("be a time such as 2026-11-01T10:00:00Z".to_owned());
@@ -200,14 +192,6 @@ fn string(schema: &Value, text: &str) -> Option<String> {
     let pattern = schema["pattern"].as_str()?;
     let is_match = Regex::new(pattern).is_ok_and(|pattern| pattern.is_match(text));
     (!is_match).then(|| format!("match {pattern}"))
-}
-
-fn characters(number: u64) -> String {
-    if number == 1 {
-        "1 character".to_owned()
-    } else {
-        format!("{number} characters")
-    }
 }
 
 fn join(path: &str, name: &str) -> String {

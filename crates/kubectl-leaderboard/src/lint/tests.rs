@@ -149,7 +149,7 @@ fn each_keyword_finds_its_fault() {
         (
             "map",
             json!({"a": "b", "c": "d"}),
-            "spec.map has 2 entries. It may have 1",
+            "spec.map has 2 entries. It must have at most 1",
         ),
         ("union", json!({}), "spec.union has none of a and b. It must have one"),
         (

@@ -15,7 +15,7 @@ use crate::cluster::{Cluster, Scope};
 use crate::commands::frame;
 use crate::error::Error;
 use crate::output::{self, Format, print};
-use crate::text::Frame;
+use crate::text::{Frame, counted};
 
 /// Where the report goes.
 #[derive(Args, Debug)]
@@ -25,26 +25,15 @@ pub struct Report {
     file: Option<PathBuf>,
 }
 
-/// The part whose objects name teams.
-const SUBMISSIONS: &str = "submissions";
-
-/// One part of the report, and what it counts.
-struct Part {
-    name: &'static str,
-    one: &'static str,
-    many: &'static str,
-    objects: Result<Vec<Value>, Error>,
-}
+/// A part of the report: its name, what it counts, and the objects.
+type Part = (&'static str, &'static str, Result<Vec<Value>, Error>);
 
 /// Writes the report.
 pub async fn report(cluster: &Cluster, wanted: &Report) -> Result<ExitCode, Error> {
     let now = frame().now;
     let parts = ask(cluster).await;
-    let submissions = parts.iter().find(|part| part.name == SUBMISSIONS);
-    let names = submissions
-        .and_then(|part| part.objects.as_deref().ok())
-        .map(redact::names)
-        .unwrap_or_default();
+    let [_, (.., submissions), ..] = &parts;
+    let names = submissions.as_deref().map(redact::names).unwrap_or_default();
     let about = format!(
         "kubectl leaderboard {} of namespace {} at {now:.0}",
         env!("CARGO_PKG_VERSION"),
@@ -52,16 +41,16 @@ pub async fn report(cluster: &Cluster, wanted: &Report) -> Result<ExitCode, Erro
     );
     let mut document = json!({ "about": about });
     let (mut missing, mut counts) = (Vec::new(), Vec::new());
-    for part in parts {
-        match part.objects {
+    for (part, one, objects) in parts {
+        match objects {
             Ok(objects) => {
-                counts.push(counted(objects.len(), part.one, part.many));
-                document[part.name] = redact::objects(part.name, objects, &names);
+                counts.push(counted(objects.len(), one));
+                document[part] = redact::objects(part, objects, &names);
             }
             // Without credentials or an API server every other part would be empty too.
             Err(error @ (Error::Credentials(_) | Error::Unreachable { .. })) => return Err(error),
             // Without a right to one kind, the others help all the same.
-            Err(error) => missing.push(format!("{}: {error}", part.name)),
+            Err(error) => missing.push(format!("{part}: {error}")),
         }
     }
     document["missing"] = json!(missing);
@@ -77,27 +66,19 @@ pub async fn report(cluster: &Cluster, wanted: &Report) -> Result<ExitCode, Erro
 
 async fn ask(cluster: &Cluster) -> [Part; 4] {
     let scope = Scope::default();
-    let leaderboards = cluster.leaderboards(&scope).await;
     let unread = || Error::Forbidden("Leaderboards cannot be listed".to_owned());
-    let part = |name, one, many, objects| Part {
-        name,
-        one,
-        many,
-        objects,
-    };
-    let leaderboards = documents(leaderboards.and_then(|all| all.ok_or_else(unread)));
-    let submissions = documents(cluster.submissions(&scope).await);
-    let (pods, events) = (documents(cluster.pods().await), documents(cluster.events().await));
+    let leaderboards = cluster.leaderboards(&scope).await;
+    let leaderboards = leaderboards.and_then(|all| all.ok_or_else(unread));
     [
-        part("leaderboards", "Leaderboard", "Leaderboards", leaderboards),
-        part(SUBMISSIONS, "submission", "submissions", submissions),
-        part("pods", "Pod", "Pods", pods),
-        part("events", "event", "events", events),
+        ("leaderboards", "Leaderboard", documents(leaderboards)),
+        (
+            "submissions",
+            "submission",
+            documents(cluster.submissions(&scope).await),
+        ),
+        ("pods", "Pod", documents(cluster.pods().await)),
+        ("events", "event", documents(cluster.events().await)),
     ]
-}
-
-fn counted(number: usize, one: &str, many: &str) -> String {
-    format!("{number} {}", if number == 1 { one } else { many })
 }
 
 /// Lines about the file, the parts that are missing, and the check before it is handed on.
