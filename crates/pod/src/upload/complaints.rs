@@ -1,7 +1,6 @@
 //! Complaints: files that were left out, each written once to logcopy's log, with the limit's name and the next step.
 
 use std::collections::BTreeSet;
-use std::fmt;
 use std::time::Duration;
 
 use super::quota::Limit;
@@ -10,80 +9,56 @@ use super::quota::Limit;
 const MOST: usize = 1000;
 
 /// Why a file, or a part of it, is not stored.
-#[derive(Clone, Debug, PartialEq, Eq)]
+#[derive(thiserror::Error, Clone, Debug, PartialEq, Eq)]
 pub enum Why {
     /// There is no room for it.
+    #[error("{0}. Further files are left out without a word")]
     Limit(Limit),
     /// A known log is stored up to this byte only.
+    #[error(
+        "beyond {0} bytes: storage.s3.sizeLimit is reached, and that is what the log keeps of it. Raise it, or have less \
+         printed"
+    )]
     Shortened(u64),
     /// The allowance of the day is used up.
+    #[error(
+        "it waits for the end of the run or of the day (UTC): the daily limit of requests or bytes to S3 is used up. Have \
+         files rewritten less often"
+    )]
     Day,
     /// It took too long and was cut.
+    #[error(
+        "it was not sent within {} s, so that it does not keep the report back. It is tried again later, and at the end; \
+         have files of this size written in pieces",
+        .0.as_secs()
+    )]
     Slow(Duration),
     /// The time at the end is over.
+    #[error("{0} files at the end: half of deadlines.flushSeconds is over. Raise it, or have less written at the end")]
     Ended(usize),
     /// Status files beyond this number of rounds.
+    #[error("a container's status files are stored for its first {0} rounds. The results need none of them")]
     Statuses(u32),
     /// Entries of folders that are not looked at.
+    #[error("{0} entries are beyond what is looked at, or no files. Have fewer files written, and no links or pipes")]
     Entries(usize),
     /// Another file has its key.
+    #[error("another file has the same key")]
     SameKey,
     /// It can't be read.
+    #[error("{0}")]
     File(String),
-}
-
-impl fmt::Display for Why {
-    fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
-        match self {
-            Self::Limit(limit) => write!(f, "{limit}. Further files are left out without a word"),
-            Self::Shortened(size) => write!(
-                f,
-                "beyond {size} bytes: storage.s3.sizeLimit is reached, and that is what the log keeps of it. Raise it, or have \
-                 less printed"
-            ),
-            Self::Day => f.write_str(
-                "it waits for the end of the run or of the day (UTC): the daily limit of requests or bytes to S3 is used \
-                 up. Have files rewritten less often",
-            ),
-            Self::Slow(limit) => write!(
-                f,
-                "it was not sent within {} s, so that it does not keep the report back. It is tried again later, and at \
-                 the end; have files of this size written in pieces",
-                limit.as_secs()
-            ),
-            Self::Ended(files) => write!(
-                f,
-                "{files} files at the end: half of deadlines.flushSeconds is over. Raise it, or have less written at the \
-                 end"
-            ),
-            Self::Statuses(rounds) => write!(
-                f,
-                "a container's status files are stored for its first {rounds} rounds. The results need none of them"
-            ),
-            Self::Entries(number) => write!(
-                f,
-                "{number} entries are beyond what is looked at, or no files. Have fewer files written, and no links or \
-                 pipes"
-            ),
-            Self::SameKey => f.write_str("another file has the same key"),
-            Self::File(text) => f.write_str(text),
-        }
-    }
 }
 
 impl Why {
     /// Topic that is shown once: each limit, and each file that has a reason of its own.
     fn topic(&self, key: &str) -> String {
         match self {
-            Self::Limit(Limit::Bytes(_)) => "bytes".to_owned(),
-            Self::Limit(Limit::AgentBytes(_)) => "agents' bytes".to_owned(),
-            Self::Limit(Limit::Objects(_)) => "objects".to_owned(),
-            Self::Limit(Limit::AgentObjects(_)) => "agents' objects".to_owned(),
-            Self::Day => "day".to_owned(),
-            Self::Ended(_) => "end".to_owned(),
-            Self::Statuses(_) => "statuses".to_owned(),
-            Self::Entries(_) => "entries".to_owned(),
             Self::Shortened(_) | Self::Slow(_) | Self::SameKey | Self::File(_) => format!("of {key}"),
+            // Their numbers differ from round to round.
+            Self::Ended(_) => "end".to_owned(),
+            Self::Entries(_) => "entries".to_owned(),
+            Self::Limit(_) | Self::Day | Self::Statuses(_) => self.to_string(),
         }
     }
 }

@@ -7,9 +7,10 @@ use std::future::Future;
 use std::sync::Arc;
 use std::time::{Duration, Instant};
 
+use super::wanted::Wanted;
 use super::{Decision, Stored, fingerprint};
 use crate::blocking;
-use crate::upload::wanted::Wanted;
+use crate::daily::Spent;
 use leaderboard_aws::archive::{Archive, ArchiveError, Cause, Kept, MIN_PART, PART, read_range};
 use leaderboard_evaluation::Object;
 use leaderboard_evidence::{Stamp, Tree, TreeError};
@@ -31,37 +32,28 @@ pub(super) enum Outcome {
     Late,
 }
 
-/// One object of memory on its way.
-pub(super) struct Put {
-    pub(super) archive: Archive,
-    pub(super) key: String,
-    pub(super) object: Object,
-    /// Entity tag of what was stored last.
-    pub(super) known: Option<String>,
-    pub(super) now: Duration,
-}
-
-impl Put {
-    pub(super) async fn store(self) -> (String, Outcome) {
-        let Object { bytes, digest } = self.object;
-        let outcome = match self.archive.replace(&self.key, bytes, self.known.as_deref()).await {
-            Ok(etag) => {
-                let stamp = Stamp {
-                    size: digest.size,
-                    ..Stamp::default()
-                };
-                let stored = Stored {
-                    stamp,
-                    etag,
-                    fingerprint: digest.sha256,
-                    at: self.now,
-                };
-                Outcome::Stored(Box::new(stored), true)
-            }
-            Err(error) => Outcome::Failed(error),
-        };
-        (self.key, outcome)
-    }
+/// Stores an object of memory. `known` is the entity tag of what was stored last.
+pub(super) async fn put(
+    archive: Archive,
+    key: String,
+    object: Object,
+    known: Option<String>,
+    now: Duration,
+) -> (String, Outcome) {
+    let Object { bytes, digest } = object;
+    let outcome = match archive.replace(&key, bytes, known.as_deref()).await {
+        Ok(etag) => {
+            let stored = Stored {
+                etag,
+                fingerprint: digest.sha256,
+                at: now,
+                ..Stored::unknown(digest.size)
+            };
+            Outcome::Stored(Box::new(stored), true)
+        }
+        Err(error) => Outcome::Failed(error),
+    };
+    (key, outcome)
 }
 
 /// One file on its way.
@@ -75,6 +67,9 @@ pub(super) struct Job {
     pub(super) decision: Decision,
     pub(super) known: Option<Stored>,
     pub(super) now: Duration,
+    /// Purse that pays for it.
+    pub(super) purse: String,
+    pub(super) cost: Spent,
 }
 
 /// A file that is open, and the fingerprint of its beginning.
@@ -106,27 +101,12 @@ impl Opened {
     }
 }
 
+#[derive(thiserror::Error, Debug)]
 enum Problem {
-    Local(TreeError),
-    Archive(ArchiveError),
-}
-
-impl From<std::io::Error> for Problem {
-    fn from(error: std::io::Error) -> Self {
-        Self::Local(error.into())
-    }
-}
-
-impl From<TreeError> for Problem {
-    fn from(error: TreeError) -> Self {
-        Self::Local(error)
-    }
-}
-
-impl From<ArchiveError> for Problem {
-    fn from(error: ArchiveError) -> Self {
-        Self::Archive(error)
-    }
+    #[error(transparent)]
+    Local(#[from] TreeError),
+    #[error(transparent)]
+    Archive(#[from] ArchiveError),
 }
 
 impl Job {
@@ -156,22 +136,18 @@ impl Job {
         let Some(opened) = opened else {
             return Ok(Outcome::LeftOut("it is gone".to_owned()));
         };
-        let Opened {
-            file,
-            stamp,
-            fingerprint,
-            of_known,
-        } = opened;
+        let (file, stamp) = (&opened.file, opened.stamp);
         let stored = |etag| {
+            let (fingerprint, at) = (opened.fingerprint.clone(), self.now);
             Box::new(Stored {
                 stamp,
                 etag,
-                fingerprint: fingerprint.clone(),
-                at: self.now,
+                fingerprint,
+                at,
             })
         };
         let prefix = self.known.as_ref();
-        let prefix = prefix.filter(|known| known_size <= stamp.size && known.fingerprint == of_known);
+        let prefix = prefix.filter(|known| known_size <= stamp.size && known.fingerprint == opened.of_known);
         if let Some(known) = prefix.filter(|_| known_size == stamp.size && stamp.size < MIN_PART) {
             // Touched, or written again with the same content.
             return Ok(Outcome::Stored(stored(known.etag.clone()), false));
@@ -183,13 +159,13 @@ impl Job {
         };
         let key = &self.wanted.key;
         let etag = if kept.is_none() && stamp.size <= PART {
-            let bytes = read_range(&file, 0..stamp.size).await?;
+            let bytes = read_range(file, 0..stamp.size).await.map_err(TreeError::from)?;
             match in_time(cut_at, self.archive.put(key, bytes)).await {
                 Some(stored) => stored?,
                 None => return Ok(Outcome::Slow),
             }
         } else {
-            self.archive.upload(key, &file, kept, stamp.size, cut_at).await?
+            self.archive.upload(key, file, kept, stamp.size, cut_at).await?
         };
         Ok(Outcome::Stored(stored(etag), true))
     }

@@ -4,7 +4,6 @@
 //! limits only, and the logs by which a run is judged keep room that nothing else can use.
 
 use std::collections::BTreeSet;
-use std::fmt;
 
 use super::Decision;
 use crate::daily::Spent;
@@ -15,10 +14,11 @@ use leaderboard_contract::keys::{
 use leaderboard_contract::run::STATUS_FOLDER;
 use leaderboard_protocol::files::{Host, Pair};
 
-/// Objects of one run.
-pub const OBJECTS: u64 = 20_000;
-/// Objects that are kept for results, status files and the known logs.
-const KEPT_OBJECTS: u64 = 4_500;
+/// Objects for the files of the host's containers and the agents' own: of the 20,000 of a run, the others are results, status files and
+/// known logs.
+const FILES: u64 = 15_500;
+/// Of these, the agents' own.
+const AGENT_FILES: u64 = 10_000;
 /// Bytes that an object counts at least: an empty one costs a request, an entry in each list, and memory here.
 pub const LEAST: u64 = 4 << 10;
 /// Bytes that the server copies with one request of an append.
@@ -40,42 +40,29 @@ pub enum Kind {
 }
 
 /// Why a file is not stored.
-#[derive(Clone, Copy, Debug, PartialEq, Eq)]
+#[derive(thiserror::Error, Clone, Copy, Debug, PartialEq, Eq)]
 pub enum Limit {
     /// Bytes of the run.
+    #[error(
+        "storage.s3.sizeLimit is reached: of it, {0} bytes are for all but the known logs. Raise it, or have the host's \
+         containers and the agent write less"
+    )]
     Bytes(u64),
     /// Bytes of the agents' own files.
+    #[error(
+        "the agents' own files have reached their half of storage.s3.sizeLimit, {0} bytes. Raise it, or have the agent \
+         write less"
+    )]
     AgentBytes(u64),
     /// Objects of the run.
+    #[error(
+        "a run's limit of objects is reached: {0} for files of the host's containers and of agents. Have them write fewer \
+         files"
+    )]
     Objects(u64),
     /// Objects of the agents' own files.
+    #[error("the agents' own files have reached the limit of {0} objects. Have the agent write fewer files")]
     AgentObjects(u64),
-}
-
-impl fmt::Display for Limit {
-    fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
-        match self {
-            Self::Bytes(limit) => write!(
-                f,
-                "storage.s3.sizeLimit is reached: of it, {limit} bytes are for all but the known logs. Raise it, or have the \
-                 host's containers and the agent write less"
-            ),
-            Self::AgentBytes(limit) => write!(
-                f,
-                "the agents' own files have reached their half of storage.s3.sizeLimit, {limit} bytes. Raise it, or have the \
-                 agent write less"
-            ),
-            Self::Objects(limit) => write!(
-                f,
-                "a run's limit of objects is reached: {limit} for files of the host's containers and of agents. Have them \
-                 write fewer files"
-            ),
-            Self::AgentObjects(limit) => write!(
-                f,
-                "the agents' own files have reached the limit of {limit} objects. Have the agent write fewer files"
-            ),
-        }
-    }
 }
 
 /// The limits of one run.
@@ -83,8 +70,6 @@ impl fmt::Display for Limit {
 pub struct Quota {
     /// Bytes: `storage.s3.sizeLimit`.
     pub bytes: u64,
-    /// Objects.
-    pub objects: u64,
     /// Allowance of one known log for a day.
     pub log_a_day: Spent,
     /// Allowance of the agents' own files together for a day, and of the other files of the host's containers.
@@ -99,7 +84,6 @@ impl Quota {
         let at_least = |bytes: u64, gibibytes: u64| bytes.max(gibibytes << 30);
         Self {
             bytes,
-            objects: OBJECTS,
             // A growing log costs four requests a minute.
             log_a_day: Spent {
                 requests: 10_000,
@@ -168,12 +152,12 @@ impl Quota {
     /// Bytes that each known log keeps for itself: together a quarter of the limit.
     fn log_share(&self) -> u64 {
         let logs = u64::try_from(self.logs.len()).unwrap_or(u64::MAX);
-        quarter(self.bytes).checked_div(logs).unwrap_or(0)
+        (self.bytes / 4).checked_div(logs).unwrap_or(0)
     }
 
     /// Bytes for everything but the known logs' shares.
     fn common(&self) -> u64 {
-        self.bytes.saturating_sub(quarter(self.bytes))
+        self.bytes.saturating_sub(self.bytes / 4)
     }
 
     /// Bytes of a key that count against what is common.
@@ -185,14 +169,6 @@ impl Quota {
             Kind::Result | Kind::Host | Kind::Agent => counted,
         }
     }
-}
-
-fn half(limit: u64) -> u64 {
-    limit.checked_div(2).unwrap_or(0)
-}
-
-fn quarter(limit: u64) -> u64 {
-    half(half(limit))
 }
 
 /// The merged file, or the checkpoint of a pair.
@@ -240,9 +216,9 @@ impl Ledger<'_> {
         }
         let room = |limit: u64, used: u64| limit.saturating_sub(used.saturating_sub(weight_before));
         let common = room(quota.common(), self.bytes);
-        let agents = room(half(quota.bytes), self.agent_bytes);
+        let agents = room(quota.bytes / 2, self.agent_bytes);
         let (room, limit) = if is_agents(kind, key) && agents <= common {
-            (agents, Limit::AgentBytes(half(quota.bytes)))
+            (agents, Limit::AgentBytes(quota.bytes / 2))
         } else {
             (common, Limit::Bytes(quota.common()))
         };
@@ -252,12 +228,9 @@ impl Ledger<'_> {
         if weight > room {
             return Err(limit);
         }
-        let files = quota.objects.saturating_sub(KEPT_OBJECTS);
         match before {
-            None if kind == Kind::Agent && self.agent_objects >= half(quota.objects).min(files) => {
-                Err(Limit::AgentObjects(half(quota.objects).min(files)))
-            }
-            None if self.objects >= files => Err(Limit::Objects(files)),
+            None if kind == Kind::Agent && self.agent_objects >= AGENT_FILES => Err(Limit::AgentObjects(AGENT_FILES)),
+            None if self.objects >= FILES => Err(Limit::Objects(FILES)),
             _ => Ok(size),
         }
     }
@@ -285,7 +258,6 @@ impl Ledger<'_> {
 
 /// Cost of sending a file of `size` bytes.
 pub fn cost(decision: Decision, size: u64) -> Spent {
-    let parts = |bytes: u64, of: u64| bytes.div_ceil(of);
     match decision {
         Decision::Keep => Spent::default(),
         Decision::PutWhole if size <= PART => Spent {
@@ -293,12 +265,12 @@ pub fn cost(decision: Decision, size: u64) -> Spent {
             bytes: size,
         },
         Decision::PutWhole => Spent {
-            requests: parts(size, PART).saturating_add(2),
+            requests: size.div_ceil(PART).saturating_add(2),
             bytes: size,
         },
         Decision::Append { from } => {
             let bytes = size.saturating_sub(from);
-            let requests = parts(bytes, PART).saturating_add(parts(from, COPIED));
+            let requests = bytes.div_ceil(PART).saturating_add(from.div_ceil(COPIED));
             Spent {
                 requests: requests.saturating_add(2),
                 bytes,

@@ -11,12 +11,12 @@ use std::time::{Duration, Instant};
 use futures::StreamExt;
 
 use super::complaints::{Complaints, Why};
-use super::job::{Job, Outcome, Put};
+use super::job::{Job, Outcome, put};
 use super::quota::{Kind, Ledger, Quota, cost};
 use super::wanted::Wanted;
 use super::{Decision, Memory, Stored, decide_upload};
 use crate::blocking;
-use crate::daily::{Spent, today};
+use crate::daily::today;
 use leaderboard_aws::archive::{Archive, ArchiveError, Cause};
 use leaderboard_evaluation::Object;
 use leaderboard_evidence::{Stamp, Tree};
@@ -78,25 +78,6 @@ struct Slow {
     times: u32,
 }
 
-/// Purse that pays for a file, and how much.
-struct Bill {
-    key: String,
-    purse: String,
-    cost: Spent,
-}
-
-/// Keys, and why nothing is stored there.
-type LeftOut = Vec<(String, Why)>;
-
-/// A file that is due.
-#[derive(Clone, Copy, Debug)]
-struct Due {
-    decision: Decision,
-    /// With as many bytes as it may have.
-    stamp: Stamp,
-    cost: Spent,
-}
-
 impl Uploader {
     /// With the memory of what an earlier program of this Pod stored.
     pub fn new(archive: Archive, tree: Arc<Tree>, quota: Quota) -> Self {
@@ -131,18 +112,12 @@ impl Uploader {
                 known.stamp.size == object.digest.size && known.fingerprint == object.digest.sha256
             })
         };
-        let jobs: Vec<Put> = objects
-            .iter()
-            .filter(|(key, object)| !is_stored(key, object))
-            .map(|(key, object)| Put {
-                archive: self.archive.clone(),
-                key: key.clone(),
-                object: object.clone(),
-                known: self.memory.stored.get(key).and_then(|known| known.etag.clone()),
-                now,
-            })
-            .collect();
-        let work = jobs.into_iter().map(Put::store);
+        let new = objects.iter().filter(|(key, object)| !is_stored(key, object));
+        let work = new.map(|(key, object)| {
+            let known = self.memory.stored.get(key).and_then(|known| known.etag.clone());
+            put(self.archive.clone(), key.clone(), object.clone(), known, now)
+        });
+        let work: Vec<_> = work.collect();
         let outcomes = futures::stream::iter(work).buffer_unordered(AT_ONCE).collect().await;
         let mut sent = Sent::default();
         let failed = self.settle(outcomes, None, &mut sent);
@@ -163,36 +138,38 @@ impl Uploader {
         for (key, why) in &left_out {
             self.complaints.say(key, why);
         }
-        for (job, bill) in jobs.iter().filter(|(job, _)| job.is_shortened) {
-            self.complaints.say(&bill.key, &Why::Shortened(job.wanted.stamp.size));
+        for job in jobs.iter().filter(|job| job.is_shortened) {
+            let Wanted { key, stamp, .. } = &job.wanted;
+            self.complaints.say(key, &Why::Shortened(stamp.size));
         }
         let new = self.count_new(&jobs).await;
         // After a failure, or the end of the window, no upload begins. Uploads under way end or are cut, so that each is remembered.
         let broken = Arc::new(AtomicBool::new(false));
-        let work = jobs.into_iter().map(|(job, bill)| {
+        let work = jobs.into_iter().map(|job| {
             let broken = Arc::clone(&broken);
             async move {
                 let is_over = window.begin_until.is_some_and(|until| Instant::now() >= until);
                 if is_over || broken.load(Ordering::Relaxed) {
-                    return (bill, Outcome::Late);
+                    return (job, Outcome::Late);
                 }
                 let outcome = job.store(window.cut_at).await;
                 if matches!(outcome, Outcome::Failed(_)) {
                     broken.store(true, Ordering::Relaxed);
                 }
-                (bill, outcome)
+                (job, outcome)
             }
         });
-        let outcomes: Vec<(Bill, Outcome)> = futures::stream::iter(work).buffer_unordered(AT_ONCE).collect().await;
+        let outcomes: Vec<(Job, Outcome)> = futures::stream::iter(work).buffer_unordered(AT_ONCE).collect().await;
         let has_changed = !outcomes.is_empty();
-        let outcomes = outcomes.into_iter().map(|(bill, outcome)| {
+        let outcomes = outcomes.into_iter().map(|(job, outcome)| {
+            let key = job.wanted.key;
             if !matches!(outcome, Outcome::Late) {
-                self.memory.sent.add(&bill.purse, bill.cost);
+                self.memory.sent.add(&job.purse, job.cost);
             }
-            if matches!(outcome, Outcome::Late | Outcome::LeftOut(_)) && new.contains(&bill.key) {
-                self.memory.stored.remove(&bill.key);
+            if matches!(outcome, Outcome::Late | Outcome::LeftOut(_)) && new.contains(&key) {
+                self.memory.stored.remove(&key);
             }
-            (bill.key, outcome)
+            (key, outcome)
         });
         let outcomes = outcomes.collect();
         let time = window.cut_at.map(|cut_at| cut_at.saturating_duration_since(began));
@@ -205,17 +182,13 @@ impl Uploader {
 
     /// Counts the objects that are going to be made, before the first of them is: a logcopy that is killed meanwhile must not
     /// forget any. Returns their keys.
-    async fn count_new(&mut self, jobs: &[(Job, Bill)]) -> BTreeSet<String> {
-        let new = jobs
-            .iter()
-            .filter(|(_, bill)| !self.memory.stored.contains_key(&bill.key));
-        let new: BTreeMap<String, u64> = new
-            .map(|(job, bill)| (bill.key.clone(), job.wanted.stamp.size))
-            .collect();
-        for (key, size) in &new {
-            self.memory.stored.insert(key.clone(), Stored::unknown(*size));
-        }
+    async fn count_new(&mut self, jobs: &[Job]) -> BTreeSet<String> {
+        let files = jobs.iter().map(|job| &job.wanted);
+        let new = files.filter(|file| !self.memory.stored.contains_key(&file.key));
+        let new = new.map(|file| (file.key.clone(), Stored::unknown(file.stamp.size)));
+        let new: BTreeMap<String, Stored> = new.collect();
         if !new.is_empty() {
+            self.memory.stored.extend(new.clone());
             self.remember().await;
         }
         new.into_keys().collect()
@@ -274,7 +247,7 @@ impl Uploader {
     }
 
     /// The files that are due and fit, the known logs first, and what is to be shown of the others.
-    fn due(&self, files: &[Wanted], window: Window) -> (Vec<(Job, Bill)>, LeftOut) {
+    fn due(&self, files: &[Wanted], window: Window) -> (Vec<Job>, Vec<(String, Why)>) {
         let is_last = window.is_last;
         let now = self.epoch.elapsed();
         let stored = self.memory.stored.iter();
@@ -293,43 +266,57 @@ impl Uploader {
             if !is_last && self.slow.get(key).is_some_and(|slow| slow.again > now) {
                 continue;
             }
-            let known = self.memory.stored.get(key);
-            let (purse, allowed) = self.quota.purse(key);
-            match due(file, known, &ledger, now) {
-                Ok(None) => {}
-                Err(why) => left_out.push((key.to_owned(), why)),
-                Ok(Some(due)) if !is_last && !planned.of(purse).plus(due.cost).fits(allowed) => {
-                    left_out.push((key.to_owned(), Why::Day));
+            let job = match self.job(file, &ledger, now) {
+                Ok(None) => continue,
+                Ok(Some(job)) => job,
+                Err(why) => {
+                    left_out.push((key.to_owned(), why));
+                    continue;
                 }
-                Ok(Some(due)) => {
-                    ledger.take(key, known.map(|known| known.stamp.size), due.stamp.size);
-                    planned.add(purse, due.cost);
-                    jobs.push(self.job(file, due, purse, now));
-                }
+            };
+            let allowed = self.quota.purse(key).1;
+            if !is_last && !planned.of(&job.purse).plus(job.cost).fits(allowed) {
+                left_out.push((key.to_owned(), Why::Day));
+                continue;
             }
+            ledger.take(
+                key,
+                job.known.as_ref().map(|known| known.stamp.size),
+                job.wanted.stamp.size,
+            );
+            planned.add(&job.purse, job.cost);
+            jobs.push(job);
         }
         (jobs, left_out)
     }
 
-    fn job(&self, file: &Wanted, due: Due, purse: &str, now: Duration) -> (Job, Bill) {
-        let bill = Bill {
-            key: file.key.clone(),
-            purse: purse.to_owned(),
-            cost: due.cost,
-        };
-        let job = Job {
+    /// A file that is due, with as many bytes as there is room for.
+    fn job(&self, file: &Wanted, ledger: &Ledger<'_>, now: Duration) -> Result<Option<Job>, Why> {
+        let known = self.memory.stored.get(&file.key);
+        if decide_upload(&file.stamp, known, now, file.haste) == Decision::Keep {
+            return Ok(None);
+        }
+        let before = known.map(|known| known.stamp.size);
+        let size = ledger.admit(&file.key, before, file.stamp.size).map_err(Why::Limit)?;
+        let stamp = Stamp { size, ..file.stamp };
+        let is_shortened = size < file.stamp.size;
+        // The beginning of a log that is too large is stored, and that does not change while the log grows.
+        if is_shortened && known.is_some_and(|known| known.stamp.inode == stamp.inode && known.stamp.size >= size) {
+            return Ok(None);
+        }
+        let decision = decide_upload(&stamp, known, now, file.haste);
+        let job = || Job {
             archive: self.archive.clone(),
             tree: Arc::clone(&self.tree),
-            wanted: Wanted {
-                stamp: due.stamp,
-                ..file.clone()
-            },
-            is_shortened: due.stamp.size < file.stamp.size,
-            decision: due.decision,
-            known: self.memory.stored.get(&file.key).cloned(),
+            wanted: Wanted { stamp, ..file.clone() },
+            is_shortened,
+            decision,
+            known: known.cloned(),
             now,
+            purse: self.quota.purse(&file.key).0.to_owned(),
+            cost: cost(decision, size),
         };
-        (job, bill)
+        Ok((decision != Decision::Keep).then(job))
     }
 
     async fn remember(&self) {
@@ -338,24 +325,6 @@ impl Uploader {
             tracing::warn!("what is stored can't be noted down, a restart will send it again: {error}");
         }
     }
-}
-
-/// Decision on a file that is due, and how much of it there is room for.
-fn due(file: &Wanted, known: Option<&Stored>, ledger: &Ledger<'_>, now: Duration) -> Result<Option<Due>, Why> {
-    if decide_upload(&file.stamp, known, now, file.haste) == Decision::Keep {
-        return Ok(None);
-    }
-    let before = known.map(|known| known.stamp.size);
-    let size = ledger.admit(&file.key, before, file.stamp.size).map_err(Why::Limit)?;
-    let stamp = Stamp { size, ..file.stamp };
-    let is_whole = size == file.stamp.size;
-    // The beginning of a log that is too large is stored, and that does not change while the log grows.
-    if !is_whole && known.is_some_and(|known| known.stamp.inode == stamp.inode && known.stamp.size >= size) {
-        return Ok(None);
-    }
-    let decision = decide_upload(&stamp, known, now, file.haste);
-    let cost = cost(decision, size);
-    Ok((decision != Decision::Keep).then_some(Due { decision, stamp, cost }))
 }
 
 #[cfg(test)]
