@@ -22,10 +22,9 @@ use std::sync::Arc;
 use std::time::Duration;
 
 use kube::Client;
-use kube::runtime::events::Recorder;
 use kube::runtime::reflector::ObjectRef;
 use kube::runtime::watcher::Config;
-use tokio::sync::mpsc;
+use tokio::sync::{mpsc, watch};
 use tokio::task::JoinHandle;
 use tokio::time::Instant;
 
@@ -234,7 +233,7 @@ impl Parts {
                 allowed: self.settings.allowed.clone(),
             },
             leaderboards: self.watches.leaderboards.clone(),
-            recorder: events(&self.client),
+            recorder: recorder(&self.client, CONTROLLER),
             telemetry: self.telemetry.clone(),
             problems: shared::Problems::new(Readiness::default()),
         })
@@ -270,7 +269,7 @@ impl Parts {
             leaderboards: LeaderboardState::default(),
             asks: Asks::start(client, aws, &self.settings, tasks, || by_key(board())),
             external,
-            recorder: events(client),
+            recorder: recorder(client, CONTROLLER),
             metrics: Arc::clone(&self.telemetry.metrics),
             traces: self.telemetry.traces.clone(),
             wake: board(),
@@ -343,39 +342,30 @@ async fn end<T>(
     result
 }
 
-fn events(client: &Client) -> Recorder {
-    recorder(client, CONTROLLER)
-}
-
 /// Waits to become the leader. False if the stop comes before.
 async fn await_lead(leader: &Leader, telemetry: &Observability) -> Result<bool, RunError> {
-    let mut leadership = leader.leadership();
-    loop {
-        match &*leadership.borrow_and_update() {
-            Leadership::Leader { .. } => return Ok(true),
-            Leadership::Lost { why } => return Err(RunError::LostLease(why.clone())),
-            Leadership::Standby => {}
-        }
-        tokio::select! {
-            biased;
-            () = telemetry.stop.wait() => return Ok(false),
-            // The task of the Lease has failed, which ends the process.
-            changed = leadership.changed() => if changed.is_err() { telemetry.stop.wait().await },
-        }
+    tokio::select! {
+        biased;
+        () = telemetry.stop.wait() => Ok(false),
+        next = after(leader.leadership(), |now| *now == Leadership::Standby) => match next {
+            Leadership::Lost { why } => Err(RunError::LostLease(why)),
+            _ => Ok(true),
+        },
     }
 }
 
-async fn lost(mut leadership: tokio::sync::watch::Receiver<Leadership>) -> String {
-    let why = {
-        let ended = leadership.wait_for(|l| !matches!(l, Leadership::Leader { .. })).await;
-        ended.map(|leadership| match &*leadership {
-            Leadership::Lost { why } => why.clone(),
-            _ => "the Lease was released".into(),
-        })
-    };
-    match why {
-        Ok(why) => why,
-        // The task of the Lease has failed, and ends the process by its name.
+async fn lost(leadership: watch::Receiver<Leadership>) -> String {
+    match after(leadership, |now| now.term().is_some()).await {
+        Leadership::Lost { why } => why,
+        _ => "the Lease was released".into(),
+    }
+}
+
+/// Where this process stands once this does not hold. Never, if the task of the Lease has failed, which ends the process by its name.
+async fn after(mut leadership: watch::Receiver<Leadership>, holds: fn(&Leadership) -> bool) -> Leadership {
+    let next = leadership.wait_for(|now| !holds(now)).await.map(|now| now.clone());
+    match next {
+        Ok(next) => next,
         Err(_) => std::future::pending().await,
     }
 }
