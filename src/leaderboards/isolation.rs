@@ -239,16 +239,13 @@ pub(super) fn pods_left(stores: &Stores, leaderboard: &Leaderboard) -> usize {
     if leaderboard.metadata.deletion_timestamp.is_none() {
         return 0;
     }
-    let is_left = |pod: &Arc<Pod>| {
-        is_pod_of(pod, leaderboard) && !matches!(pod.status.phase.as_deref(), Some("Succeeded" | "Failed"))
+    let is_left = |pod: &&Arc<Pod>| {
+        let meta = &pod.metadata;
+        meta.labels.leaderboard.as_deref() == leaderboard.metadata.name.as_deref()
+            && meta.namespace.as_deref() == leaderboard.metadata.namespace.as_deref()
+            && !matches!(pod.status.phase.as_deref(), Some("Succeeded" | "Failed"))
     };
-    stores.pods.state().iter().filter(|pod| is_left(pod)).count()
-}
-
-fn is_pod_of(pod: &Pod, leaderboard: &Leaderboard) -> bool {
-    let meta = &pod.metadata;
-    meta.labels.leaderboard.as_deref() == leaderboard.metadata.name.as_deref()
-        && meta.namespace.as_deref() == leaderboard.metadata.namespace.as_deref()
+    stores.pods.state().iter().filter(is_left).count()
 }
 
 /// The isolation that a Pod has found, and when; that is the beginning of time if the kubelet reports none.

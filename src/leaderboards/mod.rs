@@ -37,7 +37,7 @@ use leaderboard_api::{Leaderboard, names};
 use leaderboard_policy::ask::Service;
 use leaderboard_policy::census::Census;
 use leaderboard_policy::leaderboards::decide::{LeaderboardPlan, LeaderboardView, decide};
-use leaderboard_policy::leaderboards::refusal;
+use leaderboard_policy::leaderboards::refusal::{self, Refusal};
 use leaderboard_policy::leaderboards::standings::Results;
 use leaderboard_policy::leaderboards::view::Policy;
 use probe::{Asks, Looked};
@@ -98,12 +98,7 @@ async fn drive(leaderboard: Arc<Leaderboard>, uses: Uses<'_>) -> Result<Duration
         Some(_) => Looked::default(),
         None => uses.asks.ask(&leaderboard, is_refused(uses, &leaderboard)),
     };
-    let (view, made) = observe(uses, &leaderboard, policy, &looked, now);
-    let view = LeaderboardView {
-        is_looked_at: looked.waits().is_none(),
-        refusal,
-        ..view
-    };
+    let (view, made) = observe(uses, &leaderboard, (policy, refusal), &looked, now);
     let plan = decide(&view);
     serve(uses, &view, &plan, &looked);
     let mut version = leaderboard.metadata.resource_version.clone();
@@ -159,7 +154,7 @@ fn is_refused(uses: Uses<'_>, leaderboard: &Leaderboard) -> bool {
 fn observe(
     uses: Uses<'_>,
     leaderboard: &Arc<Leaderboard>,
-    policy: Policy,
+    (policy, refusal): (Policy, Option<Refusal>),
     looked: &Looked,
     now: Timestamp,
 ) -> (LeaderboardView, Made) {
@@ -191,8 +186,8 @@ fn observe(
         pods: isolation::pods_left(stores, leaderboard),
         policy,
         measured: isolation::measured(uses.policies.state, leaderboard),
-        refusal: None,
-        is_looked_at: true,
+        refusal,
+        is_looked_at: looked.waits().is_none(),
         invalid_pod: tried.refused,
         pod_notes: tried.notes,
         claims: tried.claims,

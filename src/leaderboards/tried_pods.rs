@@ -107,11 +107,11 @@ async fn try_templates(client: &Client, settings: &Settings, leaderboard: &Leade
         .filter_map(|track| Some((track, sample_job(settings, leaderboard, track)?)))
         .collect();
     let template = |job: &DynamicObject| job.data.pointer("/spec/template").cloned().unwrap_or_default();
-    let pods = jobs.iter().map(|(track, job)| TrackPods {
+    let pods_of = |(track, job): &(&Track, DynamicObject)| TrackPods {
         track: track.name.clone(),
         template: template(job),
-    });
-    let pods: Vec<TrackPods> = pods.collect();
+    };
+    let pods: Vec<TrackPods> = jobs.iter().map(pods_of).collect();
     let hosts = match leaderboard.spec.network.dns {
         Dns::None => endpoints::of_pods(&leaderboard.spec, settings.own.region.as_deref()).await,
         Dns::Cluster => Ok(Vec::new()),

@@ -29,15 +29,10 @@ pub(super) fn outline(view: &View, status: &SubmissionStatus, so_far: bool, pati
             patience,
         });
     Outline {
-        phase: phase(view),
+        phase: view.submission.spec.evalai.map_or(0, |evalai| evalai.phase),
         stored,
         ..Outline::default()
     }
-}
-
-/// Phase whose leaderboard gets the result.
-pub(super) fn phase(view: &View) -> i64 {
-    view.submission.spec.evalai.map_or(0, |e| e.phase)
 }
 
 /// A failure for the participant, in our own words: reason, class, and a sentence with a next step that a participant can do.
@@ -93,29 +88,21 @@ pub(super) fn row(report: Option<&ReportDigest>, status: &SubmissionStatus) -> O
         results: status.results_url.clone().unwrap_or_default(),
         progress: status.progress.as_ref().map(|p| p.text.clone()).unwrap_or_default(),
         gpu_seconds: gpu_seconds(status),
-        metrics: columns(report, plan, is_finished(status)),
+        metrics: columns(report, plan, status.state_of_conditions() == State::Finished),
     })
 }
 
 /// GPU seconds of a submission that has ended, as text; empty before, because each Job would cost a further write.
 fn gpu_seconds(status: &SubmissionStatus) -> String {
-    let used = status
-        .usage
-        .map(|usage| usage.gpu_seconds)
-        .filter(|seconds| *seconds > 0);
-    let used = used.filter(|_| status.state_of_conditions().is_terminal());
-    used.map(|seconds| seconds.to_string()).unwrap_or_default()
+    let has_ended = status.state_of_conditions().is_terminal();
+    let used = status.usage.filter(|usage| has_ended && usage.gpu_seconds > 0);
+    used.map(|usage| usage.gpu_seconds.to_string()).unwrap_or_default()
 }
 
 /// The attempt as the row counts it: also those of an earlier Submission of the same run, which is gone.
 pub(super) fn attempt_of_run(status: &SubmissionStatus) -> i64 {
     let earlier = status.plan.as_ref().map_or(0, |plan| plan.earlier_attempts);
     status.attempt.unwrap_or_default().0.saturating_add(earlier)
-}
-
-/// True if its results count.
-pub(super) fn is_finished(status: &SubmissionStatus) -> bool {
-    status.state_of_conditions() == State::Finished
 }
 
 fn table_status(state: State) -> &'static str {
