@@ -42,11 +42,6 @@ impl Ages {
         self.0.retain(|_, seen| seen.until > now);
     }
 
-    /// When the next message is forgotten unless it comes back.
-    pub fn next_expiry(&self) -> Option<Instant> {
-        self.0.values().map(|seen| seen.until).min()
-    }
-
     /// When the oldest was sent, in milliseconds since 1970.
     pub fn oldest_ms(&self) -> Option<i64> {
         self.0.values().map(|seen| seen.sent_ms).min()
@@ -64,7 +59,7 @@ mod tests {
     #[test]
     fn the_oldest_counts_until_it_is_deleted() {
         let (mut ages, soon) = (Ages::default(), Instant::now() + MINUTE);
-        assert_eq!((ages.oldest_ms(), ages.next_expiry()), (None, None));
+        assert_eq!(ages.oldest_ms(), None);
         for (id, sent) in [("b", 200), ("a", 100), ("c", 300)] {
             ages.keep(id, sent, soon);
         }
@@ -81,7 +76,6 @@ mod tests {
         let (mut ages, now) = (Ages::default(), Instant::now());
         ages.keep("a", 100, now + MINUTE);
         ages.keep("b", 200, now + 2 * MINUTE);
-        assert_eq!(ages.next_expiry(), Some(now + MINUTE));
         ages.expire(now + MINUTE / 2);
         assert_eq!(ages.oldest_ms(), Some(100));
         // It was received again.

@@ -24,15 +24,6 @@ pub struct WatchEvent<K> {
     pub is_gone: bool,
 }
 
-impl<K> Clone for WatchEvent<K> {
-    fn clone(&self) -> Self {
-        Self {
-            object: self.object.clone(),
-            is_gone: self.is_gone,
-        }
-    }
-}
-
 /// The watch's end. Clones are the same feed.
 pub(super) struct Feed<K>(Arc<Mutex<Lanes<K>>>);
 

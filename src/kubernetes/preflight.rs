@@ -67,8 +67,10 @@ pub async fn await_kinds(client: &Client, plurals: &[&str], telemetry: &Observab
         }
         telemetry.readiness.set(KINDS_CHECK, Err(missing.clone()));
         last = missing;
-        if !pause(KINDS_PAUSE, telemetry).await {
-            return false;
+        tokio::select! {
+            biased;
+            () = telemetry.stop.wait() => return false,
+            () = sleep(KINDS_PAUSE) => {}
         }
     }
 }
@@ -126,14 +128,5 @@ async fn ask(reviews: &Api<SelfSubjectAccessReview>, need: &ResourceAttributes) 
         Ok(answer) if answer.status.as_ref().is_some_and(|status| status.allowed) => None,
         Ok(_) => Some(format!("may not {need}; add the verb to the operator's role")),
         Err(error) => Some(format!("can't ask whether it may {need}: {}", error.cause())),
-    }
-}
-
-/// False: the process was stopped.
-async fn pause(time: Duration, telemetry: &Observability) -> bool {
-    tokio::select! {
-        biased;
-        () = telemetry.stop.wait() => false,
-        () = sleep(time) => true,
     }
 }

@@ -32,11 +32,6 @@ impl Stop {
         // An error means that the sender is gone, hence that no more work is wanted.
         let _ = receiver.wait_for(|stop| *stop).await;
     }
-
-    /// For parts that watch the channel themselves.
-    pub fn receiver(&self) -> watch::Receiver<bool> {
-        self.0.clone()
-    }
 }
 
 /// Listens for SIGTERM and SIGINT. Ctrl-C a second time ends the process without any more ado.

@@ -43,11 +43,6 @@ impl Tasks {
         }
     }
 
-    /// When tasks are to end.
-    pub fn stop(&self) -> &Stop {
-        &self.stop
-    }
-
     /// Starts a task that stays until the stop. Its handle gives `None` if it panicked.
     pub fn stay<T: Send + 'static>(
         &self,

@@ -5,7 +5,6 @@ use kube::core::ClusterResourceScope;
 use serde::Deserialize;
 
 use super::meta::Meta;
-use super::pod::of_type;
 use super::texts::{Text, Texts};
 use super::watchable;
 
@@ -49,7 +48,8 @@ pub struct NodeCondition {
 }
 
 fn ready<'de, D: serde::Deserializer<'de>>(deserializer: D) -> Result<Option<NodeCondition>, D::Error> {
-    of_type(deserializer, |condition: &NodeCondition| &*condition.type_ == "Ready")
+    let all = Option::<Vec<NodeCondition>>::deserialize(deserializer)?;
+    Ok(all.into_iter().flatten().find(|condition| &*condition.type_ == "Ready"))
 }
 
 impl Node {

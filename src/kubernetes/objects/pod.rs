@@ -153,15 +153,6 @@ fn conditions<'de, D: Deserializer<'de>>(deserializer: D) -> Result<Conditions, 
     Ok(found)
 }
 
-/// Reads one of all conditions.
-pub(super) fn of_type<'de, T: Deserialize<'de>, D: Deserializer<'de>>(
-    deserializer: D,
-    is_it: impl FnMut(&T) -> bool,
-) -> Result<Option<T>, D::Error> {
-    let all = Option::<Vec<T>>::deserialize(deserializer)?;
-    Ok(all.into_iter().flatten().find(is_it))
-}
-
 /// A container's id as a number, which is enough to compare two; 0 without one.
 fn digest<'de, D: Deserializer<'de>>(deserializer: D) -> Result<u64, D::Error> {
     let id = Option::<Cow<'_, str>>::deserialize(deserializer)?.unwrap_or_default();
