@@ -217,7 +217,7 @@ class Classification(unittest.TestCase):
         self.assertEqual(process.returncode, code, printed)
         return printed
 
-    def evaluator(self, worker: int, fault: str, splits: str, resume: str) -> subprocess.Popen[str]:
+    def evaluator(self, worker: object, fault: str, splits: str, resume: str, **more: str) -> subprocess.Popen[str]:
         place = self.folder / f"results-{worker}"
         return self.start(
             GAMES / "classification_evaluator.py",
@@ -229,6 +229,7 @@ class Classification(unittest.TestCase):
             RESUME=resume,
             FAULT=fault,
             SPLITS=splits,
+            **more,
         )
 
     def result(self, worker: int) -> dict[str, object]:
@@ -268,6 +269,20 @@ class Classification(unittest.TestCase):
                     self.assert_result(worker, 2 * HALF, dict(zip(last, rates, strict=True)))
                     for file in (self.folder / f"results-{worker}").iterdir():
                         file.unlink()
+
+    def test_the_one_that_merges_takes_the_median_of_all_halves(self) -> None:
+        self.agent("predict")
+        (self.folder / "parts").mkdir()
+        for worker in RIGHT:
+            self.assertEqual(self.evaluator(worker, "none", "test", "").wait(SECONDS), 0)
+            (self.folder / "parts" / str(worker)).symlink_to(self.folder / f"results-{worker}")
+        (self.folder / "results-merge").mkdir()
+        for resume, code in (("", 1), ("1", 0)):
+            merge = self.evaluator("merge", "crash-once", "test", resume, PARTS=str(self.folder / "parts"))
+            self.assertEqual(merge.wait(SECONDS), code)
+        splits = [{"name": "test", "metrics": {"median": 0.8}}]
+        expected = {"schema": 1, "done": 1, "total": 1, "final": True, "splits": splits}
+        self.assertEqual(json.loads((self.folder / "results-merge" / "result.json").read_text()), expected)
 
     def assert_result(self, worker: int, done: int, rates: dict[str, float]) -> None:
         splits = [{"name": name, "metrics": {"accuracy": rate}} for name, rate in rates.items()]

@@ -32,6 +32,8 @@ pub(super) const ACCURACY: &str = "0.79";
 /// The same of the first half of each worker's rows, (34 + 39) / 100, and of the second, (41 + 44) / 100.
 const EASY: &str = "0.73";
 const HARD: &str = "0.85";
+/// The median of the halves, (39 + 41) / 2 of 50 rows.
+const MEDIAN: &str = "0.8";
 const ALL_ROWS: &str = "200/200";
 /// Rows that are counted when both evaluators wait half-way.
 const HELD: i32 = 100;
@@ -263,7 +265,17 @@ async fn files_have_their_exact_score_whatever_crashes_and_a_cancel_ends_an_agen
             "tracks": tracks(&["hold", "crash-once"], &json!({"metric": "accuracy", "split": "hard"})),
         });
         scene.leaderboard("files", example(lab, "predictions", files)).await;
+        let mut merging = going_on(lab, "SPLITS", "test");
+        merging["merge"] = "Command".into();
+        let merged = json!({
+            "evaluation": {"container": merging},
+            "tracks": tracks(&["crash-once"], &json!({"metric": "median"})),
+        });
+        scene
+            .leaderboard("merged", example(lab, "classification", merged))
+            .await;
         let cases = vec![
+            merged_by_a_command(scene).boxed_local(),
             evicted(scene).boxed_local(),
             evaluators_crash(scene).boxed_local(),
             agent_crashes(scene).boxed_local(),
@@ -287,6 +299,27 @@ async fn agent_crashes(scene: &Scene) {
     assert_eq!(log.matches(PREDICTED).count(), 1, "{log}");
     assert_own_words(scene, "agent-crashes", "agent-crashes").await;
     one_job(&mut case, scene, "agent-crashes").await;
+    case.close();
+}
+
+async fn merged_by_a_command(scene: &Scene) {
+    let mut case = Case::open(
+        "results that a command merges, which crashes once as each evaluator does",
+        "Finished; one Job",
+    );
+    let agent = json!({"image": image(&scene.lab, "classification/agent:1")});
+    submit(scene, "merged", "merged", "crash-once", agent).await;
+    let submission = case.ends(scene, "merged", LIMIT).await;
+    assert_exact(&submission, ("median", MEDIAN), ALL_ROWS);
+    let workers = submission.status.unwrap().workers;
+    let crashes: Vec<(i32, i32)> = workers.iter().map(|worker| (worker.id, worker.crashes)).collect();
+    assert_eq!(crashes, [(1, 1), (2, 1), (3, 1)], "{workers:?}");
+    assert_went_on(scene, "merged").await;
+    let stored: Value = serde_json::from_str(&scene.cloud.text("merged", "evalai/results.json").await).unwrap();
+    let split = json!({"split": "test", "show_to_participant": true, "accuracies": {"median": 0.8}});
+    assert_eq!(stored, json!([split]));
+    assert_own_words(scene, "merged", "merged").await;
+    one_job(&mut case, scene, "merged").await;
     case.close();
 }
 
