@@ -268,9 +268,7 @@ impl Tree {
 
     /// Makes a folder and those above it, writable for every user: containers of any user work in them.
     pub fn folder(&self, relative: &str) -> Result<OwnedFd, TreeError> {
-        if !is_plain(relative) {
-            return Err(TreeError::Path);
-        }
+        plain(relative)?;
         let mut at = self.root.try_clone()?;
         for name in relative.split('/') {
             match mkdirat(&at, name, Mode::from_bits_truncate(0o777)) {
@@ -290,9 +288,7 @@ impl Tree {
 
     /// Empties a folder, and makes it if there is none. No stranger may write where it lies.
     pub fn clear(&self, relative: &str) -> Result<(), TreeError> {
-        if !is_plain(relative) {
-            return Err(TreeError::Path);
-        }
+        plain(relative)?;
         match std::fs::remove_dir_all(self.path.join(relative)) {
             Err(error) if error.kind() != io::ErrorKind::NotFound => return Err(error.into()),
             _ => {}
@@ -303,9 +299,7 @@ impl Tree {
     /// Makes a file that every user may read and write, in place of what is there.
     pub fn create(&self, relative: &str) -> Result<File, TreeError> {
         let (folder, name) = relative.rsplit_once('/').ok_or(TreeError::Path)?;
-        if !is_plain(relative) {
-            return Err(TreeError::Path);
-        }
+        plain(relative)?;
         let folder = self.folder(folder)?;
         unlink(&folder, name)?;
         let flags = OFlag::O_WRONLY | OFlag::O_CREAT | OFlag::O_EXCL | OFlag::O_NOFOLLOW | OFlag::O_CLOEXEC;
@@ -335,9 +329,7 @@ impl Tree {
 
     /// Looks at a file before it is opened: opening a device can act, and a pipe lets its writer go on.
     fn look(&self, relative: &str) -> Result<(), TreeError> {
-        if !is_plain(relative) {
-            return Err(TreeError::Path);
-        }
+        plain(relative)?;
         let inner;
         let (folder, name) = match relative.rsplit_once('/') {
             None => (&self.root, relative),
@@ -354,9 +346,7 @@ impl Tree {
     }
 
     fn at(&self, relative: &str, flags: OFlag) -> Result<OwnedFd, TreeError> {
-        if !is_plain(relative) {
-            return Err(TreeError::Path);
-        }
+        plain(relative)?;
         let flags = flags | OFlag::O_CLOEXEC | OFlag::O_NOFOLLOW | OFlag::O_NOCTTY;
         let beneath = ResolveFlag::RESOLVE_BENEATH
             | ResolveFlag::RESOLVE_NO_SYMLINKS
@@ -399,6 +389,10 @@ impl Stamp {
             inode: stat.st_ino,
         }
     }
+}
+
+fn plain(path: &str) -> Result<(), TreeError> {
+    if is_plain(path) { Ok(()) } else { Err(TreeError::Path) }
 }
 
 fn unlink(folder: &OwnedFd, name: &str) -> Result<(), TreeError> {

@@ -84,9 +84,9 @@ pub async fn find(asked: &Isolation, api_server: Option<SocketAddr>, enforced_wi
         enforced_within
     };
     match measure(|| reach(address), patience).await {
-        Measured::Blocked(how) => Finding::Enforced(address, how),
-        Measured::Open => Finding::Open(address),
-        Measured::NoRoute => Finding::Unmeasured(format!(
+        Try::Blocked(how) => Finding::Enforced(address, how),
+        Try::Connected => Finding::Open(address),
+        Try::NoRoute => Finding::Unmeasured(format!(
             "The Pod has no route to {address}, so whether the NetworkPolicy is enforced is not known. Set network.probe to an \
              address and port that Pods have a route to, that answer and that network.egress does not allow."
         )),
@@ -117,7 +117,7 @@ fn address(asked: &Isolation, api_server: Option<SocketAddr>) -> Result<SocketAd
     Ok(address)
 }
 
-/// Result of one try.
+/// Result of one try, or of all of them.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 enum Try {
     /// A connection was made, the only proof that packets come through.
@@ -127,15 +127,8 @@ enum Try {
     NoRoute,
 }
 
-#[derive(Clone, Copy, Debug, PartialEq, Eq)]
-enum Measured {
-    Blocked(Blocked),
-    Open,
-    NoRoute,
-}
-
 /// Tries until enough fail in a row, or until they have done anything else for too long.
-async fn measure(mut reach: impl AsyncFnMut() -> Try, patience: Duration) -> Measured {
+async fn measure(mut reach: impl AsyncFnMut() -> Try, patience: Duration) -> Try {
     let began = Instant::now();
     let (mut failures, mut was_reached) = (0, false);
     loop {
@@ -149,7 +142,7 @@ async fn measure(mut reach: impl AsyncFnMut() -> Try, patience: Duration) -> Mea
         let Some(how) = how else {
             was_reached |= found == Try::Connected;
             if began.elapsed() >= patience {
-                return if was_reached { Measured::Open } else { Measured::NoRoute };
+                return if was_reached { Try::Connected } else { Try::NoRoute };
             }
             failures = 0;
             sleep(PAUSE).await;
@@ -159,7 +152,7 @@ async fn measure(mut reach: impl AsyncFnMut() -> Try, patience: Duration) -> Mea
         // An error that comes at once counts for no more than a silence.
         sleep(TRY.saturating_sub(tried.elapsed())).await;
         if failures == FAILURES {
-            return Measured::Blocked(how);
+            return Try::Blocked(how);
         }
     }
 }
@@ -214,11 +207,11 @@ mod tests {
             Try::Blocked(Blocked::Silent)
         };
         let found = measure(reach, patience).await;
-        (found == Measured::Blocked(Blocked::Silent), began.elapsed().as_millis())
+        (found == Try::Blocked(Blocked::Silent), began.elapsed().as_millis())
     }
 
     /// Finding where the tries show this, one after the other, and the last again and again; and after how many seconds.
-    async fn of(tries: &[Try], patience: Duration) -> (Measured, u64) {
+    async fn of(tries: &[Try], patience: Duration) -> (Try, u64) {
         let (began, mut next) = (Instant::now(), 0);
         let reach = async || {
             next += 1;
@@ -233,26 +226,26 @@ mod tests {
         use Try::{Connected, NoRoute};
         let refused = Try::Blocked(Blocked::Refused);
         let silent = Try::Blocked(Blocked::Silent);
-        let (by_refusal, by_silence) = (Measured::Blocked(Blocked::Refused), Measured::Blocked(Blocked::Silent));
-        let cases: [(&str, &[Try], (Measured, u64)); 8] = [
+        let (by_refusal, by_silence) = (Try::Blocked(Blocked::Refused), Try::Blocked(Blocked::Silent));
+        let cases: [(&str, &[Try], (Try, u64)); 8] = [
             ("it rejects", &[refused], (by_refusal, 3)),
             ("it drops", &[silent], (by_silence, 3)),
             ("both", &[silent, refused, silent], (by_silence, 3)),
             (
                 "an API server that is being restarted",
                 &[refused, refused, Connected],
-                (Measured::Open, 60),
+                (Try::Connected, 60),
             ),
             (
                 "no route yet",
                 &[NoRoute, NoRoute, NoRoute, NoRoute, silent],
                 (by_silence, 5),
             ),
-            ("no route ever", &[NoRoute], (Measured::NoRoute, 60)),
+            ("no route ever", &[NoRoute], (Try::NoRoute, 60)),
             (
                 "no route yet, then open",
                 &[NoRoute, NoRoute, Connected],
-                (Measured::Open, 60),
+                (Try::Connected, 60),
             ),
             ("a route that is taken away", &[Connected, NoRoute], (by_silence, 3)),
         ];

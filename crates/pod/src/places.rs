@@ -1,6 +1,6 @@
 //! Where things are for the programs in the Pod: the mounts, and the few values the Pod's template puts in the environment.
 //!
-//! Made by the programs' entry points from [`super::run`]'s constants, and by tests from temporary folders.
+//! Made by the programs' entry points from the constants of `leaderboard_contract::run`, and by tests from temporary folders.
 
 use std::fs;
 use std::net::{IpAddr, SocketAddr};
@@ -120,26 +120,19 @@ impl Setting {
 
 /// The run in the environment of a Pod.
 pub fn run() -> Result<Run, SettingError> {
-    read_run(&variable(ENV_RUN)?)
-}
-
-fn variable(name: &'static str) -> Result<String, SettingError> {
-    std::env::var(name).map_err(|_| SettingError::Missing(name))
-}
-
-fn read_run(json: &str) -> Result<Run, SettingError> {
-    let run: Run = serde_json::from_str(json)?;
+    let run: Run = serde_json::from_str(&variable(ENV_RUN)?)?;
     if run.schema != SCHEMA {
         return Err(SettingError::Schema(run.schema));
     }
     Ok(run)
 }
 
+fn variable(name: &'static str) -> Result<String, SettingError> {
+    std::env::var(name).map_err(|_| SettingError::Missing(name))
+}
+
 fn api_server() -> Option<SocketAddr> {
-    let variable = |name| std::env::var(name).ok();
-    let host: IpAddr = variable("KUBERNETES_SERVICE_HOST")?.parse().ok()?;
-    Some(SocketAddr::new(
-        host,
-        variable("KUBERNETES_SERVICE_PORT")?.parse().ok()?,
-    ))
+    let host: IpAddr = variable("KUBERNETES_SERVICE_HOST").ok()?.parse().ok()?;
+    let port = variable("KUBERNETES_SERVICE_PORT").ok()?.parse().ok()?;
+    Some(SocketAddr::new(host, port))
 }

@@ -103,19 +103,12 @@ impl Shipper {
         let note = tree.read(NOTE, NOTE_LIMIT).ok().flatten();
         let noted = note.and_then(|(bytes, _)| serde_json::from_slice(&bytes).ok());
         let note = noted.unwrap_or_else(|| {
-            let known = streams
-                .keys()
-                .filter_map(|path| Some((path, restored.stored.get(path)?)));
-            let marks = known
-                .map(|(path, stored)| {
-                    let mark = Mark {
-                        inode: stored.stamp.inode,
-                        offset: stored.stamp.size,
-                    };
-                    (path.clone(), mark)
-                })
-                .collect();
-            let sent = Daily::default();
+            let marks = streams.keys().filter_map(|path| {
+                let stamp = restored.stored.get(path)?.stamp;
+                let (inode, offset) = (stamp.inode, stamp.size);
+                Some((path.clone(), Mark { inode, offset }))
+            });
+            let (marks, sent) = (marks.collect(), Daily::default());
             Note { marks, sent }
         });
         Self {
