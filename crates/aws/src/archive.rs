@@ -11,6 +11,7 @@ mod stream;
 mod upload;
 
 use aws_sdk_s3::error::{ProvideErrorMetadata, SdkError};
+use aws_sdk_s3::operation::get_object::builders::GetObjectFluentBuilder;
 use aws_sdk_s3::primitives::ByteStream;
 use futures::{StreamExt, TryStreamExt};
 use hyper::body::Bytes;
@@ -23,7 +24,7 @@ use leaderboard_base::meter::Meter;
 
 pub use error::{ArchiveError, Cause};
 pub use listing::{Listed, Listing};
-pub use parts::{MIN_PART, PART, Part, PartsError, plan as plan_parts};
+pub use parts::{MIN_PART, PART, PartsError};
 pub use stream::StreamError;
 pub use upload::read_range;
 
@@ -46,7 +47,7 @@ pub struct Archive {
 }
 
 /// An object with its content.
-#[derive(Clone, Debug, PartialEq, Eq)]
+#[derive(Clone, Debug, Default, PartialEq, Eq)]
 pub struct Object {
     /// Its content.
     pub bytes: Vec<u8>,
@@ -136,12 +137,27 @@ impl Archive {
 
     /// An object of at most `limit` bytes, unless it is still the one with this entity tag.
     pub async fn get_if_none_match(&self, key: &str, etag: Option<&str>, limit: u64) -> Result<Fetched, ArchiveError> {
+        let request = self.client.get_object().set_if_none_match(etag.map(str::to_owned));
+        self.read(key, request, limit).await
+    }
+
+    /// The last `bytes` of an object, or all of it; `None` if there is none.
+    pub async fn tail(&self, key: &str, bytes: u64) -> Result<Option<Vec<u8>>, ArchiveError> {
+        let request = self.client.get_object().range(format!("bytes=-{bytes}"));
+        match self.read(key, request, bytes).await? {
+            Fetched::Found(object) => Ok(Some(object.bytes)),
+            Fetched::Absent | Fetched::NotModified => Ok(None),
+        }
+    }
+
+    async fn read(&self, key: &str, request: GetObjectFluentBuilder, limit: u64) -> Result<Fetched, ArchiveError> {
         const OP: &str = "reading";
-        let request = self.client.get_object().bucket(&self.bucket).key(self.full(key));
-        let request = request.set_if_none_match(etag.map(str::to_owned)).send();
-        let mut output = match self.meter.aws("s3", "GetObject", request).await {
+        let request = request.bucket(&self.bucket).key(self.full(key));
+        let mut output = match self.meter.aws("s3", "GetObject", request.send()).await {
             Ok(output) => output,
             Err(error) if error::status(&error) == Some(304) => return Ok(Fetched::NotModified),
+            // An empty object has no range.
+            Err(error) if error::status(&error) == Some(416) => return Ok(Fetched::Found(Object::default())),
             Err(error) if is_absent(&error) => return Ok(Fetched::Absent),
             Err(error) if error::status(&error) == Some(403) && self.is_unlisted(key).await => {
                 return Ok(Fetched::Absent);
@@ -151,6 +167,7 @@ impl Archive {
         let announced = output.content_length.and_then(|length| u64::try_from(length).ok());
         let mut bytes = Vec::with_capacity(usize::try_from(announced.unwrap_or(0).min(limit)).unwrap_or(0));
         while let Some(chunk) = output.body.try_next().await.map_err(|e| self.broken(OP, key, &e))? {
+            // A stand-in without ranges sends everything.
             if (bytes.len() + chunk.len()) as u64 > limit {
                 return Err(self.error(OP, key, Cause::TooLarge(limit)));
             }
@@ -160,29 +177,6 @@ impl Archive {
             bytes,
             etag: output.e_tag,
         }))
-    }
-
-    /// The last `bytes` of an object, or all of it; `None` if there is none.
-    pub async fn tail(&self, key: &str, bytes: u64) -> Result<Option<Vec<u8>>, ArchiveError> {
-        const OP: &str = "reading";
-        let request = self.client.get_object().bucket(&self.bucket).key(self.full(key));
-        let mut output = match request.range(format!("bytes=-{bytes}")).send().await {
-            Ok(output) => output,
-            Err(error) if is_absent(&error) => return Ok(None),
-            // An empty object has no range.
-            Err(error) if error::status(&error) == Some(416) => return Ok(Some(Vec::new())),
-            Err(error) if error::status(&error) == Some(403) && self.is_unlisted(key).await => return Ok(None),
-            Err(error) => return Err(self.failed(OP, key, &error)),
-        };
-        let mut tail = Vec::new();
-        while let Some(chunk) = output.body.try_next().await.map_err(|e| self.broken(OP, key, &e))? {
-            tail.extend_from_slice(&chunk);
-            if tail.len() as u64 > bytes {
-                // A stand-in without ranges sends everything.
-                return Err(self.error(OP, key, Cause::TooLarge(bytes)));
-            }
-        }
-        Ok(Some(tail))
     }
 
     /// Writes an object's content to `into`, at most `limit` bytes. Returns how many; `None` if there is no object.

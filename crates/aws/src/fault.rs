@@ -103,7 +103,7 @@ fn of_answer(code: &str, status: u16) -> Fault {
         _ => match status {
             401 | 403 => Fault::Denied,
             429 => Fault::Throttled,
-            500.. => Fault::Unavailable,
+            408 | 500.. => Fault::Unavailable,
             _ => Fault::Refused,
         },
     }

@@ -5,6 +5,7 @@ use std::borrow::Cow;
 use aws_sdk_s3::error::{ProvideErrorMetadata, SdkError};
 
 use super::parts::PartsError;
+use crate::fault::{self, Fault};
 use leaderboard_api::DOCUMENTS;
 
 type HttpResponse = aws_sdk_s3::config::http::HttpResponse;
@@ -104,38 +105,20 @@ impl Cause {
     where
         E: ProvideErrorMetadata + std::error::Error + 'static,
     {
-        let SdkError::ServiceError(service) = error else {
-            return Self::unanswered(error);
+        let status = status(error);
+        let text = match status {
+            Some(status) => format!("status {status}, {}", fault::sentence(error)),
+            None => fault::sentence(error),
         };
-        let status = service.raw().status().as_u16();
-        let code = service.err().code().unwrap_or_default();
-        let text = match (code, service.err().message()) {
-            ("", None) => format!("status {status}"),
-            (code, None) => format!("status {status}, {code}"),
-            (code, Some(message)) => format!("status {status}, {code}: {message}"),
-        };
-        match (status, code) {
-            (_, "NoSuchBucket") => Self::NoBucket,
-            (404 | 412, _) | (_, "PreconditionFailed" | "ConditionalRequestConflict") => Self::Changed,
-            (401 | 403, _) => Self::Denied(text),
-            (501, _) | (_, "NotImplemented") => Self::Unknown(text),
-            (408 | 429 | 500..=599, _) | (_, "SlowDown" | "RequestTimeout" | "RequestTimeTooSkewed") => {
-                Self::Away(text)
-            }
-            _ => Self::Refused(text),
-        }
-    }
-
-    /// No answer of S3. Missing credentials look the same to the SDK, and are worth their own words.
-    fn unanswered<E>(error: &SdkError<E, HttpResponse>) -> Self
-    where
-        E: std::error::Error + 'static,
-    {
-        let text = leaderboard_api::text::chain(error);
-        if text.contains("credentials") {
-            Self::Denied(text)
-        } else {
-            Self::Away(text)
+        match (status, error.code()) {
+            (_, Some("NoSuchBucket")) => Self::NoBucket,
+            (Some(404 | 412), _) | (_, Some("PreconditionFailed" | "ConditionalRequestConflict")) => Self::Changed,
+            (Some(501), _) | (_, Some("NotImplemented")) => Self::Unknown(text),
+            _ => match fault::of(error) {
+                Fault::Denied => Self::Denied(text),
+                Fault::Throttled | Fault::Unavailable => Self::Away(text),
+                Fault::Missing | Fault::Conflict | Fault::Refused => Self::Refused(text),
+            },
         }
     }
 }

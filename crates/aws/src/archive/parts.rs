@@ -3,6 +3,8 @@
 //! S3 refuses parts under 5 MiB unless they are the last, but only when the upload is completed, and stand-ins do not
 //! refuse them at all. So the rule is enforced here.
 
+use std::ops::Range;
+
 /// Smallest part that may be followed by another.
 pub const MIN_PART: u64 = 5 << 20;
 /// Most parts of one upload.
@@ -16,46 +18,19 @@ const MAX_PART: u64 = 16 << 20;
 const COPY: u64 = 1 << 30;
 
 /// One part.
-#[derive(Clone, Copy, Debug, PartialEq, Eq)]
-pub enum Part {
-    /// Bytes the stored object has already.
-    Copy {
-        /// First byte.
-        from: u64,
-        /// How many.
-        len: u64,
-    },
-    /// Bytes of the file.
-    Send {
-        /// First byte.
-        from: u64,
-        /// How many.
-        len: u64,
-    },
-}
-
-impl Part {
-    fn len(self) -> u64 {
-        match self {
-            Self::Copy { len, .. } | Self::Send { len, .. } => len,
-        }
-    }
+#[derive(Clone, Debug, PartialEq, Eq)]
+pub struct Part {
+    /// The stored object has its bytes already; else they are the file's.
+    pub is_stored: bool,
+    pub bytes: Range<u64>,
 }
 
 /// Parts that S3 would refuse.
 #[derive(thiserror::Error, Clone, Copy, Debug, PartialEq, Eq)]
 pub enum PartsError {
-    /// One of them is too small.
-    #[error("part {number} would have {len} bytes, and S3 takes parts under {MIN_PART} bytes only as the last")]
-    TooSmall {
-        /// Which, from 1.
-        number: usize,
-        /// Its bytes.
-        len: u64,
-    },
-    /// There are too many.
-    #[error("it would need {0} parts, and S3 takes {MAX_PARTS}")]
-    TooMany(usize),
+    /// The stored beginning is too small to be one.
+    #[error("a part would have {0} bytes, and S3 takes parts under {MIN_PART} bytes only as the last")]
+    TooSmall(u64),
     /// Its parts would be larger than what may be in memory.
     #[error("it has {0} bytes, and its parts would have more than {MAX_PART}")]
     TooLarge(u64),
@@ -67,23 +42,24 @@ pub enum PartsError {
 /// The parts of an object of `size` bytes whose first `kept` bytes are stored already.
 pub fn plan(kept: u64, size: u64) -> Result<Vec<Part>, PartsError> {
     let new = size.checked_sub(kept).ok_or(PartsError::Shrunk)?;
-    let mut parts = Vec::new();
-    let pieces = kept.div_ceil(COPY);
-    for piece in 0..pieces {
-        let (from, end) = (kept / pieces * piece, kept / pieces * (piece + 1));
-        let end = if piece + 1 == pieces { kept } else { end };
-        parts.push(Part::Copy { from, len: end - from });
+    if new > 0 && (1..MIN_PART).contains(&kept) {
+        return Err(PartsError::TooSmall(kept));
     }
+    let pieces = kept.div_ceil(COPY);
     let room = MAX_PARTS.saturating_sub(pieces).max(1);
     let step = step(new, room).ok_or(PartsError::TooLarge(size))?;
-    let mut from = kept;
-    while from < size {
-        let len = step.min(size - from);
-        parts.push(Part::Send { from, len });
-        from += len;
-    }
-    check(&parts)?;
-    Ok(parts)
+    let copied = cut(0..kept, kept.div_ceil(pieces.max(1)), true);
+    Ok(copied.chain(cut(kept..size, step, false)).collect())
+}
+
+/// Bytes in parts of `step`, of which the last has what is left.
+fn cut(bytes: Range<u64>, step: u64, is_stored: bool) -> impl Iterator<Item = Part> {
+    let count = (bytes.end - bytes.start).div_ceil(step.max(1));
+    (0..count).map(move |index| {
+        let from = bytes.start + index * step;
+        let bytes = from..bytes.end.min(from + step);
+        Part { is_stored, bytes }
+    })
 }
 
 /// Bytes of each part but the last of an object that has `most` bytes at most, and whose size is not known yet.
@@ -97,34 +73,21 @@ fn step(bytes: u64, room: u64) -> Option<u64> {
     (step <= MAX_PART).then_some(step)
 }
 
-/// Refuses what S3 would refuse.
-fn check(parts: &[Part]) -> Result<(), PartsError> {
-    if parts.len() as u64 > MAX_PARTS {
-        return Err(PartsError::TooMany(parts.len()));
-    }
-    let followed = parts.len().saturating_sub(1);
-    match parts.iter().take(followed).position(|part| part.len() < MIN_PART) {
-        Some(index) => Err(PartsError::TooSmall {
-            number: index + 1,
-            len: parts[index].len(),
-        }),
-        None => Ok(()),
-    }
-}
-
 #[cfg(test)]
 mod tests {
     use super::*;
 
     const MIB: u64 = 1 << 20;
 
+    fn len(part: &Part) -> u64 {
+        part.bytes.end - part.bytes.start
+    }
+
     #[test]
     fn a_part_under_the_minimum_is_refused_unless_it_is_the_last() {
-        let small = PartsError::TooSmall {
-            number: 1,
-            len: MIN_PART - 1,
-        };
+        let small = PartsError::TooSmall(MIN_PART - 1);
         assert_eq!(plan(MIN_PART - 1, 20 * MIB), Err(small));
+        assert!(plan(MIN_PART - 1, MIN_PART - 1).is_ok());
         assert!(plan(MIN_PART, MIN_PART + 1).is_ok());
         assert!(plan(0, 1).is_ok());
     }
@@ -137,6 +100,7 @@ mod tests {
             (0, PART + 1),
             (MIN_PART, MIN_PART + 3),
             (50 * MIB, 67 * MIB + 5),
+            (COPY + 1, COPY + 2),
             (3 * COPY + 17, 3 * COPY + 17 + PART * 2),
             (0, 150_000 * MIB),
         ];
@@ -144,14 +108,12 @@ mod tests {
             let parts = plan(kept, size).unwrap();
             let mut at = 0;
             for part in &parts {
-                let (from, len, copied) = match *part {
-                    Part::Copy { from, len } => (from, len, true),
-                    Part::Send { from, len } => (from, len, false),
-                };
-                assert_eq!((from, copied), (at, at < kept), "{kept} of {size}");
-                at += len;
+                assert_eq!((part.bytes.start, part.is_stored), (at, at < kept), "{kept} of {size}");
+                at = part.bytes.end;
             }
             assert_eq!(at, size);
+            let followed = parts.iter().rev().skip(1);
+            assert!(followed.map(len).all(|len| len >= MIN_PART), "{kept} of {size}");
             assert!(parts.len() as u64 <= MAX_PARTS);
         }
     }
@@ -159,7 +121,7 @@ mod tests {
     #[test]
     fn no_part_is_larger_than_what_may_be_in_memory() {
         let most = MAX_PART * MAX_PARTS;
-        assert!(plan(0, most).is_ok_and(|parts| parts.iter().all(|part| part.len() <= MAX_PART)));
+        assert!(plan(0, most).is_ok_and(|parts| parts.iter().all(|part| len(part) <= MAX_PART)));
         for size in [most + 1, 4 << 40, u64::MAX / 2] {
             assert_eq!(plan(0, size), Err(PartsError::TooLarge(size)));
         }

@@ -13,7 +13,8 @@ use aws_sdk_s3::types::builders::CompletedPartBuilder;
 use aws_sdk_s3::types::{ChecksumAlgorithm, CompletedMultipartUpload, CompletedPart};
 use percent_encoding::{AsciiSet, NON_ALPHANUMERIC, utf8_percent_encode};
 
-use super::{Archive, ArchiveError, Cause, Kept, Part, parts};
+use super::parts::{self, Part};
+use super::{Archive, ArchiveError, Cause, Kept};
 use crate::metered::Metered;
 
 const OP: &str = "storing";
@@ -42,7 +43,7 @@ impl Archive {
         let parts = parts::plan(kept.map_or(0, |kept| kept.size), size);
         let parts = parts.map_err(|e| self.error(OP, key, e.into()))?;
         let id = self.begin_upload(key).await?;
-        let sending = self.send_parts(key, &id, file, kept, &parts);
+        let sending = self.send_parts(key, &id, file, kept, parts);
         let stored = match cut_at {
             Some(cut_at) => tokio::time::timeout_at(cut_at.into(), sending)
                 .await
@@ -103,16 +104,13 @@ impl Archive {
         id: &str,
         file: &Arc<File>,
         kept: Option<Kept<'_>>,
-        parts: &[Part],
+        parts: Vec<Part>,
     ) -> Result<Option<String>, ArchiveError> {
         let mut done = Vec::with_capacity(parts.len());
-        for (number, part) in (1..).zip(parts) {
-            let completed = match *part {
-                Part::Copy { from, len } => {
-                    let etag = kept.map_or("", |kept| kept.etag);
-                    self.copy_part(key, id, number, etag, from..from + len).await?
-                }
-                Part::Send { from, len } => self.send_part(key, id, number, file, from..from + len).await?,
+        for (number, Part { is_stored, bytes }) in (1..).zip(parts) {
+            let completed = match kept.filter(|_| is_stored) {
+                Some(kept) => self.copy_part(key, id, number, kept.etag, bytes).await?,
+                None => self.send_part(key, id, number, file, bytes).await?,
             };
             done.push(completed.part_number(number).build());
         }
