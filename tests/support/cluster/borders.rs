@@ -17,8 +17,14 @@ use super::{LABEL, Scene, USER_AGENT};
 /// Name of the policy that keeps other operators out.
 const POLICY: &str = "leaderboard-tests";
 
+/// Installs the definitions, and keeps others out.
+pub(super) async fn draw(client: &Client) {
+    install_definitions(client).await;
+    keep_others_out(client).await;
+}
+
 /// Installs the definitions, or brings them up to date.
-pub(super) async fn install_definitions(client: &Client) {
+async fn install_definitions(client: &Client) {
     let api: Api<CustomResourceDefinition> = Api::all(client.clone());
     for definition in crds::definitions().unwrap() {
         let object = definition.object().unwrap();
@@ -36,7 +42,7 @@ pub(super) async fn install_definitions(client: &Client) {
 
 /// Keeps an operator out that serves all namespaces, such as the demo's. It may write nothing here. The AWS that it would read and change
 /// is out of its reach, on loopback.
-pub(super) async fn keep_others_out(client: &Client) {
+async fn keep_others_out(client: &Client) {
     let policy = json!({
         "apiVersion": "admissionregistration.k8s.io/v1",
         "kind": "ValidatingAdmissionPolicy",
