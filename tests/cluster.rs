@@ -1,7 +1,8 @@
 //! The whole system on a real cluster: the operator's own programs, real Pods, and stand-ins for AWS and EvalAI.
 //!
 //! Each test has a namespace, queues, a table and a prefix in the bucket of its own. It runs the operator as child processes that it may
-//! kill and stop. Six tests run at once, begun in the order of their names, so that the longest come first. Each prints its seconds.
+//! kill and stop. Six tests run at once, and up to ten while the processors have time left, begun in the order of their names. Each prints
+//! its seconds.
 //! `restarts` disturbs all others, so it runs alone, after them.
 
 #![allow(

@@ -121,7 +121,7 @@ def kubelet(settings: Settings) -> str:
             "localStorageCapacityIsolation": True,
             "makeIPTablesUtilChains": False,
             "resolvConf": f"{settings.config}/resolv.conf",
-            "maxPods": 60,
+            "maxPods": 110,
             "podPidsLimit": 4096,
             # One hanging pull must not stop the pulls of every other Pod.
             "serializeImagePulls": False,

@@ -46,8 +46,10 @@ API_TOOLS = (*ENVTEST_TOOLS, "prometheus", "otelcol")
 # Test programs of cargo with a layer of their own, as they need an API server or a node.
 APART = ("api", "cluster")
 OPERATOR = "leaderboard-operator"
-# Tests that run at once, as they wait most of their time: of the API server for controllers, of the cluster for the kubelet.
+# Tests of the API server that run at once, as they wait most of their time for controllers.
 AT_ONCE = 6
+# The most tests of the cluster that do, which wait for the kubelet. How many in fact is what tests/support/cluster/turns.rs finds.
+MOST_AT_ONCE = 10
 # Tests that disturb every other one, all of them ignored unless named: they run alone, after the others.
 ALONE = "cluster::restarts::"
 # A backtrace pushes the message out of what is kept of a long log; `cargo test` itself still gives one.
@@ -302,7 +304,7 @@ def run_cluster_tests(plan: Plan, env: dict[str, str]) -> None:
     def at_once(threads: int, harness: Sequence[str]) -> Outcome:
         return cargo_outcome(plan, target, {**env, "RUST_TEST_THREADS": str(threads)}, harness)
 
-    passed = settle(plan.summary, at_once(AT_ONCE, [plan.filter]), lambda names: at_once(1, ["--exact", *names]))
+    passed = settle(plan.summary, at_once(MOST_AT_ONCE, [plan.filter]), lambda names: at_once(1, ["--exact", *names]))
     alone = names_alone(ignored_tests(plan, target, env), plan.filter)
     if not alone and not plan.filter:
         raise LabError(

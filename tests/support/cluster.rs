@@ -19,9 +19,11 @@ use kube::{Client, Config, Resource, ResourceExt};
 use leaderboard_api::names::LABEL_SUBMISSION;
 use leaderboard_api::{Leaderboard, Submission};
 use serde_json::{Value, json};
+use tokio::sync::OnceCell;
 use tokio::time::timeout;
 
 pub use self::reads::{containers, done, is_settled, is_true, names, reason, score, state};
+use self::turns::Turn;
 use super::aws::{BUCKET, Cloud, REGION};
 use super::evalai::{Evalai, HOST_TOKEN};
 use super::gate::Gate;
@@ -32,6 +34,8 @@ mod borders;
 mod ending;
 #[path = "cluster/reads.rs"]
 mod reads;
+#[path = "cluster/turns.rs"]
+mod turns;
 #[path = "cluster/waits.rs"]
 mod waits;
 
@@ -41,6 +45,8 @@ const TEST_LIMIT: Duration = Duration::from_mins(20);
 pub const USER_AGENT: &str = "leaderboard-tests";
 /// Marks the tests' namespaces, where no service account may write.
 pub const LABEL: &str = "leaderboard.carla.org/test";
+/// Drawn once for all tests: the API server compiles each rule of a definition that is applied.
+static BORDERS: OnceCell<()> = OnceCell::const_new();
 
 /// The cluster, as the environment describes it.
 pub struct Lab {
@@ -99,6 +105,7 @@ pub struct Scene {
 /// `LEADERBOARD_TEST_KEEP` is set.
 pub async fn scenario(name: &str, body: impl AsyncFnOnce(&Scene)) {
     let lab = Lab::from_environment();
+    let _turn = Turn::take().await;
     let scene = Scene::set_up(lab, name).await;
     let begun = Instant::now();
     let outcome = AssertUnwindSafe(timeout(TEST_LIMIT, body(&scene))).catch_unwind().await;
@@ -138,8 +145,7 @@ async fn client() -> Client {
 impl Scene {
     async fn set_up(lab: Lab, name: &str) -> Self {
         let client = client().await;
-        borders::install_definitions(&client).await;
-        borders::keep_others_out(&client).await;
+        BORDERS.get_or_init(|| borders::draw(&client)).await;
         let namespace = format!("{name}-{:05x}", fastrand::u32(..1 << 20));
         let endpoint = std::env::var("AWS_ENDPOINT_URL").unwrap_or_else(|_| format!("http://{}", lab.registry));
         let logs = PathBuf::from(env!("CARGO_TARGET_TMPDIR")).join(&namespace);
