@@ -2,7 +2,6 @@
 //!
 //! kubectl calls a program `kubectl_complete-leaderboard` with the words so far, and takes lines and a directive in cobra's form.
 
-use clap::builder::PossibleValue;
 use clap::{Arg, Command};
 
 /// The program that kubectl calls.
@@ -47,12 +46,12 @@ pub fn offer(command: &Command, words: &[String]) -> Offer {
             .filter(|flag| verb.is_some() && flag.is_global_set());
         let flags = within.get_arguments().chain(globals);
         let names = flags.filter_map(|flag| flag.get_long()).map(|name| format!("--{name}"));
-        return fitting(names, last);
+        return Offer::Words(fitting(names, last));
     }
     match verb {
         None => {
             let verbs = command.get_subcommands().filter(|verb| !verb.is_hide_set());
-            fitting(verbs.map(|verb| verb.get_name().to_owned()), last)
+            Offer::Words(fitting(verbs.map(|verb| verb.get_name().to_owned()), last))
         }
         Some(verb) if verb.get_positionals().next().is_none() => Offer::Words(Vec::new()),
         Some(verb) if ["import", "lint", "man"].contains(&verb.get_name()) => Offer::Files,
@@ -62,11 +61,11 @@ pub fn offer(command: &Command, words: &[String]) -> Offer {
 }
 
 /// The words that begin like the last one, sorted, each once.
-pub fn fitting(words: impl IntoIterator<Item = String>, last: &str) -> Offer {
+pub fn fitting(words: impl IntoIterator<Item = String>, last: &str) -> Vec<String> {
     let mut words: Vec<String> = words.into_iter().filter(|word| word.starts_with(last)).collect();
     words.sort();
     words.dedup();
-    Offer::Words(words)
+    words
 }
 
 fn verb<'a>(command: &'a Command, before: &[String]) -> Option<&'a Command> {
@@ -104,13 +103,11 @@ fn value_of(flag: &Arg, last: &str) -> Offer {
     match flag.get_long() {
         Some("leaderboard") => Offer::Leaderboards,
         Some("download" | "file" | "kubeconfig") => Offer::Files,
-        _ => fitting(
-            flag.get_possible_values()
-                .iter()
-                .map(PossibleValue::get_name)
-                .map(str::to_owned),
-            last,
-        ),
+        _ => {
+            let values = flag.get_possible_values();
+            let names = values.iter().map(|value| value.get_name().to_owned());
+            Offer::Words(fitting(names, last))
+        }
     }
 }
 

@@ -55,7 +55,7 @@ use self::cluster::{Cluster, Scope, Target};
 use self::complete::Offer;
 use self::error::Error;
 use self::help::GLOBAL;
-use self::output::{Colour, Format, Output, formats, note, print};
+use self::output::{Format, Output, formats, note, print, set_colours};
 
 /// How long a shell waits for names.
 const COMPLETION: Duration = Duration::from_secs(3);
@@ -70,7 +70,7 @@ struct Cli {
     target: Target,
     /// When to color lines; auto: on a terminal, unless NO_COLOR is set.
     #[arg(long, global = true, value_enum, default_value_t, value_name = "WHEN", help_heading = GLOBAL)]
-    color: Colour,
+    color: ColorChoice,
     /// The same as --color never.
     #[arg(long, global = true, conflicts_with = "color", help_heading = GLOBAL)]
     no_color: bool,
@@ -191,7 +191,7 @@ fn main() -> ExitCode {
     let words: Vec<OsString> = std::env::args_os().collect();
     let matches = command_line(&words).get_matches_from(&words);
     let cli = Cli::from_arg_matches(&matches).unwrap_or_else(|error| error.exit());
-    if cli.no_color { Colour::Never } else { cli.color }.settle();
+    set_colours(if cli.no_color { ColorChoice::Never } else { cli.color });
     // It fails only where a provider is installed already, which serves as well.
     let _ = rustls::crypto::ring::default_provider().install_default();
     let runtime = tokio::runtime::Builder::new_current_thread().enable_all().build();
@@ -231,7 +231,7 @@ async fn carry_out(cli: Cli) -> Result<ExitCode, Error> {
         Command::Man(wanted) => manual::write(help::dressed(Cli::command()), &wanted),
         Command::Lint(wanted) => lint::lint(&wanted),
         Command::Version(wanted) => version::version(cli.target, &wanted).await,
-        Command::Import(wanted) => import::import(&wanted, cli.target.namespace),
+        Command::Import(wanted) => import::import(&wanted, cli.target.namespace.as_deref()),
         command => {
             let cluster = Cluster::connect(cli.target).await?;
             let done = carry_out_there(command, &cluster).await;
@@ -277,19 +277,16 @@ async fn complete(words: &[String]) {
     let matches = Cli::command().ignore_errors(true).try_get_matches_from(before);
     let target = matches.ok().and_then(|matches| Target::from_arg_matches(&matches).ok());
     let target = target.unwrap_or_default();
-    let is_file = offered == Offer::Files;
-    let names = match offered {
-        Offer::Words(words) => words,
-        Offer::Files => Vec::new(),
+    let (names, directive) = match offered {
+        Offer::Files => (Vec::new(), complete::FILES),
+        Offer::Words(words) => (words, complete::NO_FILES),
         of_cluster => {
             let found = tokio::time::timeout(COMPLETION, names_of(target, &of_cluster)).await;
-            found.ok().and_then(Result::ok).unwrap_or_default()
+            let names = found.ok().and_then(Result::ok).unwrap_or_default();
+            (complete::fitting(names, last), complete::NO_FILES)
         }
     };
-    if let Offer::Words(words) = complete::fitting(names, last) {
-        print(&words);
-    }
-    let directive = if is_file { complete::FILES } else { complete::NO_FILES };
+    print(&names);
     print(&[directive.to_owned()]);
 }
 

@@ -7,7 +7,7 @@ use std::process::ExitCode;
 use std::sync::{Mutex, OnceLock, PoisonError};
 
 use clap::builder::{PossibleValuesParser, TypedValueParser};
-use clap::{Args, ValueEnum};
+use clap::{Args, ColorChoice, ValueEnum};
 use leaderboard_api::text::is_harmful;
 use serde_json::Value;
 
@@ -46,26 +46,17 @@ pub fn formats<const N: usize>(names: [&'static str; N]) -> impl TypedValueParse
     parser.map(|name| Format::from_str(&name, true).unwrap_or_default())
 }
 
-/// When lines are coloured.
-#[derive(ValueEnum, Clone, Copy, Debug, Default, PartialEq, Eq)]
-pub enum Colour {
-    #[default]
-    Auto,
-    Always,
-    Never,
-}
-
-impl Colour {
-    /// Decides for this process.
-    pub fn settle(self) {
-        let is_wanted = match self {
-            Self::Always => true,
-            Self::Never => false,
-            Self::Auto => std::io::stdout().is_terminal() && std::env::var_os("NO_COLOR").is_none_or(|v| v.is_empty()),
-        };
-        // Only the first call counts, and there is one.
-        let _ = COLOURS.set(is_wanted);
-    }
+/// Decides for this process whether lines are coloured.
+pub fn set_colours(wanted: ColorChoice) {
+    let is_wanted = match wanted {
+        ColorChoice::Always => true,
+        ColorChoice::Never => false,
+        ColorChoice::Auto => {
+            std::io::stdout().is_terminal() && std::env::var_os("NO_COLOR").is_none_or(|v| v.is_empty())
+        }
+    };
+    // Only the first call counts, and there is one.
+    let _ = COLOURS.set(is_wanted);
 }
 
 /// A value as text in a format for programs; none for the formats of people.

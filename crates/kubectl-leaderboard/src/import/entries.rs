@@ -50,24 +50,18 @@ const ORIGINALS: [Original; 2] = [
     },
 ];
 
+/// The entries that are given, by name.
+pub(super) type Entries = BTreeMap<String, Entry>;
+
 /// The answer of AWS for one entry.
 #[derive(Deserialize)]
-struct Answer {
+pub(super) struct Entry {
     #[serde(rename = "ARN")]
     arn: String,
     #[serde(rename = "Name")]
     name: String,
     /// Absent where the reader has left it out.
     #[serde(rename = "SecretString")]
-    text: Option<String>,
-}
-
-/// The entries that are given, by name.
-pub(super) type Entries = BTreeMap<String, Entry>;
-
-/// One entry, with its place in AWS.
-pub(super) struct Entry {
-    arn: String,
     text: Option<String>,
 }
 
@@ -80,10 +74,10 @@ impl Entry {
 
 /// Reads the answers of a text. The error is the line at which it stops being one.
 pub(super) fn answers(text: &str) -> Result<Entries, usize> {
-    let answers = serde_json::Deserializer::from_str(text).into_iter::<Answer>();
-    let named = answers.map(|answer| {
-        let Answer { arn, name, text } = answer.map_err(|error| error.line())?;
-        Ok((name, Entry { arn, text }))
+    let answers = serde_json::Deserializer::from_str(text).into_iter::<Entry>();
+    let named = answers.map(|entry| {
+        let entry = entry.map_err(|error| error.line())?;
+        Ok((entry.name.clone(), entry))
     });
     named.collect()
 }
@@ -91,30 +85,21 @@ pub(super) fn answers(text: &str) -> Result<Entries, usize> {
 /// Where an entry is, by its ARN.
 #[derive(Clone, Debug, PartialEq)]
 pub(super) struct Place {
-    partition: String,
     pub(super) region: String,
-    account: String,
+    /// The role that docs/migrate.md makes for the Pods.
+    pub(super) role: String,
 }
 
 impl Place {
     fn of(arn: &str) -> Option<Self> {
         let mut parts = arn.strip_prefix("arn:")?.split(':');
         let is_word = |text: &&str| text.bytes().all(|byte| byte.is_ascii_alphanumeric() || byte == b'-');
-        let partition = parts.next().filter(is_word)?.to_owned();
+        let partition = parts.next().filter(is_word)?;
         parts.next().filter(|service| *service == "secretsmanager")?;
         let region = parts.next().filter(is_word)?.to_owned();
-        let account = parts.next().filter(is_word)?.to_owned();
-        Some(Self {
-            partition,
-            region,
-            account,
-        })
-    }
-
-    /// The role that docs/migrate.md makes for the Pods.
-    pub(super) fn role(&self) -> String {
-        let Self { partition, account, .. } = self;
-        format!("arn:{partition}:iam::{account}:role/leaderboard-submission-worker")
+        let account = parts.next().filter(is_word)?;
+        let role = format!("arn:{partition}:iam::{account}:role/leaderboard-submission-worker");
+        Some(Self { region, role })
     }
 }
 
@@ -196,7 +181,7 @@ struct Fields<'a> {
 
 impl<'a> Fields<'a> {
     /// The keys of one entry. None, with the problem in `found`, if its ARN or its text cannot be read.
-    fn of(entry: &'static str, Entry { arn, text }: &Entry, found: &'a mut Found) -> Option<Self> {
+    fn of(entry: &'static str, Entry { arn, text, .. }: &Entry, found: &'a mut Found) -> Option<Self> {
         let Some(place) = Place::of(arn) else {
             found.problems.push(format!(
                 "the answer for {entry} has no ARN of Secrets Manager; print it with its ARN"
@@ -327,15 +312,15 @@ pub(super) fn parse(entries: &Entries) -> Result<Pipeline, Vec<String>> {
             .push("there is no answer for leaderboard-10 or leaderboard-20; print one of them too".to_owned());
     }
     let Found { problems, dropped } = found;
-    problems
-        .is_empty()
-        .then_some(Pipeline {
-            api_server,
-            token_region,
-            boards,
-            dropped,
-        })
-        .ok_or(problems)
+    if !problems.is_empty() {
+        return Err(problems);
+    }
+    Ok(Pipeline {
+        api_server,
+        token_region,
+        boards,
+        dropped,
+    })
 }
 
 /// Region of the token's entry, and the server.

@@ -8,18 +8,12 @@ use std::str::FromStr;
 use leaderboard_api::DOCUMENTS;
 use serde_json::{Value, json};
 
+use super::Import;
 use super::entries::{Board, EVALAI, Pipeline, Track};
 use crate::text::wrap;
 
 /// Columns of a line of the first comment.
 const WIDTH: usize = 116;
-
-/// Settings that no entry holds; the command line names them.
-pub(super) struct Options {
-    pub(super) namespace: String,
-    pub(super) challenge: i64,
-    pub(super) queue: Queue,
-}
 
 /// The URL of an SQS queue.
 #[derive(Clone, Debug, PartialEq)]
@@ -50,37 +44,18 @@ impl Queue {
     }
 }
 
-/// All that is printed.
-pub(super) fn yaml(pipeline: &Pipeline, options: &Options) -> String {
-    let boards = pipeline
-        .boards
-        .iter()
-        .map(|board| leaderboard(pipeline, board, options));
-    let namespace = quoted(&options.namespace);
-    format!(
-        "{}---\n\
-         # Privileged simulators need the Pod Security level privileged.\n\
-         apiVersion: v1\n\
-         kind: Namespace\n\
-         metadata:\n\
-         \x20 name: {namespace}\n\
-         \x20 labels:\n\
-         \x20   pod-security.kubernetes.io/enforce: privileged\n\
-         ---\n\
-         # The Pods of submissions. It needs no rights in the cluster and no annotation; its role is in podIdentity.\n\
-         apiVersion: v1\n\
-         kind: ServiceAccount\n\
-         metadata:\n\
-         \x20 name: submission-worker\n\
-         \x20 namespace: {namespace}\n\
-         {}",
-        heading(pipeline, options),
-        boards.collect::<String>()
-    )
+/// All that is printed for a namespace.
+pub(super) fn yaml(pipeline: &Pipeline, wanted: &Import, namespace: &str) -> String {
+    let namespace = quoted(namespace);
+    let boards = pipeline.boards.iter();
+    let boards = boards.map(|board| leaderboard(pipeline, board, wanted, &namespace));
+    let start = format!(include_str!("namespace.yaml.in"), namespace = namespace);
+    let heading = heading(pipeline, wanted, &namespace);
+    format!("{heading}{start}{}", boards.collect::<String>())
 }
 
 /// The first comment.
-fn heading(pipeline: &Pipeline, options: &Options) -> String {
+fn heading(pipeline: &Pipeline, wanted: &Import, namespace: &str) -> String {
     let mut dropped = String::new();
     for line in &pipeline.dropped {
         let marks = std::iter::once("# - ").chain(std::iter::repeat("#   "));
@@ -95,12 +70,12 @@ fn heading(pipeline: &Pipeline, options: &Options) -> String {
          # Go through each comment that begins with \"To decide\".\n\
          {dropped}#\n\
          {}",
-        values(pipeline, options)
+        values(pipeline, wanted, namespace)
     )
 }
 
 /// Leaderboards may name only what the chart's values allow.
-fn values(pipeline: &Pipeline, options: &Options) -> String {
+fn values(pipeline: &Pipeline, wanted: &Import, namespace: &str) -> String {
     let names = |name: fn(&Board) -> Option<&String>| {
         let names: BTreeSet<&String> = pipeline.boards.iter().filter_map(name).collect();
         json!(names)
@@ -108,32 +83,31 @@ fn values(pipeline: &Pipeline, options: &Options) -> String {
     format!(
         "# Values of the operator's chart for these objects:\n\
          #   leaderboards:\n\
-         #   - namespace: {}\n\
+         #   - namespace: {namespace}\n\
          #     secretsManager: [{EVALAI}]\n\
          #     queues: [{}]\n\
          #     buckets: {}\n\
          #     tables: {}\n\
          #     logGroups: {}\n",
-        quoted(&options.namespace),
-        quoted(&options.queue.0),
+        quoted(&wanted.queue.0),
         names(|board| Some(&board.bucket)),
         names(|board| Some(&board.table)),
         names(|board| board.log_group.as_ref()),
     )
 }
 
-fn leaderboard(pipeline: &Pipeline, board: &Board, options: &Options) -> String {
+fn leaderboard(pipeline: &Pipeline, board: &Board, wanted: &Import, namespace: &str) -> String {
     let tracks: Vec<String> = board.tracks.iter().map(|of| track(board, of)).collect();
     let region = &board.place.region;
     format!(
         include_str!("leaderboard.yaml.in"),
         entry = board.original.entry,
-        namespace = quoted(&options.namespace),
+        namespace = namespace,
         api_server = quoted(&pipeline.api_server),
-        challenge = options.challenge,
+        challenge = wanted.challenge,
         token_region = quoted(&pipeline.token_region),
-        queue = quoted(&options.queue.0),
-        queue_region = quoted(options.queue.region().unwrap_or(region)),
+        queue = quoted(&wanted.queue.0),
+        queue_region = quoted(wanted.queue.region().unwrap_or(region)),
         version = board.original.version,
         repetitions = board.original.repetitions,
         tracks = tracks.join("\n"),
@@ -144,7 +118,7 @@ fn leaderboard(pipeline: &Pipeline, board: &Board, options: &Options) -> String 
         region = quoted(region),
         table = quoted(&board.table),
         log_group = log_group(board),
-        role = quoted(&board.place.role()),
+        role = quoted(&board.place.role),
         nodes = board.original.nodes,
     )
 }

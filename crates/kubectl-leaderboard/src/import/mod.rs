@@ -17,7 +17,7 @@ use clap::Args;
 use leaderboard_api::DOCUMENTS;
 
 use self::entries::Entries;
-use self::manifests::{Options, Queue};
+use self::manifests::Queue;
 use crate::error::Error;
 use crate::output::{note, print};
 
@@ -40,18 +40,13 @@ pub struct Import {
 }
 
 /// Prints the manifests, for a namespace.
-pub fn import(wanted: &Import, namespace: Option<String>) -> Result<ExitCode, Error> {
+pub fn import(wanted: &Import, namespace: Option<&str>) -> Result<ExitCode, Error> {
     let mut entries = Entries::new();
     for path in &wanted.files {
         entries.extend(read(path)?);
     }
     let pipeline = entries::parse(&entries).map_err(|problems| Error::Unfit(problems.join("; ")))?;
-    let options = Options {
-        namespace: namespace.unwrap_or_else(|| NAMESPACE.to_owned()),
-        challenge: wanted.challenge,
-        queue: wanted.queue.clone(),
-    };
-    let yaml = manifests::yaml(&pipeline, &options);
+    let yaml = manifests::yaml(&pipeline, wanted, namespace.unwrap_or(NAMESPACE));
     for line in &pipeline.dropped {
         note(&format!("not taken over: {line}"));
     }
@@ -64,8 +59,7 @@ pub fn import(wanted: &Import, namespace: Option<String>) -> Result<ExitCode, Er
 /// The entries of a file.
 fn read(path: &Path) -> Result<Entries, Error> {
     let shown = path.display();
-    let (text, is_open) =
-        text_of(path).map_err(|error| Error::Unfit(format!("cannot read {shown}: {error}. Name another file")))?;
+    let (text, is_open) = text_of(path).map_err(|error| Error::Unread(shown.to_string(), error))?;
     let entries = entries::answers(&text).map_err(|line| {
         Error::Unfit(format!(
             "{shown}, line {line}: this is no answer of `aws secretsmanager get-secret-value --output json`. Print the entry again"

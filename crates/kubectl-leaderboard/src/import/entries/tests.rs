@@ -39,7 +39,7 @@ fn the_entries_of_the_original_are_read_whole() {
     assert_eq!(twenty.log_group.as_deref(), Some("leaderboard-20"));
     assert_eq!(twenty.place.region, "us-west-2");
     assert_eq!(
-        twenty.place.role(),
+        twenty.place.role,
         "arn:aws:iam::123456789012:role/leaderboard-submission-worker"
     );
     let tracks: Vec<_> = twenty.tracks.iter().map(|t| (t.phase, t.codename.as_str())).collect();

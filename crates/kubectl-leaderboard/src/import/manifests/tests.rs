@@ -2,22 +2,23 @@ use leaderboard_api::{Display, GpuMode, Leaderboard, LeaderboardSpec, Leaderboar
 use serde_json::json;
 
 use super::*;
-use crate::import::entries::{answers, parse};
+use crate::import::entries::{Entries, answers, parse};
 use crate::import::samples_tests::{TOKEN, Texts, answer, board, entries, texts};
 use crate::tests::golden::assert_golden;
 
 const URL: &str = "https://sqs.us-west-2.amazonaws.com/123456789012/leaderboard";
 
-fn options() -> Options {
-    Options {
-        namespace: "leaderboard".into(),
+fn yaml_of(entries: &Entries) -> String {
+    let wanted = Import {
+        files: vec![],
         challenge: 2098,
         queue: URL.parse().unwrap(),
-    }
+    };
+    yaml(&parse(entries).unwrap(), &wanted, "leaderboard")
 }
 
 fn printed(texts: &Texts) -> String {
-    yaml(&parse(&entries(texts)).unwrap(), &options())
+    yaml_of(&entries(texts))
 }
 
 fn documents(text: &str) -> Vec<Value> {
@@ -215,7 +216,7 @@ fn no_text_of_an_entry_ends_a_comment_or_commands_a_terminal() {
         twenty[hostile] = json!("x");
         let mut all = entries(&texts());
         all.append(&mut answers(&answer("leaderboard-20", &twenty.to_string()).to_string()).unwrap());
-        let yaml = yaml(&parse(&all).unwrap(), &options());
+        let yaml = yaml_of(&all);
         assert_eq!(documents(&yaml).len(), 4, "{yaml}");
         let is_odd = |c: char| c != '\n' && (c.is_control() || "\u{85}\u{2028}\u{2029}\u{202e}".contains(c));
         assert!(!yaml.contains(is_odd), "{yaml:?}");
