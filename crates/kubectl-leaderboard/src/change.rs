@@ -117,9 +117,7 @@ fn resume_many(submission: &Submission, frame: Frame) -> Result<Change, String> 
 
 fn restart(submission: &Submission, frame: Frame) -> Result<Change, String> {
     let name = submission.name_any();
-    if let Some(why_not) = is_settled(submission) {
-        return Err(why_not);
-    }
+    may_go_on(submission)?;
     if !is_run(submission) {
         return Err(format!(
             "{name} is {} and has no run to restart. See `{}`",
@@ -157,14 +155,6 @@ fn resume(submission: &Submission, leaderboard: Observed<'_>, frame: Frame) -> R
     Ok(resumption(submission, attempt, page.into_lines()))
 }
 
-/// The attempt that a resume requests, or why there is none.
-fn next_attempt(submission: &Submission) -> Result<Attempt, String> {
-    match not_resumable(submission) {
-        Some(why_not) => Err(why_not),
-        None => Ok(submission.spec.attempt.next()),
-    }
-}
-
 fn resumption(submission: &Submission, attempt: Attempt, lines: Vec<String>) -> Change {
     Change {
         // Somebody else may raise the attempt at the same time: then the patch conflicts.
@@ -178,43 +168,41 @@ fn resumption(submission: &Submission, attempt: Attempt, lines: Vec<String>) -> 
 }
 
 /// Why no attempt can be requested of it, whatever has become of the present one.
-fn is_settled(submission: &Submission) -> Option<String> {
+fn may_go_on(submission: &Submission) -> Result<(), String> {
     let name = submission.name_any();
     if submission.metadata.deletion_timestamp.is_some() {
-        return Some(format!(
+        return Err(format!(
             "{name} is being deleted. Wait until it is gone, and apply it again with a higher attempt to continue from its \
              stored results"
         ));
     }
     if is_attempt_requested(submission) {
         let wanted = submission.spec.attempt;
-        return Some(format!(
+        return Err(format!(
             "attempt {wanted} of {name} is already requested and has not started yet. See `{}`",
             command("why", submission)
         ));
     }
-    None
+    Ok(())
 }
 
-fn not_resumable(submission: &Submission) -> Option<String> {
-    if let Some(why_not) = is_settled(submission) {
-        return Some(why_not);
-    }
+/// The attempt that a resume requests, or why there is none.
+fn next_attempt(submission: &Submission) -> Result<Attempt, String> {
+    may_go_on(submission)?;
     let name = submission.name_any();
-    let see = command("why", submission);
     match status(submission).known_state().filter(|_| has_ended(submission)) {
-        Some(State::Failed | State::Cancelled) => None,
-        Some(State::Finished) => Some(format!(
+        Some(State::Failed | State::Cancelled) => Ok(submission.spec.attempt.next()),
+        Some(State::Finished) => Err(format!(
             "{name} has finished and cannot be resumed. Submit again to run it once more"
         )),
         _ => {
-            let shown = shown(submission);
+            let (shown, see) = (shown(submission), command("why", submission));
             let or = if is_run(submission) {
                 format!("restart its run (`{} --restart`)", command("resume", submission))
             } else {
                 format!("cancel it first (`{}`)", command("cancel", submission))
             };
-            Some(format!(
+            Err(format!(
                 "{name} is {shown}; only Failed and Cancelled submissions can be resumed. Wait for its end (`{see}`), or {or}"
             ))
         }

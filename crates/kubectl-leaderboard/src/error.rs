@@ -3,6 +3,7 @@
 //! Called by `cluster` and `main`.
 
 use std::error::Error as StdError;
+use std::iter::successors;
 
 use kube::client::AuthError;
 use kube::config::KubeconfigError;
@@ -171,12 +172,9 @@ pub(super) fn of_bucket(address: &str, why: &str) -> Error {
 
 /// Why no cluster is configured. The text of a parser may show a part of the file, and with it perhaps a token.
 pub(super) fn of_kubeconfig(error: &(dyn StdError + 'static)) -> Error {
-    let mut next = Some(error);
-    while let Some(cause) = next {
-        if let Some(KubeconfigError::Parse(_)) = cause.downcast_ref() {
-            return Error::Config("the kubeconfig is not one, or not YAML".to_owned());
-        }
-        next = cause.source();
+    let mut found = causes(error).filter_map(|cause| cause.downcast_ref::<KubeconfigError>());
+    if found.any(|cause| matches!(cause, KubeconfigError::Parse(_))) {
+        return Error::Config("the kubeconfig is not one, or not YAML".to_owned());
     }
     Error::Config(phrase(&leaderboard_api::text::chain(error)))
 }
@@ -189,26 +187,25 @@ pub(super) fn phrase(text: &str) -> String {
 /// The error of the program that a kubeconfig names for credentials. kube's own text would show all its output, and with it
 /// perhaps a token.
 fn credentials(error: &(dyn StdError + 'static)) -> Option<String> {
-    let mut next = Some(error);
-    while let Some(error) = next {
-        if let Some(found) = error.downcast_ref::<AuthError>() {
-            return Some(match found {
-                AuthError::AuthExecRun { out, .. } => {
-                    let stderr = String::from_utf8_lossy(&out.stderr);
-                    let last = stderr.lines().rfind(|line| !line.trim().is_empty());
-                    let why = last.map_or_else(|| out.status.to_string(), str::to_owned);
-                    phrase(&format!(
-                        "the program that the kubeconfig names for credentials failed: {why}"
-                    ))
-                }
-                // Its text may show what the program printed.
-                AuthError::AuthExecParse(_) => {
-                    "the program that the kubeconfig names for credentials printed something else".to_owned()
-                }
-                other => phrase(&leaderboard_api::text::chain(other)),
-            });
+    let found = causes(error).find_map(|cause| cause.downcast_ref::<AuthError>())?;
+    Some(match found {
+        AuthError::AuthExecRun { out, .. } => {
+            let stderr = String::from_utf8_lossy(&out.stderr);
+            let last = stderr.lines().rfind(|line| !line.trim().is_empty());
+            let why = last.map_or_else(|| out.status.to_string(), str::to_owned);
+            phrase(&format!(
+                "the program that the kubeconfig names for credentials failed: {why}"
+            ))
         }
-        next = error.source();
-    }
-    None
+        // Its text may show what the program printed.
+        AuthError::AuthExecParse(_) => {
+            "the program that the kubeconfig names for credentials printed something else".to_owned()
+        }
+        other => phrase(&leaderboard_api::text::chain(other)),
+    })
+}
+
+/// An error and its causes.
+fn causes<'a>(error: &'a (dyn StdError + 'static)) -> impl Iterator<Item = &'a (dyn StdError + 'static)> {
+    successors(Some(error), |error| error.source())
 }
