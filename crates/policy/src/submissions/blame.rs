@@ -88,17 +88,7 @@ fn from_outside(host: Option<&ContainerView>, agent: Option<&ContainerView>) -> 
 /// True if a crash was a failure of the host's container itself, which it was not if its Pod was being ended.
 fn is_hosts_own(host: Option<&ContainerView>, crash: &Crash) -> bool {
     let was_ended = host.and_then(|container| what(container.last.as_ref()?)) == Some(What::Stopped);
-    let is_its = matches!(
-        crash.cause,
-        EndReason::SimulatorCrashed
-            | EndReason::SimulatorNotReady
-            | EndReason::SimulatorSilent
-            | EndReason::SimulatorNotStarted
-            | EndReason::EvaluatorCrashed
-            | EndReason::EvaluatorNotReady
-            | EndReason::EvaluatorNotStarted
-    );
-    is_its && !was_ended
+    failure::of_host(crash.cause, Agents::Beside).is_some() && !was_ended
 }
 
 fn of_both(host: Option<&ContainerView>, end: &EndView, blamed: Crash) -> Crash {

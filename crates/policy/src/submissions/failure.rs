@@ -259,7 +259,7 @@ fn of_node(
 }
 
 /// The end of the host's container, if that was the cause.
-fn of_host(cause: EndReason, agents: Agents) -> Option<(Reason, &'static str)> {
+pub(super) fn of_host(cause: EndReason, agents: Agents) -> Option<(Reason, &'static str)> {
     let (reason, what) = match cause {
         EndReason::SimulatorCrashed => (Reason::SimulationCrashed, "it crashed"),
         EndReason::SimulatorNotReady => (Reason::SimulationCrashed, "it was not ready in time"),

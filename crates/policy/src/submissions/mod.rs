@@ -41,8 +41,7 @@ use crate::view::{JobView, ObservedJob, Stage, View};
 use gates::{input, slot};
 use leaderboard_api::{JOB_SECONDS, LeaderboardSpec, Reason};
 pub use plan::{Action, EvalaiUpdate, Event, Plan, Question, SlotUse, StatusWrite, TableUpdate, job_name};
-pub use run::pinned;
-pub use run::{awaits_publication, patience};
+pub use run::{awaits_publication, patience, pinned};
 use status::PlanBuilder;
 use waits::{Wait, after};
 
