@@ -6,13 +6,13 @@ use std::borrow::Cow;
 use std::collections::BTreeMap;
 use std::fmt;
 
-use k8s_openapi::api::networking::v1::{NetworkPolicy, NetworkPolicySpec};
+use k8s_openapi::api::networking::v1::NetworkPolicy;
 use k8s_openapi::apimachinery::pkg::apis::meta::v1::{OwnerReference, Time};
 use kube::Resource;
 use kube::api::ObjectMeta;
 use kube::core::NamespaceResourceScope;
 use kube::runtime::reflector::Lookup;
-use leaderboard_api::{Leaderboard, LeaderboardSpec, LeaderboardStatus, Submission, SubmissionSpec, SubmissionStatus};
+use leaderboard_api::{Leaderboard, Submission, SubmissionStatus};
 use serde::de::{DeserializeOwned, IgnoredAny};
 use serde::{Deserialize, Deserializer};
 use serde_json::value::RawValue;
@@ -115,35 +115,24 @@ impl<K: Watchable> Resource for Item<K> {
     }
 }
 
-/// A kind whose objects may be stored by another version of this program, or by a person.
-pub trait Parts: Lookup<DynamicType = ()> + Clone + fmt::Debug + Send + Sync + 'static {
-    type Spec: DeserializeOwned;
-    type Status: DeserializeOwned;
+impl Watchable for Submission {
+    type Scope = NamespaceResourceScope;
 
-    fn of(metadata: ObjectMeta, spec: Self::Spec, status: Self::Status) -> Self;
-
-    /// Stores texts once that many objects have.
-    fn share_texts(&mut self, _texts: &mut Texts) {}
-}
-
-impl Parts for Submission {
-    type Spec = SubmissionSpec;
-    type Status = Option<SubmissionStatus>;
-
-    fn of(metadata: ObjectMeta, spec: Self::Spec, status: Self::Status) -> Self {
-        let mut submission = Self { metadata, spec, status };
-        if let Some(status) = &mut submission.status {
-            // A list that was read has room for twice as many.
-            status.conditions.shrink_to_fit();
-            status.workers.shrink_to_fit();
-            if let Some(plan) = &mut status.plan {
-                plan.shrink_to_fit();
+    fn read<'de, D: Deserializer<'de>>(deserializer: D) -> Result<Result<Self, Malformed>, D::Error> {
+        in_parts(deserializer, |metadata, spec, mut status: Option<SubmissionStatus>| {
+            if let Some(status) = &mut status {
+                // A list that was read has room for twice as many.
+                status.conditions.shrink_to_fit();
+                status.workers.shrink_to_fit();
+                if let Some(plan) = &mut status.plan {
+                    plan.shrink_to_fit();
+                }
             }
-        }
-        submission
+            Self { metadata, spec, status }
+        })
     }
 
-    fn share_texts(&mut self, texts: &mut Texts) {
+    fn share(&mut self, texts: &mut Texts) {
         let status = self.status.iter_mut();
         status
             .flat_map(SubmissionStatus::shared_texts)
@@ -151,33 +140,19 @@ impl Parts for Submission {
     }
 }
 
-impl Parts for Leaderboard {
-    type Spec = LeaderboardSpec;
-    type Status = Option<LeaderboardStatus>;
-
-    fn of(metadata: ObjectMeta, spec: Self::Spec, status: Self::Status) -> Self {
-        Self { metadata, spec, status }
-    }
-}
-
-impl Parts for NetworkPolicy {
-    type Spec = Option<NetworkPolicySpec>;
-    type Status = IgnoredAny;
-
-    fn of(metadata: ObjectMeta, spec: Self::Spec, _: Self::Status) -> Self {
-        Self { metadata, spec }
-    }
-}
-
-impl<K: Parts> Watchable for K {
+impl Watchable for Leaderboard {
     type Scope = NamespaceResourceScope;
 
     fn read<'de, D: Deserializer<'de>>(deserializer: D) -> Result<Result<Self, Malformed>, D::Error> {
-        in_parts(deserializer)
+        in_parts(deserializer, |metadata, spec, status| Self { metadata, spec, status })
     }
+}
 
-    fn share(&mut self, texts: &mut Texts) {
-        self.share_texts(texts);
+impl Watchable for NetworkPolicy {
+    type Scope = NamespaceResourceScope;
+
+    fn read<'de, D: Deserializer<'de>>(deserializer: D) -> Result<Result<Self, Malformed>, D::Error> {
+        in_parts(deserializer, |metadata, spec, _: IgnoredAny| Self { metadata, spec })
     }
 }
 
@@ -192,11 +167,15 @@ struct Unparsed<'a> {
     status: Option<&'a RawValue>,
 }
 
-fn in_parts<'de, K: Parts, D: Deserializer<'de>>(deserializer: D) -> Result<Result<K, Malformed>, D::Error> {
+/// Reads an object that may be stored by another version of this program, or by a person.
+fn in_parts<'de, D: Deserializer<'de>, K, S: DeserializeOwned, T: DeserializeOwned>(
+    deserializer: D,
+    join: impl FnOnce(ObjectMeta, S, T) -> K,
+) -> Result<Result<K, Malformed>, D::Error> {
     let Unparsed { metadata, spec, status } = Unparsed::deserialize(deserializer)?;
     let parsed = (|| Ok((parse(spec)?, parse(status)?)))();
     Ok(match parsed {
-        Ok((spec, status)) => Ok(K::of(metadata.into(), spec, status)),
+        Ok((spec, status)) => Ok(join(metadata.into(), spec, status)),
         Err(error) => Err(metadata.malformed(&error)),
     })
 }

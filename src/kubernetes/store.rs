@@ -32,12 +32,6 @@ struct Cache<K> {
 #[error("the watch has ended before its first list")]
 pub struct Ended;
 
-/// Fills a cache.
-pub(super) struct Writer<K> {
-    store: Store<K>,
-    ready: watch::Sender<bool>,
-}
-
 /// Namespace and name in one.
 pub(super) fn key_of(object: &impl Lookup) -> Box<str> {
     key(
@@ -57,6 +51,21 @@ impl<K> Clone for Store<K> {
 }
 
 impl<K: Watchable> Store<K> {
+    /// An empty cache, and what is sent `true` once everything was listed.
+    pub(super) fn new(index: Index<K>) -> (Self, watch::Sender<bool>) {
+        let (listed, ready) = watch::channel(false);
+        let cache = Cache {
+            by_key: HashMap::new(),
+            by_index: HashMap::new(),
+        };
+        let shared = Shared {
+            cache: RwLock::new(cache),
+            index,
+            ready,
+        };
+        (Self(Arc::new(shared)), listed)
+    }
+
     /// The object of this name.
     pub fn get(&self, reference: &ObjectRef<K>) -> Option<Arc<K>> {
         self.by_key(&key(reference.namespace.as_deref(), &reference.name))
@@ -102,40 +111,12 @@ impl<K: Watchable> Store<K> {
     fn write(&self) -> RwLockWriteGuard<'_, Cache<K>> {
         self.0.cache.write().unwrap_or_else(PoisonError::into_inner)
     }
-}
-
-impl<K: Watchable> Writer<K> {
-    pub(super) fn new(index: Index<K>) -> Self {
-        let (sender, ready) = watch::channel(false);
-        let cache = Cache {
-            by_key: HashMap::new(),
-            by_index: HashMap::new(),
-        };
-        let shared = Shared {
-            cache: RwLock::new(cache),
-            index,
-            ready,
-        };
-        Self {
-            store: Store(Arc::new(shared)),
-            ready: sender,
-        }
-    }
-
-    pub(super) fn store(&self) -> &Store<K> {
-        &self.store
-    }
-
-    /// Everything was listed once.
-    pub(super) fn is_complete(&self) {
-        self.ready.send_replace(true);
-    }
 
     /// Takes an object in. Returns it, and what it replaces.
-    pub(super) fn put(&mut self, object: K) -> (Arc<K>, Option<Arc<K>>) {
+    pub(super) fn insert(&self, object: K) -> (Arc<K>, Option<Arc<K>>) {
         let (key, object) = (key_of(&object), Arc::new(object));
-        let index = self.store.0.index;
-        let mut cache = self.store.write();
+        let index = self.0.index;
+        let mut cache = self.write();
         let before = cache.by_key.insert(key, Arc::clone(&object));
         if let Some(before) = &before {
             cache.leave(before, index);
@@ -152,17 +133,17 @@ impl<K: Watchable> Writer<K> {
     }
 
     /// Drops an object. Returns what it was.
-    pub(super) fn remove(&mut self, key: &str) -> Option<Arc<K>> {
-        let mut cache = self.store.write();
+    pub(super) fn evict(&self, key: &str) -> Option<Arc<K>> {
+        let mut cache = self.write();
         let before = cache.by_key.remove(key)?;
-        cache.leave(&before, self.store.0.index);
+        cache.leave(&before, self.0.index);
         drop(cache);
         Some(before)
     }
 
     /// The keys for which this does not hold.
     pub(super) fn keys_without(&self, holds: impl Fn(&str) -> bool) -> Vec<Box<str>> {
-        let cache = self.store.read();
+        let cache = self.read();
         cache.by_key.keys().filter(|key| !holds(key)).cloned().collect()
     }
 }
@@ -188,33 +169,25 @@ mod tests {
     impl<K: Watchable> Store<K> {
         /// A cache that holds these.
         pub(crate) fn of(objects: impl IntoIterator<Item = K>, index: Index<K>) -> Self {
-            let mut writer = Writer::new(index);
+            let (store, listed) = Self::new(index);
             for object in objects {
-                writer.put(object);
+                store.insert(object);
             }
-            writer.is_complete();
-            writer.store
+            listed.send_replace(true);
+            store
         }
 
         /// An empty cache, and what makes it complete.
         pub(crate) fn unlisted() -> (Self, watch::Sender<bool>) {
-            let Writer { store, ready } = Writer::new(|_| None);
-            (store, ready)
+            Self::new(|_| None)
         }
 
         pub(crate) fn put(&self, object: K) {
-            self.writer().put(object);
+            self.insert(object);
         }
 
         pub(crate) fn remove(&self, object: &K) {
-            self.writer().remove(&key_of(object));
-        }
-
-        fn writer(&self) -> Writer<K> {
-            Writer {
-                store: self.clone(),
-                ready: watch::channel(true).0,
-            }
+            self.evict(&key_of(object));
         }
     }
 
@@ -230,8 +203,7 @@ mod tests {
 
     #[test]
     fn the_index_follows_an_object_that_is_replaced_or_removed() {
-        let mut writer = Writer::new(owner);
-        let store = writer.store().clone();
+        let (store, _) = Store::new(owner);
         let uids = |value: &str| {
             let mut uids: Vec<_> = store
                 .indexed(value)
@@ -241,20 +213,20 @@ mod tests {
             uids.sort();
             uids
         };
-        writer.put(pod("a", "1", "job-1"));
-        writer.put(pod("b", "2", "job-1"));
+        store.insert(pod("a", "1", "job-1"));
+        store.insert(pod("b", "2", "job-1"));
         assert_eq!(uids("job-1"), ["1", "2"]);
-        let (_, before) = writer.put(pod("a", "3", "job-2"));
+        let (_, before) = store.insert(pod("a", "3", "job-2"));
         assert_eq!(before.unwrap().metadata.uid.as_ref(), "1");
         assert_eq!(
             (uids("job-1"), uids("job-2")),
             (vec!["2".to_owned()], vec!["3".to_owned()])
         );
-        writer.put(pod("a", "3", "job-2"));
+        store.insert(pod("a", "3", "job-2"));
         assert_eq!(uids("job-2"), ["3"], "once, however often it changes");
-        writer.remove("n/b");
-        writer.remove("n/a");
-        assert!(writer.remove("n/a").is_none() && store.is_empty());
+        store.evict("n/b");
+        store.evict("n/a");
+        assert!(store.evict("n/a").is_none() && store.is_empty());
         assert!(store.read().by_index.is_empty(), "nothing is left of what is gone");
     }
 }

@@ -11,12 +11,13 @@ use std::sync::{Arc, Mutex};
 use futures::StreamExt;
 use kube::Api;
 use kube::runtime::watcher::{Config, Error, Event};
+use tokio::sync::watch::Sender;
 
 use super::feed::{Feed, WatchEvents};
 use super::item::{Item, Watchable};
 use super::objects::Texts;
 use super::source::{self, Source, is_refusal};
-use super::store::{Index, Store, Writer, key_of};
+use super::store::{Index, Store, key_of};
 use crate::metrics::WatchMetrics;
 use crate::observability::Observability;
 use crate::observability::readiness::Readiness;
@@ -92,9 +93,9 @@ pub fn spawn_watch<K: Watchable>(
     index: Index<K>,
     telemetry: &Observability,
 ) -> Watch<K> {
-    let writer = Writer::<K>::new(index);
+    let (store, listed) = Store::new(index);
     let watch = Watch {
-        store: writer.store().clone(),
+        store,
         synced: Synced::default(),
         unreadable: Arc::default(),
         feed: Feed::new(),
@@ -113,7 +114,7 @@ pub fn spawn_watch<K: Watchable>(
         readiness: telemetry.readiness.clone(),
         kind,
         texts: Texts::default(),
-        writer,
+        listed,
         watch: watch.clone(),
         pending: HashSet::new(),
     };
@@ -135,7 +136,8 @@ struct Task<K: Watchable> {
     metrics: WatchMetrics,
     readiness: Readiness,
     texts: Texts,
-    writer: Writer<K>,
+    /// Makes the cache complete.
+    listed: Sender<bool>,
     watch: Watch<K>,
     /// Keys that have come before every source has listed once, and are events when they have.
     pending: HashSet<Box<str>>,
@@ -204,7 +206,7 @@ impl<K: Watchable> Task<K> {
             return key;
         }
         object.share(&mut self.texts);
-        let (after, before) = self.writer.put(object);
+        let (after, before) = self.watch.store.insert(object);
         match before {
             // The end of an object that was replaced by another one of its name between two reads.
             Some(before) if before.uid() != after.uid() => self.tell(&before, true),
@@ -222,7 +224,7 @@ impl<K: Watchable> Task<K> {
             Err(malformed) => (malformed.key(), None),
         };
         self.note_unreadable(|keys| _ = keys.remove(&key));
-        let known = self.writer.remove(&key);
+        let known = self.watch.store.evict(&key);
         // No event was sent for an object that never could be read.
         if let Some(last) = last.or(known) {
             self.tell(&last, true);
@@ -246,8 +248,9 @@ impl<K: Watchable> Task<K> {
         let from = &self.sources[source];
         let is_there = |key: &str| !from.has(key) || shown.contains(key);
         self.note_unreadable(|keys| keys.retain(|key| is_there(key)));
-        let lost = self.writer.keys_without(is_there);
-        let gone: Vec<Arc<K>> = lost.iter().filter_map(|key| self.writer.remove(key)).collect();
+        let store = &self.watch.store;
+        let lost = store.keys_without(is_there);
+        let gone: Vec<Arc<K>> = lost.iter().filter_map(|key| store.evict(key)).collect();
         if self.sources.iter().all(|source| source.has_listed) {
             self.complete(&gone);
         }
@@ -263,7 +266,7 @@ impl<K: Watchable> Task<K> {
     /// The cache holds what every source has listed: what has come since is an event.
     fn complete(&mut self, gone: &[Arc<K>]) {
         // Before anyone is woken by what was listed.
-        self.writer.is_complete();
+        self.listed.send_replace(true);
         if !self.watch.synced.is_true() && self.sources.iter().all(|source| source.is_synced) {
             self.watch.synced.set(true);
             self.readiness.set(&self.check, Ok(()));

@@ -1,10 +1,9 @@
 //! Texts that many objects have in common, such as the names of namespaces, nodes and containers.
 
 use std::collections::HashSet;
-use std::fmt;
 
 pub use leaderboard_api::SharedText as Text;
-use serde::de::{Deserializer, Error, Visitor};
+use serde::{Deserialize, Deserializer};
 
 /// Texts that are kept at least, whether or not an object still has them.
 const KEPT: usize = 256;
@@ -45,31 +44,8 @@ impl Texts {
 
 /// Reads a text that may be long, as far as it is of use.
 pub(super) fn cut<'de, D: Deserializer<'de>>(deserializer: D) -> Result<Option<Box<str>>, D::Error> {
-    struct Cut;
-    impl<'de> Visitor<'de> for Cut {
-        type Value = Option<Box<str>>;
-
-        fn expecting(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
-            f.write_str("a text or nothing")
-        }
-
-        fn visit_str<E: Error>(self, text: &str) -> Result<Self::Value, E> {
-            Ok(Some(text[..text.floor_char_boundary(LONGEST_TEXT)].into()))
-        }
-
-        fn visit_unit<E: Error>(self) -> Result<Self::Value, E> {
-            Ok(None)
-        }
-
-        fn visit_none<E: Error>(self) -> Result<Self::Value, E> {
-            Ok(None)
-        }
-
-        fn visit_some<D: Deserializer<'de>>(self, deserializer: D) -> Result<Self::Value, D::Error> {
-            deserializer.deserialize_str(self)
-        }
-    }
-    deserializer.deserialize_option(Cut)
+    let text = Option::<String>::deserialize(deserializer)?;
+    Ok(text.map(|text| text[..text.floor_char_boundary(LONGEST_TEXT)].into()))
 }
 
 #[cfg(test)]
