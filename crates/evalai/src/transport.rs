@@ -115,29 +115,25 @@ pub(super) async fn read(response: Response<Body>, end: Instant, largest: usize,
         .and_then(|value| value.to_str().ok())
         .map(str::to_owned);
     let body = timeout_at(end, body(response.into_body(), largest)).await;
-    let body = match body.unwrap_or_else(|_| Err(Unread::Broken(late("error decoding response body")))) {
-        Ok(body) => body,
-        Err(_) if need == Need::Status && status.is_success() => Vec::new(),
-        Err(Unread::TooLarge) => return Answer::unusable(code, "more than is read of an answer"),
-        Err(Unread::Broken(silence)) => return Answer::Unanswered(silence),
+    let body = match body.unwrap_or_else(|_| Err(late("error decoding response body"))) {
+        Ok(Some(body)) => body,
+        Ok(None) | Err(_) if need == Need::Status && status.is_success() => Vec::new(),
+        Ok(None) => return Answer::unusable(code, "more than is read of an answer"),
+        Err(silence) => return Answer::Unanswered(silence),
     };
     classify(code, retry_after.as_deref(), &body).map(|()| (code, body))
 }
 
-enum Unread {
-    TooLarge,
-    Broken(Silence),
-}
-
-async fn body(mut chunks: Body, largest: usize) -> Result<Vec<u8>, Unread> {
+/// A whole body; none if it has more than `largest` bytes.
+async fn body(mut chunks: Body, largest: usize) -> Result<Option<Vec<u8>>, Silence> {
     let mut body = Vec::new();
-    while let Some(chunk) = chunks.try_next().await.map_err(Unread::Broken)? {
+    while let Some(chunk) = chunks.try_next().await? {
         if body.len() + chunk.len() > largest {
-            return Err(Unread::TooLarge);
+            return Ok(None);
         }
         body.extend_from_slice(&chunk);
     }
-    Ok(body)
+    Ok(Some(body))
 }
 
 /// Why there is no answer that was waited for long enough.

@@ -123,8 +123,7 @@ impl Queue {
 
     /// When the list was asked for that shows an ended submission as cancelled; none if the last one does not.
     pub fn cancelled_as_of(&self, leaderboard: &Key, pk: i64) -> Option<Timestamp> {
-        let target = self.served.get(leaderboard)?;
-        let (at, listed) = &self.challenges.get(&target.challenge)?.cancelled;
+        let (at, listed) = &self.challenge_of(leaderboard)?.cancelled;
         listed.contains(&pk).then_some(*at)
     }
 

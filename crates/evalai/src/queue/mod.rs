@@ -323,25 +323,19 @@ impl Queue {
 
     /// True if partial results are on the leaderboards of a phase.
     pub fn shows_partial(&self, leaderboard: &Key, phase: i64) -> bool {
-        let check = self
-            .served
-            .get(leaderboard)
-            .and_then(|target| self.challenges.get(&target.challenge));
-        let catalog = check.and_then(|challenge| challenge.check.catalog.as_ref());
-        catalog.is_some_and(|catalog| {
-            catalog
-                .phases
-                .iter()
-                .any(|known| known.id == phase && known.shows_partial)
-        })
+        let check = self.challenge_of(leaderboard).map(|challenge| &challenge.check);
+        let phases = check.and_then(|check| Some(&check.catalog.as_ref()?.phases));
+        phases.is_some_and(|phases| phases.iter().any(|known| known.id == phase && known.shows_partial))
+    }
+
+    /// The challenge that a Leaderboard serves.
+    fn challenge_of(&self, leaderboard: &Key) -> Option<&Challenge> {
+        self.challenges.get(&self.served.get(leaderboard)?.challenge)
     }
 
     /// How a Leaderboard fits its challenge; none before the first check. The error is why there was no newer check.
     pub fn labels(&self, leaderboard: &Key) -> (Option<Labels>, Option<String>) {
-        let Some(target) = self.served.get(leaderboard) else {
-            return (None, None);
-        };
-        let Some(challenge) = self.challenges.get(&target.challenge) else {
+        let Some((target, challenge)) = self.served.get(leaderboard).zip(self.challenge_of(leaderboard)) else {
             return (None, None);
         };
         let labels = challenge.check.catalog.as_ref().map(|catalog| compare(target, catalog));
@@ -386,8 +380,7 @@ impl Queue {
 
     /// EvalAI's answer about the token's rights on the challenge of a Leaderboard, if it has none.
     pub fn challenge_refused(&self, leaderboard: &Key) -> Option<&str> {
-        let target = self.served.get(leaderboard)?;
-        let check = &self.challenges.get(&target.challenge)?.check;
+        let check = &self.challenge_of(leaderboard)?.check;
         check.error.as_deref().filter(|_| check.is_forbidden)
     }
 
