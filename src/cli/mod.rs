@@ -17,7 +17,6 @@ use clap::{Args, Parser, Subcommand};
 
 use crate::observability::logging::Format;
 use crate::revision::REVISION;
-use crate::runtime::leader::{self, Identity};
 use leaderboard_aws::clients as aws;
 use leaderboard_policy::allowed::Allowed;
 
@@ -107,19 +106,6 @@ struct Controller {
     /// Title of the page, such as the cluster's name. It stands in the page's header and in the browser's tab.
     #[arg(long, env = "LEADERBOARD_PAGE_TITLE", default_value = "")]
     page_title: String,
-    #[command(flatten)]
-    scope: Scope,
-    /// Name of this replica.
-    #[arg(long, env = "POD_NAME", default_value = "leaderboard-operator")]
-    pod_name: String,
-    /// UID of this replica.
-    #[arg(long, env = "POD_UID", default_value = "")]
-    pod_uid: String,
-}
-
-/// Rights of a controller besides those in its namespaces, and its Lease.
-#[derive(Args, Debug)]
-struct Scope {
     /// Whether the operator may read nodes. Without it a lost node is noticed later.
     #[arg(long, env = "LEADERBOARD_CLUSTER_RIGHTS", default_value_t = true, action = clap::ArgAction::Set)]
     cluster_rights: bool,
@@ -129,13 +115,12 @@ struct Scope {
     /// Name of the Lease.
     #[arg(long, env = "LEADERBOARD_LEASE", default_value = "leaderboard-operator")]
     lease: String,
-}
-
-impl Scope {
-    /// The Lease, for a replica of this name.
-    fn lease(&self, identity: Identity) -> leader::Settings {
-        leader::Settings::new(&self.lease_namespace, &self.lease, identity)
-    }
+    /// Name of this replica.
+    #[arg(long, env = "POD_NAME", default_value = "leaderboard-operator")]
+    pod_name: String,
+    /// UID of this replica.
+    #[arg(long, env = "POD_UID", default_value = "")]
+    pod_uid: String,
 }
 
 /// How to run a Pod's program outside of a Pod. Within a Pod the defaults are right.

@@ -153,7 +153,7 @@ async fn lead(options: Controller) -> End {
         lease: leader::lease_client(config).map_err(|e| client_errors::kube(&e))?,
     };
     let identity = Identity::of_pod(&options.pod_name, &options.pod_uid);
-    let lease = options.scope.lease(identity);
+    let lease = leader::Settings::new(&options.lease_namespace, &options.lease, identity);
     let aws = Aws::load("controller").await;
     let settings = Settings {
         own: OwnImage {
@@ -164,7 +164,7 @@ async fn lead(options: Controller) -> End {
         },
         operator: lease.installation(),
         namespaces: Namespaces::of(options.server.namespaces),
-        has_cluster_rights: options.scope.cluster_rights,
+        has_cluster_rights: options.cluster_rights,
         allowed: options.server.allowed,
         concurrency: options.concurrency,
     };

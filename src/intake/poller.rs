@@ -268,20 +268,11 @@ impl<S: Source> Poller<S> {
                 let waited = Duration::from_millis(u64::try_from(waited).unwrap_or_default());
                 self.metrics().shared.message_wait.observe(waited.as_secs_f64());
             }
-            Ok(Outcome::Repeat | Outcome::NotNew) => {
-                tracing::debug!("a repeat");
+            Ok(Outcome::Repeat | Outcome::NotNew) => tracing::debug!("a repeat"),
+            Ok(outcome @ (Outcome::Refused | Outcome::IdTaken(_))) => tracing::warn!("{outcome}"),
+            Ok(outcome @ (Outcome::Stopping | Outcome::Deleting)) => {
+                tracing::info!("{outcome}; the message comes back");
             }
-            Ok(Outcome::Refused) => tracing::warn!("{}", Outcome::Refused),
-            Ok(Outcome::Stopping) => {
-                tracing::info!("the attempt before is still being stopped; the message comes back");
-            }
-            Ok(Outcome::Deleting) => {
-                tracing::info!("the Submission of this name is still being deleted; the message comes back");
-            }
-            Ok(Outcome::IdTaken(owner)) => tracing::warn!(
-                owner,
-                "another object has the name of this submission; rename or delete it"
-            ),
             Err(error) => tracing::warn!(%error, "not ingested"),
         }
         Some(outcome)
