@@ -2,12 +2,12 @@
 //! so far; it keeps no state, so a run that was interrupted merges like one that was not.
 
 use crate::checkpoint::{Checkpoint, Record};
-use crate::json::{KeyOrder, Node, Object, Text, write};
+use crate::json::{Node, Object, Text, write};
 use crate::names::{self, STARTED, Score};
 use crate::number::{Number, count};
 use crate::statistics::{self, Global};
 use crate::verdict::Ending;
-use crate::{Format, Outcome, Plan, RecordName, Refusal, Slice};
+use crate::{Format, Outcome, Plan, RecordName, Refusal};
 
 /// How far one pair is.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
@@ -61,7 +61,7 @@ impl Merged {
 
     fn mean(&self, score: Score) -> Option<f64> {
         let global = self.view.global.as_ref().or(self.view.so_far.as_ref())?;
-        Some(global.mean(score).as_f64()).filter(|mean| mean.is_finite())
+        Some(global.means.get(score).as_f64()).filter(|mean| mean.is_finite())
     }
 }
 
@@ -108,7 +108,7 @@ pub fn merge(plan: &Plan, workers: &[Option<&Checkpoint>]) -> Result<Merged, Ref
     let total = plan.expected().unwrap_or_else(|| sum(workers, Checkpoint::total));
     let is_final = total != 0 && done == total && is_complete(plan, workers);
     if is_final {
-        check_routes(plan, workers, &sorted)?;
+        check_routes(plan, &sorted)?;
     }
     let done_unsorted = done_records(workers);
     let done_sorted = by_route(&done_unsorted);
@@ -129,7 +129,7 @@ pub fn merge(plan: &Plan, workers: &[Option<&Checkpoint>]) -> Result<Merged, Ref
         eligible: ending.outcome == Outcome::Finished,
         entry_status: ending.entry_status.to_owned(),
         outcome: ending.outcome,
-        score: global.as_ref().map(|global| global.mean(Score::Composed).as_f64()),
+        score: global.as_ref().map(|global| global.means.composed.as_f64()),
         partial_score: partial_score(&done_sorted),
         pairs: pairs(plan, workers),
         warnings: warnings(workers),
@@ -201,22 +201,19 @@ fn is_complete(plan: &Plan, workers: &[Option<&Checkpoint>]) -> bool {
 }
 
 /// Every route once: by the plan where ids are positions, else as far as the original looks.
-fn check_routes(plan: &Plan, workers: &[Option<&Checkpoint>], sorted: &[&Record]) -> Result<(), Refusal> {
-    if plan.format == Format::V2
-        && let Some([_, again]) = sorted.array_windows().find(|[a, b]| same_route(plan, a, b))
-    {
-        return Err(Refusal::Duplicate {
-            record: again.name.clone(),
-        });
+fn check_routes(plan: &Plan, sorted: &[&Record]) -> Result<(), Refusal> {
+    if plan.format == Format::V1 {
+        return Ok(());
     }
+    if let Some([_, again]) = sorted.array_windows().find(|[a, b]| same_route(plan, a, b)) {
+        let record = again.name.clone();
+        return Err(Refusal::Duplicate { record });
+    }
+    // A Pod has read no record outside its pair's slice, so as many as there are routes leave no gap.
     if plan.decides() && plan.is_pod() {
-        return check_slices(plan, workers);
+        return Ok(());
     }
-    if plan.format == Format::V2 {
-        check_gaps(sorted)
-    } else {
-        Ok(())
-    }
+    check_gaps(sorted)
 }
 
 fn same_route(plan: &Plan, a: &Record, b: &Record) -> bool {
@@ -225,28 +222,6 @@ fn same_route(plan: &Plan, a: &Record, b: &Record) -> bool {
     } else {
         a.route_id == b.route_id
     }
-}
-
-fn check_slices(plan: &Plan, workers: &[Option<&Checkpoint>]) -> Result<(), Refusal> {
-    let outside = |slice: &Slice, record: &&Record| !slice.contains(record.key.0);
-    for (pair, (slice, worker)) in plan.pairs.iter().zip(workers).enumerate() {
-        if let Some(record) = worker
-            .iter()
-            .flat_map(|worker| &worker.records)
-            .find(|record| outside(slice, record))
-        {
-            let problem = crate::RecordProblem::OutsideSlice {
-                first: slice.first,
-                last: slice.last,
-            };
-            return Err(Refusal::Record {
-                pair,
-                record: record.name.clone(),
-                problem,
-            });
-        }
-    }
-    Ok(())
 }
 
 /// The original's search for a gap. It learns the number of repetitions on its way, so it gives false alarms and misses
@@ -359,12 +334,7 @@ fn text(
         ("values", Node::texts(&values)),
         ("labels", Node::texts(&labels)),
     ]);
-    let order = if format == Format::V1 {
-        KeyOrder::Sorted
-    } else {
-        KeyOrder::AsGiven
-    };
-    write(&file, order)
+    write(&file, format.key_order())
 }
 
 /// The keys of a V2 record, in their order.

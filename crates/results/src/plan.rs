@@ -4,7 +4,7 @@
 use serde::{Deserialize, Serialize};
 
 use crate::Refusal;
-use crate::json::FileLimits;
+use crate::json::{FileLimits, KeyOrder};
 
 /// Bounds of the checkpoints of all pairs together in a Pod. Real ones hold a few kilobytes a route run.
 const SHARED: FileLimits = FileLimits {
@@ -24,6 +24,16 @@ pub enum Format {
     V1,
     /// Leaderboard 2.0, 2.1 and later.
     V2,
+}
+
+impl Format {
+    /// The order in which its scripts write the keys of an object.
+    pub(crate) fn key_order(self) -> KeyOrder {
+        match self {
+            Self::V1 => KeyOrder::Sorted,
+            Self::V2 => KeyOrder::AsGiven,
+        }
+    }
 }
 
 /// How much of a strange checkpoint is put up with.

@@ -3,7 +3,7 @@
 
 use std::fmt::{self, Write as _};
 
-use crate::json::{KeyOrder, Node, write};
+use crate::json::{Node, write};
 use crate::merge::{Line, Merged};
 use crate::names::{metrics, sensor_name};
 use crate::number::Number;
@@ -64,12 +64,7 @@ fn results(format: Format, global: Option<&Global>) -> Result<String, Refusal> {
         ("show_to_participant", Node::Bool(true)),
         ("accuracies", Node::Object(accuracies)),
     ]);
-    let order = if format == Format::V1 {
-        KeyOrder::Sorted
-    } else {
-        KeyOrder::AsGiven
-    };
-    write(&Node::List(vec![split]), order).map_err(|limit| Refusal::Output { limit })
+    write(&Node::List(vec![split]), format.key_order()).map_err(|limit| Refusal::Output { limit })
 }
 
 fn stdout(format: Format, merged: &Merged) -> Result<String, Refusal> {

@@ -5,7 +5,7 @@ mod plausible;
 mod record;
 mod verify;
 
-pub(crate) use record::Record;
+pub(crate) use record::{Meta, Record, Scores};
 
 use crate::json::{self, Limit, ReadError, Text, Value};
 use crate::names::{CRASHED, FINISHED, INVALID};

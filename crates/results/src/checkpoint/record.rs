@@ -9,7 +9,7 @@ use crate::{Format, RecordName, RecordProblem};
 /// No evaluator has ids or repetitions beyond this.
 const MAX_ID: i64 = 1_000_000_000;
 
-/// The three scores of a record.
+/// The three scores of a record, or their means or deviations over several.
 #[derive(Clone, Copy, Debug)]
 pub(crate) struct Scores {
     pub(crate) route: Number,
@@ -18,6 +18,14 @@ pub(crate) struct Scores {
 }
 
 impl Scores {
+    pub(crate) fn each(of: impl Fn(Score) -> Number) -> Self {
+        Self {
+            route: of(Score::Route),
+            penalty: of(Score::Penalty),
+            composed: of(Score::Composed),
+        }
+    }
+
     pub(crate) fn get(&self, score: Score) -> Number {
         match score {
             Score::Route => self.route,
@@ -27,12 +35,20 @@ impl Scores {
     }
 }
 
-/// Length in meters, durations in seconds; -1 where nothing was measured.
+/// Length in meters, durations in seconds, of a record or of several; -1 where nothing was measured.
 #[derive(Clone, Copy, Debug)]
 pub(crate) struct Meta {
     pub(crate) length: Number,
     pub(crate) game: Number,
     pub(crate) system: Number,
+}
+
+impl Meta {
+    pub(crate) const ZERO: Self = Self {
+        length: Number::ZERO,
+        game: Number::ZERO,
+        system: Number::ZERO,
+    };
 }
 
 /// A route record.
@@ -190,11 +206,7 @@ fn off_road(infractions: &Object) -> Result<f64, RecordProblem> {
 
 fn scores(object: &Object) -> Result<Scores, RecordProblem> {
     let Some(value) = object.get("scores") else {
-        return Ok(Scores {
-            route: Number::ZERO,
-            penalty: Number::ZERO,
-            composed: Number::ZERO,
-        });
+        return Ok(Scores::each(|_| Number::ZERO));
     };
     let all = value.as_object().ok_or(RecordProblem::Shape {
         key: "scores",
@@ -214,11 +226,7 @@ fn meta(format: Format, object: &Object) -> Result<Meta, RecordProblem> {
                 key: "meta",
                 wanted: "an object",
             }),
-            Format::V2 => Ok(Meta {
-                length: Number::ZERO,
-                game: Number::ZERO,
-                system: Number::ZERO,
-            }),
+            Format::V2 => Ok(Meta::ZERO),
         };
     };
     let all = value.as_object().ok_or(RecordProblem::Shape {

@@ -1,5 +1,6 @@
 //! The reader: bytes to a value, within limits that hold whatever the bytes are. One recursive descent, depth counted.
 
+use std::collections::BTreeMap;
 use std::sync::Arc;
 
 use super::limits::{FileLimits, Limit};
@@ -327,47 +328,21 @@ fn has_repeats(entries: &[(Text, Value)]) -> bool {
     false
 }
 
-/// A repeated key keeps its first place and gets its last value. By sorting, since the keys are a stranger's choice.
-fn without_repeats(mut entries: Vec<(Text, Value)>) -> Vec<(Text, Value)> {
+/// A repeated key keeps its first place and gets its last value. In a tree of keys, since these are a stranger's choice.
+fn without_repeats(entries: Vec<(Text, Value)>) -> Vec<(Text, Value)> {
     if entries.len() <= FEW_KEYS && !has_repeats(&entries) {
         return entries;
     }
-    let mut order: Vec<usize> = (0..entries.len()).collect();
-    order.sort_by(|&a, &b| {
-        entries
-            .get(a)
-            .map(|e| &e.0)
-            .cmp(&entries.get(b).map(|e| &e.0))
-            .then(a.cmp(&b))
-    });
-    let same = |a: usize, b: usize| entries.get(a).map(|e| &e.0) == entries.get(b).map(|e| &e.0);
-    let groups: Vec<Vec<usize>> = order
-        .chunk_by(|&a, &b| same(a, b))
-        .filter(|group| group.len() > 1)
-        .map(<[usize]>::to_vec)
-        .collect();
-    if groups.is_empty() {
-        return entries;
-    }
-    let mut drop = vec![false; entries.len()];
-    for group in groups {
-        if let [first, .., last] = group.as_slice() {
-            let value = entries
-                .get_mut(*last)
-                .map(|entry| std::mem::replace(&mut entry.1, Value::Null));
-            if let (Some(entry), Some(value)) = (entries.get_mut(*first), value) {
-                entry.1 = value;
-            }
-        }
-        for index in group.into_iter().skip(1) {
-            if let Some(flag) = drop.get_mut(index) {
-                *flag = true;
-            }
+    let mut places = BTreeMap::new();
+    let mut kept: Vec<(Text, Value)> = Vec::with_capacity(entries.len());
+    for (key, value) in entries {
+        let place = *places.entry(key.clone()).or_insert(kept.len());
+        match kept.get_mut(place) {
+            Some((_, first)) => *first = value,
+            None => kept.push((key, value)),
         }
     }
-    let mut dropped = drop.into_iter();
-    entries.retain(|_| !dropped.next().unwrap_or(false));
-    entries
+    kept
 }
 
 #[cfg(test)]

@@ -7,9 +7,10 @@ mod v2;
 pub(crate) use v1::global as v1;
 pub(crate) use v2::global as v2;
 
-use crate::json::Node;
+use crate::checkpoint::{Meta, Record, Scores};
+use crate::json::{Node, Value};
 use crate::names::{self, Metric, Score, Source};
-use crate::number::Number;
+use crate::number::{Number, count, square};
 use crate::{Format, RecordName, Refusal};
 
 /// The global record.
@@ -19,22 +20,12 @@ pub(crate) struct Global {
     pub(crate) status: String,
     /// In the order of [`names::infractions`].
     pub(crate) infractions: Vec<Number>,
-    pub(crate) means: PerScore<Number>,
+    pub(crate) means: Scores,
     /// `None`: a single route has no deviation.
-    pub(crate) deviations: Option<PerScore<Number>>,
-    pub(crate) totals: Totals,
+    pub(crate) deviations: Option<Scores>,
+    /// Plain sums over the routes.
+    pub(crate) totals: Meta,
     pub(crate) exceptions: Vec<Exception>,
-}
-
-/// One value for each score, in the order of [`Score::ALL`].
-pub(crate) type PerScore<T> = [T; 3];
-
-/// Plain sums over the routes: meters and seconds.
-#[derive(Clone, Copy, Debug)]
-pub(crate) struct Totals {
-    pub(crate) length: Number,
-    pub(crate) game: Number,
-    pub(crate) system: Number,
 }
 
 /// A route that did not go well.
@@ -42,23 +33,15 @@ pub(crate) struct Totals {
 pub(crate) struct Exception {
     pub(crate) route_id: String,
     /// The index in the merged file, or what the worker's file has.
-    pub(crate) index: Option<crate::json::Value>,
+    pub(crate) index: Value,
     pub(crate) status: String,
 }
 
 impl Global {
-    pub(crate) fn mean(&self, score: Score) -> Number {
-        let place = Score::ALL.iter().position(|s| *s == score);
-        place
-            .and_then(|place| self.means.get(place))
-            .copied()
-            .unwrap_or(Number::ZERO)
-    }
-
     /// The value EvalAI gets for a metric.
     pub(crate) fn metric(&self, metric: &Metric) -> Number {
         match metric.source {
-            Source::Score(score) => self.mean(score),
+            Source::Score(score) => self.means.get(score),
             Source::Infraction(key) => {
                 let place = names::infractions(self.format).iter().position(|k| *k == key);
                 place
@@ -106,7 +89,7 @@ impl Global {
                 } else {
                     "scores_mean"
                 },
-                scores(&self.means),
+                scores(self.means),
             ),
             ("scores_std_dev", self.deviations_node()),
             ("meta", Node::Object(meta)),
@@ -114,7 +97,7 @@ impl Global {
     }
 
     fn deviations_node(&self) -> Node<'_> {
-        match (&self.deviations, self.format) {
+        match (self.deviations, self.format) {
             (Some(deviations), _) => scores(deviations),
             (None, Format::V1) => per_score(|_| Node::Str("NaN")),
             (None, Format::V2) => per_score(|_| Node::Number(Number::ZERO)),
@@ -123,24 +106,25 @@ impl Global {
 }
 
 impl Exception {
+    fn of(record: &Record, index: Value) -> Self {
+        Self {
+            route_id: record.route_id.clone(),
+            index,
+            status: record.status.clone(),
+        }
+    }
+
     fn node(&self) -> Node<'_> {
-        let index = self
-            .index
-            .as_ref()
-            .map_or(Node::Value(&crate::json::Value::Null), Node::Value);
-        Node::List(vec![Node::Str(&self.route_id), index, Node::Str(&self.status)])
+        Node::List(vec![
+            Node::Str(&self.route_id),
+            Node::Value(&self.index),
+            Node::Str(&self.status),
+        ])
     }
 }
 
-fn scores(numbers: &PerScore<Number>) -> Node<'static> {
-    let [composed, route, penalty] = *numbers;
-    per_score(|score| {
-        Node::Number(match score {
-            Score::Composed => composed,
-            Score::Route => route,
-            Score::Penalty => penalty,
-        })
-    })
+fn scores(numbers: Scores) -> Node<'static> {
+    per_score(|score| Node::Number(numbers.get(score)))
 }
 
 fn per_score<'a>(node: impl Fn(Score) -> Node<'a>) -> Node<'a> {
@@ -148,27 +132,32 @@ fn per_score<'a>(node: impl Fn(Score) -> Node<'a>) -> Node<'a> {
 }
 
 /// Plain sums, in the order the records come.
-fn totals(records: &[&crate::checkpoint::Record]) -> Totals {
-    let zero = Totals {
-        length: Number::ZERO,
-        game: Number::ZERO,
-        system: Number::ZERO,
-    };
-    records.iter().fold(zero, |sum, record| Totals {
+fn totals(records: &[&Record]) -> Meta {
+    records.iter().fold(Meta::ZERO, |sum, record| Meta {
         length: sum.length.plus(record.meta.length),
         game: sum.game.plus(record.meta.game),
         system: sum.system.plus(record.meta.system),
     })
 }
 
-/// The standard deviation of a sample around `mean`.
-fn deviation(records: &[&crate::checkpoint::Record], score: Score, mean: f64) -> Result<f64, Refusal> {
-    let mut sum = 0.0;
-    for record in records {
-        let difference = record.scores.get(score).as_f64() - mean;
-        sum += crate::number::square(difference).ok_or_else(|| refused(&record.name, "its scores are too large"))?;
+/// The standard deviations of a sample around `means`, each as `shown`. A single route has none.
+fn deviations(records: &[&Record], means: Scores, shown: fn(f64) -> f64) -> Result<Option<Scores>, Refusal> {
+    if records.len() == 1 {
+        return Ok(None);
     }
-    Ok((sum / (crate::number::count(records.len()) - 1.0)).sqrt())
+    let deviation = |score: Score| -> Result<Number, Refusal> {
+        let (mean, mut sum) = (means.get(score).as_f64(), 0.0);
+        for record in records {
+            let difference = record.scores.get(score).as_f64() - mean;
+            sum += square(difference).ok_or_else(|| refused(&record.name, "its scores are too large"))?;
+        }
+        Ok(Number::Float(shown((sum / (count(records.len()) - 1.0)).sqrt())))
+    };
+    Ok(Some(Scores {
+        composed: deviation(Score::Composed)?,
+        route: deviation(Score::Route)?,
+        penalty: deviation(Score::Penalty)?,
+    }))
 }
 
 fn refused(record: &RecordName, problem: &'static str) -> Refusal {

@@ -1,9 +1,9 @@
 //! The global record of Leaderboard 1.0: unrounded, and computed over the records in the order of the workers' files.
 
-use super::{Exception, Global, PerScore, deviation, refused, totals};
-use crate::checkpoint::Record;
+use super::{Exception, Global, deviations, refused, totals};
+use crate::checkpoint::{Record, Scores};
 use crate::json::Value;
-use crate::names::{self, Score};
+use crate::names;
 use crate::number::{Number, count};
 use crate::{Format, Refusal};
 
@@ -13,17 +13,11 @@ use crate::{Format, Refusal};
 /// status text; `as_original` does so too.
 pub(crate) fn global(unsorted: &[&Record], merged: &[&Record], as_original: bool) -> Result<Global, Refusal> {
     let total = count(unsorted.len());
-    let means: PerScore<f64> = Score::ALL.map(|score| {
-        let sum = unsorted
-            .iter()
-            .fold(Number::ZERO, |sum, record| sum.plus(record.scores.get(score)));
-        sum.as_f64() / total
+    let means = Scores::each(|score| {
+        let scores = unsorted.iter().map(|record| record.scores.get(score));
+        Number::Float(scores.fold(Number::ZERO, Number::plus).as_f64() / total)
     });
-    let deviations = if unsorted.len() == 1 {
-        None
-    } else {
-        Some(deviations(unsorted, means)?)
-    };
+    let deviations = deviations(unsorted, means, std::convert::identity)?;
     let exceptions = if as_original {
         every_route(unsorted)
     } else {
@@ -38,19 +32,11 @@ pub(crate) fn global(unsorted: &[&Record], merged: &[&Record], as_original: bool
         format: Format::V1,
         status: status.to_owned(),
         infractions: infractions(unsorted)?,
-        means: means.map(Number::Float),
+        means,
         deviations,
         totals: totals(unsorted),
         exceptions,
     })
-}
-
-fn deviations(records: &[&Record], [composed, route, penalty]: PerScore<f64>) -> Result<PerScore<Number>, Refusal> {
-    Ok([
-        Number::Float(deviation(records, Score::Composed, composed)?),
-        Number::Float(deviation(records, Score::Route, route)?),
-        Number::Float(deviation(records, Score::Penalty, penalty)?),
-    ])
 }
 
 /// The sum of the rates per kilometer of each route, not the rate over all routes. A route that never moved is left out:
@@ -73,22 +59,13 @@ fn infractions(records: &[&Record]) -> Result<Vec<Number>, Refusal> {
 }
 
 fn every_route(records: &[&Record]) -> Vec<Exception> {
-    let exception = |record: &&Record| Exception {
-        route_id: record.route_id.clone(),
-        index: record.object.get("index").cloned(),
-        status: record.status.clone(),
-    };
-    records.iter().map(exception).collect()
+    let index = |record: &Record| record.object.get("index").cloned().unwrap_or(Value::Null);
+    let exceptions = records.iter().map(|record| Exception::of(record, index(record)));
+    exceptions.collect()
 }
 
 fn failed_routes(records: &[&Record]) -> Vec<Exception> {
     let numbered = (0..).map(Value::Int).zip(records);
-    numbered
-        .filter(|(_, record)| record.status != names::COMPLETED)
-        .map(|(index, record)| Exception {
-            route_id: record.route_id.clone(),
-            index: Some(index),
-            status: record.status.clone(),
-        })
-        .collect()
+    let failed = numbered.filter(|(_, record)| record.status != names::COMPLETED);
+    failed.map(|(index, record)| Exception::of(record, index)).collect()
 }

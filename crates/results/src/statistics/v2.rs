@@ -1,7 +1,7 @@
 //! The global record of Leaderboard 2.0 and later: rounded, and computed over the records in the order of the merged file.
 
-use super::{Exception, Global, PerScore, deviation, totals};
-use crate::checkpoint::Record;
+use super::{Exception, Global, deviations, totals};
+use crate::checkpoint::{Record, Scores};
 use crate::json::Value;
 use crate::names::{self, OFF_ROAD, Score};
 use crate::number::{Number, count, round};
@@ -14,24 +14,14 @@ const LEAST_KILOMETERS: f64 = 0.001;
 
 /// `records`: in the order of the merged file.
 pub(crate) fn global(records: &[&Record]) -> Result<Global, Refusal> {
-    let means = Score::ALL.map(|score| mean(records, score));
-    let [composed, route, penalty] = means;
-    let deviations = if records.len() == 1 {
-        None
-    } else {
-        Some([
-            rounded_deviation(records, Score::Composed, composed)?,
-            rounded_deviation(records, Score::Route, route)?,
-            rounded_deviation(records, Score::Penalty, penalty)?,
-        ])
-    };
+    let means = Scores::each(|score| Number::Float(mean(records, score)));
     let (status, exceptions) = outcome(records);
     Ok(Global {
         format: Format::V2,
         status,
         infractions: infractions(records),
-        means: means.map(Number::Float) as PerScore<Number>,
-        deviations,
+        means,
+        deviations: deviations(records, means, |x| round(x, DIGITS))?,
         totals: totals(records),
         exceptions,
     })
@@ -46,10 +36,6 @@ fn mean(records: &[&Record], score: Score) -> f64 {
     round(sum, SCORE_DIGITS)
 }
 
-fn rounded_deviation(records: &[&Record], score: Score, mean: f64) -> Result<Number, Refusal> {
-    deviation(records, score, mean).map(|x| Number::Float(round(x, DIGITS)))
-}
-
 /// `Perfect`, `Completed` or `Failed`, whichever is worst; an unknown first text that is not `Perfect` stays as it is.
 fn outcome(records: &[&Record]) -> (String, Vec<Exception>) {
     let mut status = names::PERFECT;
@@ -57,11 +43,7 @@ fn outcome(records: &[&Record]) -> (String, Vec<Exception>) {
     for (index, record) in (0..).map(Value::Int).zip(records) {
         if record.status.contains(names::FAILED) {
             status = names::FAILED;
-            exceptions.push(Exception {
-                route_id: record.route_id.clone(),
-                index: Some(index),
-                status: record.status.clone(),
-            });
+            exceptions.push(Exception::of(record, index));
         } else if status == names::PERFECT {
             status = &record.status;
         }
