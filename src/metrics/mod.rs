@@ -224,7 +224,8 @@ impl Metrics {
     pub fn meter(self: &Arc<Self>) -> Meter {
         let metrics = Arc::clone(self);
         Meter::new(move |call| {
-            let (service, op, outcome, took) = (call.service, call.op, call.outcome, call.took.as_secs_f64());
+            let (service, op, outcome) = (call.service, call.op, call.outcome);
+            let took = call.began.elapsed().as_secs_f64();
             if service == "evalai" {
                 metrics.work.evalai_requests.of([op, outcome]).inc();
                 metrics.work.evalai_duration.of([op]).observe(took);

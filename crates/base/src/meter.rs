@@ -5,16 +5,7 @@
 
 use std::fmt;
 use std::sync::Arc;
-use std::time::{Duration, Instant};
-
-/// A call that is over.
-#[derive(Clone, Copy, Debug)]
-pub struct Call {
-    pub service: &'static str,
-    pub op: &'static str,
-    pub outcome: &'static str,
-    pub took: Duration,
-}
+use std::time::Instant;
 
 type Count = Arc<dyn Fn(&Call) + Send + Sync>;
 
@@ -23,14 +14,14 @@ type Count = Arc<dyn Fn(&Call) + Send + Sync>;
 pub struct Meter(Option<Count>);
 
 impl Meter {
-    /// Hands every call to `count`.
+    /// Hands every call to `count` once it is over.
     pub fn new(count: impl Fn(&Call) + Send + Sync + 'static) -> Self {
         Self(Some(Arc::new(count)))
     }
 
     /// A call begins. One that is dropped without an end, by a limit of time or a stop, was abandoned.
-    pub fn begin(&self, service: &'static str, op: &'static str) -> Running {
-        Running {
+    pub fn begin(&self, service: &'static str, op: &'static str) -> Call {
+        Call {
             meter: self.clone(),
             service,
             op,
@@ -48,29 +39,25 @@ impl fmt::Debug for Meter {
 
 /// A call under way.
 #[must_use]
-pub struct Running {
+pub struct Call {
     meter: Meter,
-    service: &'static str,
-    op: &'static str,
-    outcome: &'static str,
-    began: Instant,
+    pub service: &'static str,
+    pub op: &'static str,
+    pub outcome: &'static str,
+    pub began: Instant,
 }
 
-impl Running {
+impl Call {
     /// It is over.
     pub fn end(mut self, outcome: &'static str) {
         self.outcome = outcome;
     }
 }
 
-impl Drop for Running {
+impl Drop for Call {
     fn drop(&mut self) {
-        let Some(count) = &self.meter.0 else { return };
-        count(&Call {
-            service: self.service,
-            op: self.op,
-            outcome: self.outcome,
-            took: self.began.elapsed(),
-        });
+        if let Some(count) = &self.meter.0 {
+            count(self);
+        }
     }
 }
