@@ -6,7 +6,7 @@ use std::time::Duration;
 use k8s_openapi::apimachinery::pkg::apis::meta::v1::Time;
 
 use super::end;
-use super::failure::{charged, for_both, participant};
+use super::failure::{charged, participant};
 use super::gates;
 use super::plan::{Action, Question};
 use super::status::PlanBuilder;
@@ -97,8 +97,8 @@ fn brought(draft: &PlanBuilder<'_>, leaderboard: &LeaderboardSpec) -> Result<Opt
     }
     if draft.spec().input.is_some() {
         let what = "This leaderboard takes container images, and the submission is a file.";
-        let next = for_both("Submit a container image.");
-        return Err(Untaken::never(None, participant(Reason::InputInvalid, what, &next)));
+        let found = participant(Reason::InputInvalid, what, "Submit a container image.");
+        return Err(Untaken::never(None, found));
     }
     let image = named_image(draft)?;
     match image_not_allowed(draft, leaderboard, &image) {
@@ -111,8 +111,7 @@ fn brought(draft: &PlanBuilder<'_>, leaderboard: &LeaderboardSpec) -> Result<Opt
 fn file_not_allowed(draft: &PlanBuilder<'_>, evaluation: &ContainerEvaluation) -> Option<Failure> {
     if draft.spec().image.is_some() {
         let what = "This leaderboard takes files, and the submission is a container image.";
-        let next = for_both("Submit a file.");
-        return Some(participant(Reason::InputInvalid, what, &next));
+        return Some(participant(Reason::InputInvalid, what, "Submit a file."));
     }
     let file = draft.spec().input.as_ref().filter(|_| !draft.status.has_run())?;
     let limit = evaluation.input_bounds().max_bytes.bytes();

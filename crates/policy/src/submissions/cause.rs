@@ -8,7 +8,7 @@
 
 use serde_json::Value;
 
-use super::failure::{self, charged, for_both, infrastructure, participant};
+use super::failure::{self, charged, infrastructure, participant};
 use super::limits;
 use super::status::PlanBuilder;
 use super::workers::agents_of;
@@ -198,8 +198,8 @@ pub(super) fn failure_of(found: &Trouble, pod: &PodView, seconds: i64) -> Failur
             "Set USER of the image to a number other than 0, and submit again.",
         ),
         Cause::ImageProgram => {
-            let next = for_both("Push the image again and check that it runs on linux/amd64.");
-            participant(Reason::CannotStart, &tried, &next)
+            let step = "Push the image again and check that it runs on linux/amd64.";
+            participant(Reason::CannotStart, &tried, step)
         }
         Cause::ImageMissing => of_image(
             Reason::ImageNotFound,
@@ -243,7 +243,7 @@ pub(super) fn node_of(pod: &PodView) -> String {
 fn of_image(reason: Reason, what: &str, for_participants: &str, step: &str) -> Failure {
     Failure {
         participant_message: Some(format!("{for_participants} {step}")),
-        ..participant(reason, what, &for_both(step))
+        ..participant(reason, what, step)
     }
 }
 

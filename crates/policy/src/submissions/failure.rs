@@ -11,23 +11,29 @@ use leaderboard_contract::keys::{REFUSED, result_path};
 use leaderboard_contract::report::{Outcome, RefusedResults};
 use leaderboard_evaluation::{Words, words};
 
-/// A failure that is the participant's: `what` happened, in one sentence, and what each reader does about it.
-pub(super) fn participant(reason: Reason, what: &str, next: &Steps) -> Failure {
-    let message = format!("{what} {}", next.hosts);
-    let for_participants = format!("{what} {}", next.participant);
+/// A failure that is the participant's: `what` happened, in one sentence, and what both readers can do about it.
+pub(super) fn participant(reason: Reason, what: &str, step: &str) -> Failure {
     Failure {
         class: FailureClass::Participant,
         reason: reason.into(),
-        participant_message: Some(for_participants).filter(|text| *text != message),
-        message,
-        next_step: Some(next.hosts.clone()),
+        message: format!("{what} {step}"),
+        next_step: Some(step.to_owned()),
+        participant_message: None,
         worker: None,
+    }
+}
+
+/// A participant's failure about which participants do something else than hosts.
+fn apart(reason: Reason, what: &str, of_hosts: &str, of_participants: &str) -> Failure {
+    Failure {
+        participant_message: Some(format!("{what} {of_participants}")),
+        ..participant(reason, what, of_hosts)
     }
 }
 
 /// A participant's failure with the next step of the table of reasons, which both readers can take.
 pub(super) fn charged(reason: Reason, what: &str) -> Failure {
-    participant(reason, what, &for_both(&of_participant(reason)))
+    participant(reason, what, &of_participant(reason))
 }
 
 /// A failure that is not: `what` happened, in one sentence for hosts. As long as another Job may follow there is no next step.
@@ -59,11 +65,9 @@ pub(super) fn at_the_end(found: Failure) -> Failure {
 
 /// The files that an agent has left cannot be taken. `what` says what the participant does, too.
 pub(super) fn input_refused(what: &str) -> Failure {
-    let next = Steps {
-        hosts: "Look at agent/agent1/leaderboard.log of the results.".to_owned(),
-        participant: "The challenge's hosts have the agent's log.".to_owned(),
-    };
-    participant(Reason::InputInvalid, what, &next)
+    let of_hosts = "Look at agent/agent1/leaderboard.log of the results.";
+    let of_participants = "The challenge's hosts have the agent's log.";
+    apart(Reason::InputInvalid, what, of_hosts, of_participants)
 }
 
 pub(super) fn job_deleted() -> Failure {
@@ -116,7 +120,7 @@ pub(super) fn invalid_results(refused: &RefusedResults, words: &Words) -> Failur
     let what = format!("The results cannot be used: {}", sentence(&refused.why));
     Failure {
         worker: refused.worker.map(clamp),
-        ..participant(Reason::InvalidResults, &what, &for_both(words.after_refused))
+        ..participant(Reason::InvalidResults, &what, words.after_refused)
     }
 }
 
@@ -140,8 +144,8 @@ pub(super) fn not_eligible(report: &ReportDigest, status: &SubmissionStatus) -> 
         return named_crash(report, status);
     }
     let what = format!("The run ended as {}, so its results do not count.", report.outcome);
-    let next = for_both(words(status.plan.as_ref()).after_rejected);
-    participant(Reason::NotEligible, &what, &next)
+    let step = words(status.plan.as_ref()).after_rejected;
+    participant(Reason::NotEligible, &what, step)
 }
 
 /// Results that name a crash of the simulation. The agent writes them, and knows its score by then, so a crash that no host's container had is
@@ -162,7 +166,7 @@ fn named_crash(report: &ReportDigest, status: &SubmissionStatus) -> Failure {
         );
         return Failure {
             worker: Some(id),
-            ..participant(Reason::InvalidResults, &what, &for_both(words.after_refused))
+            ..participant(Reason::InvalidResults, &what, words.after_refused)
         };
     }
     // One of an older operator's Pod names no pair.
@@ -206,8 +210,7 @@ pub(super) fn of_worker(worker: &WorkerStatus, cause: EndReason, status: &Submis
         let what = format!("The {} of {} {id} failed {times}: {what}.", words.host, words.worker);
         infrastructure(reason, &what)
     } else {
-        let (reason, what, next) = of_agent(id, &times, cause, words);
-        participant(reason, &what, &next)
+        of_agent(id, &times, cause, words)
     };
     Failure {
         worker: Some(id),
@@ -279,93 +282,64 @@ pub(super) fn of_host(cause: EndReason, agents: Agents) -> Option<(Reason, &'sta
 
 const NOT_STARTED: &str = "its container could not be started";
 
-fn of_agent(id: i32, times: &str, cause: EndReason, words: &Words) -> (Reason, String, Steps) {
+fn of_agent(id: i32, times: &str, cause: EndReason, words: &Words) -> Failure {
     let host = words.host;
     match cause {
-        EndReason::OutOfMemory => (
+        EndReason::OutOfMemory => apart(
             Reason::OutOfMemory,
-            format!("Agent {id} crashed {times}, the last time for lack of memory."),
-            smaller(),
+            &format!("Agent {id} crashed {times}, the last time for lack of memory."),
+            &of_participant(Reason::OutOfMemory),
+            "Reduce the memory it uses and submit again; ask the challenge's hosts for the limit.",
         ),
-        EndReason::Idle => (
-            Reason::Idle,
-            format!("Agent {id} ended too early {times}, the last time because it printed nothing for too long."),
-            in_the_log_of(id, words),
-        ),
-        EndReason::Incomplete => (
-            Reason::InvalidResults,
-            format!(
+        EndReason::Idle => {
+            let what =
+                format!("Agent {id} ended too early {times}, the last time because it printed nothing for too long.");
+            in_the_log_of(id, Reason::Idle, &what, words)
+        }
+        EndReason::Incomplete => {
+            let what = format!(
                 "Agent {id} ended by itself {times} without complete results: its checkpoint is missing, malformed or has \
                  no global record."
-            ),
-            in_the_log_of(id, words),
-        ),
-        EndReason::CannotStart | EndReason::StartError => (
+            );
+            in_the_log_of(id, Reason::InvalidResults, &what, words)
+        }
+        EndReason::CannotStart | EndReason::StartError => charged(
             Reason::CannotStart,
-            format!("Agent {id} could not be started: its command is missing in the image or not for this machine."),
-            for_both(&of_participant(Reason::CannotStart)),
+            &format!("Agent {id} could not be started: its command is missing in the image or not for this machine."),
         ),
-        EndReason::NoProcess => (
+        EndReason::NoProcess => participant(
             Reason::AgentCrashed,
-            format!(
+            &format!(
                 "{} {id} failed {times}: the agents left the Pod no process to start it again.",
                 capitalized(words.worker)
             ),
-            for_both("Let the agents start fewer processes and threads, and submit again."),
+            "Let the agents start fewer processes and threads, and submit again.",
         ),
-        EndReason::BlamesHost => (
+        EndReason::BlamesHost => participant(
             Reason::AgentCrashed,
-            format!("Agent {id} ended {times} and blamed its {host}, which had not failed."),
-            for_both("Leave the files of the evaluator's runner alone, and submit again."),
+            &format!("Agent {id} ended {times} and blamed its {host}, which had not failed."),
+            "Leave the files of the evaluator's runner alone, and submit again.",
         ),
-        EndReason::PortTaken => (
+        EndReason::PortTaken => participant(
             Reason::AgentCrashed,
-            format!("Another container of the Pod listened on the port of {host} {id}, which failed {times}."),
-            for_both(&format!(
+            &format!("Another container of the Pod listened on the port of {host} {id}, which failed {times}."),
+            &format!(
                 "Let the agents listen on no port of {} {host}, and submit again.",
                 article(host)
-            )),
+            ),
         ),
-        _ => (
-            Reason::AgentCrashed,
-            format!("Agent {id} crashed {times}."),
-            in_the_log_of(id, words),
-        ),
-    }
-}
-
-/// The next step after a participant failure, for each of its two readers.
-#[derive(Clone, Debug, PartialEq, Eq)]
-pub(super) struct Steps {
-    pub(super) hosts: String,
-    pub(super) participant: String,
-}
-
-/// Both can do the same.
-pub(super) fn for_both(step: &str) -> Steps {
-    Steps {
-        hosts: step.to_owned(),
-        participant: step.to_owned(),
+        _ => in_the_log_of(id, Reason::AgentCrashed, &format!("Agent {id} crashed {times}."), words),
     }
 }
 
 /// The log of an agent explains what happened. Only hosts can read it.
-fn in_the_log_of(agent: i32, words: &Words) -> Steps {
-    Steps {
-        hosts: of_participant(Reason::AgentCrashed).replace("<n>", &agent.to_string()),
-        participant: format!(
-            "Reproduce it on {} of your own, fix the agent and submit again; the challenge's hosts have its log.",
-            words.practice
-        ),
-    }
-}
-
-/// An agent needs more memory than there is.
-fn smaller() -> Steps {
-    Steps {
-        hosts: of_participant(Reason::OutOfMemory),
-        participant: "Reduce the memory it uses and submit again; ask the challenge's hosts for the limit.".to_owned(),
-    }
+fn in_the_log_of(agent: i32, reason: Reason, what: &str, words: &Words) -> Failure {
+    let of_hosts = of_participant(Reason::AgentCrashed).replace("<n>", &agent.to_string());
+    let of_participants = format!(
+        "Reproduce it on {} of your own, fix the agent and submit again; the challenge's hosts have its log.",
+        words.practice
+    );
+    apart(reason, what, &of_hosts, &of_participants)
 }
 
 /// The next step of the table of reasons.

@@ -1,7 +1,7 @@
 //! The last gate before a Job: the file that EvalAI has of a submission is in the bucket of its run.
 
 use super::super::end;
-use super::super::failure::{for_both, infrastructure, participant};
+use super::super::failure::{infrastructure, participant};
 use super::super::plan::{Action, Question};
 use super::super::run;
 use super::super::status::PlanBuilder;
@@ -66,7 +66,7 @@ fn question(draft: &PlanBuilder<'_>) -> Option<Input> {
 /// The submitted file has more bytes than `limit`.
 pub(in super::super) fn too_large(limit: u64) -> Failure {
     let what = format!("The submitted file has more than the {limit} bytes that this leaderboard takes.");
-    participant(Reason::InputInvalid, &what, &for_both("Submit a smaller file."))
+    participant(Reason::InputInvalid, &what, "Submit a smaller file.")
 }
 
 fn show_first_try(draft: &mut PlanBuilder<'_>) {

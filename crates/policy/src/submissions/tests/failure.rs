@@ -1,7 +1,6 @@
 //! Sentences: each failure has its own, with a next step that a retry leaves out.
 
 use super::builders::*;
-use crate::submissions::failure::for_both;
 use crate::submissions::failure::{at_the_end, infrastructure, invalid_results, participant};
 use leaderboard_api::text::sentence;
 use leaderboard_api::{Failure, FailureClass, Reason};
@@ -24,7 +23,7 @@ fn a_next_step_is_added_at_the_end() {
             "{reason}: {ended}"
         );
     }
-    let slow = participant(Reason::Idle, "Slow.", &for_both("Hurry."));
+    let slow = participant(Reason::Idle, "Slow.", "Hurry.");
     assert_eq!(at_the_end(slow).message, "Slow. Hurry.");
 }
 

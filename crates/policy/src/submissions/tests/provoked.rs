@@ -2,7 +2,6 @@
 
 use super::builders::*;
 use crate::submissions::end::may_go_on;
-use crate::submissions::failure::for_both;
 use crate::submissions::failure::{infrastructure, participant};
 use leaderboard_api::FailureClass::Infrastructure;
 use leaderboard_api::State::{Failed, Pending, Running};
@@ -53,7 +52,7 @@ fn the_first_is_tried_again_and_a_further_one_only_after_a_route() {
 #[test]
 fn only_what_an_agent_can_provoke_has_to_be_earned() {
     let of_hosts = |reason: Reason| infrastructure(reason, "It failed.");
-    let agents = participant(Reason::CannotStart, "It failed.", &for_both("Fix it."));
+    let agents = participant(Reason::CannotStart, "It failed.", "Fix it.");
     for (what, found, goes_on) in [
         (
             "results that are kept from S3",
