@@ -214,7 +214,8 @@ pub(super) fn measured(state: &LeaderboardState, leaderboard: &Leaderboard) -> O
         };
         state.note_found(&uid, found);
     }
-    state.found(&uid, generation)
+    let found = state.read(&uid, |entry| entry.found.clone())?;
+    (found.generation == generation).then_some(found.verdict)
 }
 
 /// Remembers what a Pod has found. That of the newest spec counts, and of its Pods that of the one that ended its `workspace` last.

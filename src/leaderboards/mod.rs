@@ -41,7 +41,7 @@ use leaderboard_policy::leaderboards::refusal::{self, Refusal};
 use leaderboard_policy::leaderboards::standings::Results;
 use leaderboard_policy::leaderboards::view::Policy;
 use probe::{Asks, Looked};
-use state::{LeaderboardState, Made, RESYNC, SOONEST};
+use state::{Entry, LeaderboardState, Made, RESYNC, SOONEST};
 
 /// Time that the first look at a spec gets before the status shows it as under way. Most take less, which saves a write.
 const FIRST_LOOK: Duration = Duration::from_secs(2);
@@ -158,7 +158,7 @@ fn observe(
     looked: &Looked,
     now: Timestamp,
 ) -> (LeaderboardView, Made) {
-    let (stores, hub) = (uses.policies.stores, &uses.external.hub);
+    let (Policies { stores, state, .. }, hub) = (uses.policies, &uses.external.hub);
     let key = key_of(leaderboard.as_ref());
     let submissions = stores.submissions_for(&ObjectRef::from_obj(leaderboard.as_ref()));
     let tried = looked.pods();
@@ -169,7 +169,8 @@ fn observe(
         generation: leaderboard.metadata.generation,
         cancelled: standing::cancelled(hub, &key, leaderboard),
     };
-    let is_new = uses.policies.state.is_news(&uid_of(leaderboard.as_ref()), &made);
+    let is_stored = |entry: &Entry| entry.standings.0.as_ref() == Some(&made);
+    let is_new = !state.read(&uid_of(leaderboard.as_ref()), is_stored);
     let view = LeaderboardView {
         now,
         leaderboard: Arc::clone(leaderboard),
@@ -185,7 +186,7 @@ fn observe(
         image_note: census.image_note(),
         pods: isolation::pods_left(stores, leaderboard),
         policy,
-        measured: isolation::measured(uses.policies.state, leaderboard),
+        measured: isolation::measured(state, leaderboard),
         refusal,
         is_looked_at: looked.waits().is_none(),
         invalid_pod: tried.refused,

@@ -109,11 +109,6 @@ impl LeaderboardState {
         });
     }
 
-    pub(super) fn found(&self, uid: &str, generation: i64) -> Option<WorkspaceVerdict> {
-        let found = self.read(uid, |entry| entry.found.clone())?;
-        (found.generation == generation).then_some(found.verdict)
-    }
-
     pub(super) fn note_found(&self, uid: &str, found: Found) {
         let order = |found: &Found| (found.generation, found.at);
         self.change(uid, |entry| {
@@ -121,11 +116,6 @@ impl LeaderboardState {
                 entry.found = Some(found);
             }
         });
-    }
-
-    /// True if standings from these sources may differ from the stored ones.
-    pub(super) fn is_news(&self, uid: &str, made: &Made) -> bool {
-        self.read(uid, |entry| entry.standings.0.as_ref() != Some(made))
     }
 
     /// Time until a changed status is written: new numbers alone wait, any other change is written at once.
