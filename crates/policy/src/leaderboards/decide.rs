@@ -149,14 +149,12 @@ fn ready(view: &LeaderboardView) -> Option<(Truth, Reason, String)> {
 
 /// The condition by the looks at its places and EvalAI.
 fn found(view: &LeaderboardView) -> (Truth, Reason, String) {
-    let unreachable = |truth| view.unreachable.as_ref().filter(|found| found.truth == truth);
-    let (evalai_truth, reason, message) = evalai(&view.evalai);
-    if let Some(found) = unreachable(Truth::False) {
-        return (Truth::False, found.reason, found.message.clone());
-    }
-    match unreachable(Truth::Unknown) {
-        Some(found) if evalai_truth != Truth::False => (Truth::Unknown, found.reason, found.message.clone()),
-        _ => (evalai_truth, reason, message),
+    let of_evalai = evalai(&view.evalai);
+    match &view.unreachable {
+        Some(found) if found.truth == Truth::False || of_evalai.0 != Truth::False => {
+            (found.truth, found.reason, found.message.clone())
+        }
+        _ => of_evalai,
     }
 }
 
@@ -171,12 +169,13 @@ fn with_notes(view: &LeaderboardView, ready: (Truth, Reason, String)) -> (Truth,
     let delay = view.evalai_writes_from.filter(|_| spec.evalai.is_some());
     let observes = spec.observes().then(|| OBSERVES.to_owned());
     let notes = [
+        Some(message),
         observes,
         delay.map(previous_controller),
         without_limit(&view.leaderboard),
+        view.image_note.clone(),
     ];
-    let texts = [Some(message)].into_iter().chain(notes).flatten();
-    let texts = texts.chain(view.image_note.clone());
+    let texts = notes.into_iter().flatten();
     let texts = texts.chain(standings::notes(&view.leaderboard, &view.named));
     let texts = texts.chain(view.pod_notes.iter().chain(&view.place_notes).cloned());
     let texts: Vec<String> = texts.filter(|text| !text.is_empty()).collect();

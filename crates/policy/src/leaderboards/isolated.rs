@@ -22,23 +22,21 @@ pub fn condition(
             let message = "The NetworkPolicy is in place. Whether it is enforced is not measured: network.enforcement is Disabled.";
             (Truth::Unknown, Reason::NotMeasured, message.into())
         }
-        Policy::InPlace => measured.map_or_else(
-            || {
+        Policy::InPlace => match measured {
+            None => {
                 let message = "The NetworkPolicy is in place. The next run measures whether it is enforced.";
                 (Truth::Unknown, Reason::NotMeasured, message.into())
-            },
-            |found| {
-                let (truth, reason) = shown(found.reason);
+            }
+            Some(found) => {
+                let (truth, reason) = match found.reason {
+                    WorkspaceReason::Enforced => (Truth::True, Reason::Enforced),
+                    WorkspaceReason::NotMeasured | WorkspaceReason::NotKnownIsolated => {
+                        (Truth::Unknown, Reason::NotMeasured)
+                    }
+                    _ => (Truth::False, Reason::NotEnforced),
+                };
                 (truth, reason, found.message.clone())
-            },
-        ),
-    }
-}
-
-fn shown(found: WorkspaceReason) -> (Truth, Reason) {
-    match found {
-        WorkspaceReason::Enforced => (Truth::True, Reason::Enforced),
-        WorkspaceReason::NotMeasured | WorkspaceReason::NotKnownIsolated => (Truth::Unknown, Reason::NotMeasured),
-        _ => (Truth::False, Reason::NotEnforced),
+            }
+        },
     }
 }
