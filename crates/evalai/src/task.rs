@@ -2,7 +2,6 @@
 //!
 //! Started by `hub`, one for each server, namespace and token. Holds the queue's lock only for moments, never while it waits.
 
-use std::collections::HashMap;
 use std::sync::{Arc, Mutex, MutexGuard};
 use std::time::Duration;
 
@@ -31,8 +30,6 @@ pub(super) struct Shared {
     pub notify: Notify,
     /// The queue's time counts from here.
     start: Instant,
-    /// Waiters for the answers to requests that the queue makes for others, by their number.
-    waiters: Mutex<HashMap<u64, oneshot::Sender<Reply>>>,
 }
 
 impl Shared {
@@ -43,18 +40,12 @@ impl Shared {
             options,
             notify: Notify::new(),
             start,
-            waiters: Mutex::default(),
         }
     }
 
     /// Makes a request for another. No answer comes if the task ends before.
     pub fn pass(&self, request: Request) -> oneshot::Receiver<Reply> {
-        let (waiter, answer) = oneshot::channel();
-        let mut waiters = lock(&self.waiters);
-        let number = self.queue().pass(request, self.now());
-        waiters.retain(|_, waiter| !waiter.is_closed());
-        waiters.insert(number, waiter);
-        drop(waiters);
+        let answer = self.queue().pass(request, self.now());
         self.notify.notify_one();
         answer
     }
@@ -71,9 +62,9 @@ impl Shared {
 
     /// Reports what has changed.
     pub fn publish(&self) {
-        let (changes, sweep, answers) = {
+        let (changes, sweep) = {
             let mut queue = self.queue();
-            (queue.take_changes(), queue.take_sweep(), queue.take_answers())
+            (queue.take_changes(), queue.take_sweep())
         };
         // A listener that is gone has no use for it.
         for change in changes {
@@ -81,11 +72,6 @@ impl Shared {
         }
         for row in sweep {
             let _ = self.options.sweep.send(row);
-        }
-        for (number, answer) in answers {
-            if let Some(waiter) = lock(&self.waiters).remove(&number) {
-                let _ = waiter.send(answer);
-            }
         }
     }
 }
@@ -150,7 +136,7 @@ pub(super) async fn run(task: Task) -> bool {
             take(&shared, &ticket, reply);
         }
     };
-    lock(&shared.waiters).clear();
+    shared.queue().pass_nothing();
     let all = tokio::time::timeout(DRAIN, answers).await.is_ok();
     all && shared.queue().settled_at(shared.now()).is_none()
 }

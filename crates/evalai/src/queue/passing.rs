@@ -6,6 +6,8 @@
 use std::collections::{BTreeMap, VecDeque};
 use std::time::Duration;
 
+use tokio::sync::oneshot;
+
 use super::{Now, Queue, Ticket};
 use crate::answer::{About, Answer};
 use crate::budget::Budget;
@@ -25,7 +27,8 @@ pub(super) struct Passing {
     waiting: VecDeque<(u64, Duration, Request)>,
     /// Number of the last one.
     last: u64,
-    answers: Vec<(u64, Reply)>,
+    /// Whoever waits for an answer, by the number of the request.
+    waiters: BTreeMap<u64, oneshot::Sender<Reply>>,
     /// Queues that cannot be received from, since when, and EvalAI's answer.
     troubles: BTreeMap<String, (Duration, InboxTrouble)>,
 }
@@ -36,7 +39,7 @@ impl Passing {
             share: Budget::new(share_of(requests_per_minute), now),
             waiting: VecDeque::new(),
             last: 0,
-            answers: Vec::new(),
+            waiters: BTreeMap::new(),
             troubles: BTreeMap::new(),
         }
     }
@@ -82,17 +85,20 @@ fn share_of(requests_per_minute: u32) -> u32 {
 }
 
 impl Queue {
-    /// Makes a request for somebody who waits for [`Queue::take_answers`] to have this number.
-    pub fn pass(&mut self, request: Request, now: Now) -> u64 {
+    /// Makes a request for another. No answer comes if the queue ends before.
+    pub fn pass(&mut self, request: Request, now: Now) -> oneshot::Receiver<Reply> {
+        let (waiter, answer) = oneshot::channel();
         let passing = &mut self.passing;
         passing.last += 1;
         passing.waiting.push_back((passing.last, now.at, request));
-        passing.last
+        passing.waiters.retain(|_, waiter| !waiter.is_closed());
+        passing.waiters.insert(passing.last, waiter);
+        answer
     }
 
-    /// Answers to requests of others, each with its number.
-    pub fn take_answers(&mut self) -> Vec<(u64, Reply)> {
-        std::mem::take(&mut self.passing.answers)
+    /// Gives no other an answer any more.
+    pub fn pass_nothing(&mut self) {
+        self.passing.waiters.clear();
     }
 
     /// Takes the answer to a request of another in. Where it is about the token, the budget waits, and the same request is made again.
@@ -109,7 +115,10 @@ impl Queue {
         {
             self.wake_leaderboards(|target| target.inbox.as_ref() == Some(name));
         }
-        self.passing.answers.push((number, reply));
+        if let Some(waiter) = self.passing.waiters.remove(&number) {
+            // Whoever is gone has no use for it.
+            let _ = waiter.send(reply);
+        }
     }
 
     /// Why the queue of a Leaderboard is not read; none while it is, or has failed for a short time only.

@@ -1,6 +1,7 @@
 //! Requests about the challenge's queue in EvalAI, which others wait for: within their share, behind what is urgent.
 
 use serde_json::Value;
+use tokio::sync::oneshot::Receiver;
 
 use super::*;
 use crate::row::Received;
@@ -37,7 +38,7 @@ impl Bench {
         bench
     }
 
-    fn pass(&mut self) -> u64 {
+    fn pass(&mut self) -> Receiver<Reply> {
         let now = self.now();
         self.queue.pass(Request::Receive(QUEUE.into()), now)
     }
@@ -49,18 +50,17 @@ impl Bench {
 }
 
 #[test]
-fn each_answer_is_handed_back_with_the_number_of_its_request() {
+fn each_answer_is_handed_to_whoever_made_its_request() {
     let mut bench = Bench::reading();
-    let (first, second) = (bench.pass(), bench.pass());
+    let (mut first, mut second) = (bench.pass(), bench.pass());
     let ticket = bench.expect("message");
     bench.answer(&ticket, received());
     bench.wait(4.0);
     let ticket = bench.expect("message");
     bench.answer(&ticket, Reply::Message(Answer::Broken("EvalAI answered 500".into())));
-    let answers = bench.queue.take_answers();
-    let numbers: Vec<u64> = answers.iter().map(|(number, _)| *number).collect();
-    assert_eq!(numbers, [first, second]);
-    assert!(matches!(answers[1].1.answer(), Answer::Broken(_)), "{answers:?}");
+    let (first, second) = (first.try_recv().unwrap(), second.try_recv().unwrap());
+    assert_eq!(first.answer(), Answer::Done(()));
+    assert!(matches!(second.answer(), Answer::Broken(_)), "{second:?}");
     bench.wait(60.0);
     bench.expect_nothing();
 }
@@ -72,7 +72,7 @@ fn throttling_and_a_refused_token_cost_no_request() {
         Answer::Refused(refusal(About::Token, 401)),
     ] {
         let mut bench = Bench::reading();
-        let number = bench.pass();
+        let mut waits = bench.pass();
         let ticket = bench.expect("message");
         bench.answer(&ticket, Reply::Message(answer.clone()));
         bench.wait(29.0);
@@ -80,8 +80,8 @@ fn throttling_and_a_refused_token_cost_no_request() {
         bench.wait(32.0);
         let ticket = bench.expect("message");
         bench.answer(&ticket, received());
-        assert_eq!(bench.queue.take_answers().len(), 1, "{answer:?}");
-        assert_eq!((ticket.number, bench.trouble()), (Some(number), None));
+        let found = waits.try_recv().map(|reply| reply.answer());
+        assert_eq!((found, bench.trouble()), (Ok(Answer::Done(())), None), "{answer:?}");
     }
 }
 
@@ -121,7 +121,7 @@ fn a_refusal_is_shown_at_once_and_a_failure_after_five_minutes() {
 /// All that is sent in these minutes while a request of another follows each answer, as names.
 fn busy_minutes(bench: &mut Bench, minutes: u64) -> Vec<(Duration, String)> {
     let (end, mut sent) = (bench.at + Duration::from_mins(minutes), Vec::new());
-    bench.pass();
+    let mut waits = bench.pass();
     while bench.at < end {
         match bench.next_or_wait() {
             Ok((name, ticket)) => {
@@ -132,8 +132,8 @@ fn busy_minutes(bench: &mut Bench, minutes: u64) -> Vec<(Duration, String)> {
                     _ => Reply::Written(Answer::Done(())),
                 };
                 bench.answer(&ticket, reply);
-                for _ in bench.queue.take_answers() {
-                    bench.pass();
+                if waits.try_recv().is_ok() {
+                    waits = bench.pass();
                 }
                 sent.push((ticket.requested, name));
             }
