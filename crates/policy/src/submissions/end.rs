@@ -177,11 +177,12 @@ fn may_retry(draft: &PlanBuilder<'_>, found: &Failure) -> bool {
 }
 
 fn retry(draft: &mut PlanBuilder<'_>, found: &Failure) {
-    let failures = stop::other_failures(&draft.status);
     let (delay, next) = if stop::is_interruption(found) {
+        stop::note_interruption(draft);
         let next = "A new Job resumes from the results in S3; this costs neither an attempt nor a retry.";
         (0, next.to_owned())
     } else {
+        let failures = stop::other_failures(&draft.status);
         let delay = (Wait::RETRY.again << failures.clamp(0, 16)).min(Wait::RETRY.longest);
         (
             delay,
@@ -190,9 +191,6 @@ fn retry(draft: &mut PlanBuilder<'_>, found: &Failure) {
     };
     let at = after(draft.now(), delay);
     run::count_use(draft, draft.view.ended_at().unwrap_or(draft.now()));
-    if stop::is_interruption(found) {
-        stop::note_interruption(draft);
-    }
     note_provoked(draft, found);
     draft.status.retry += 1;
     draft.status.job_name = None;
