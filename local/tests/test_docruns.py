@@ -136,6 +136,11 @@ class Shell(unittest.TestCase):
             ("helm install a b --namespace c", "helm install a b --namespace c --dry-run=client"),
         ):
             self.assertEqual(docprograms.changed(line.split()), wanted.split())
+        for line, started in (
+            ("kubectl leaderboard why a", "kubectl-leaderboard why a"),
+            ("kubectl -n a leaderboard why", "kubectl -n a leaderboard why"),
+        ):
+            self.assertEqual(docprograms.as_started(line.split()), started.split())
         for line in ("kubectl-leaderboard why -n a", "helm -n a test b", "helm install a oci://b", "aws s3 ls"):
             self.assertIsNone(docprograms.changed(line.split()), line)
 
