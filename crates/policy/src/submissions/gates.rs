@@ -93,8 +93,8 @@ pub(super) fn waits_for_phase(draft: &mut PlanBuilder<'_>) -> bool {
     true
 }
 
-/// Why no Job may be made, if the policy is not in place; true if it could not be applied, so that waiting alone does not help. It is restored
-/// by the Leaderboard's reconcile, which wakes the submission.
+/// Why no Job may be made, if the policy is not in place. True if it could not be applied: waiting alone does not help then. It is restored by
+/// the Leaderboard's reconcile, which wakes the submission.
 fn missing_policy(draft: &PlanBuilder<'_>) -> Option<(String, bool)> {
     let leaderboard = draft.view.leaderboard.as_ref()?;
     let is_managed = leaderboard.spec.network.policy == PolicySource::Managed;
