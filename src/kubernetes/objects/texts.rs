@@ -11,20 +11,11 @@ const KEPT: usize = 256;
 const LONGEST_TEXT: usize = 1024;
 
 /// The texts of one cache, each once.
-#[derive(Debug)]
+#[derive(Debug, Default)]
 pub struct Texts {
     known: HashSet<Text>,
-    /// More than this, and those that no object has any more are dropped.
+    /// More than this and than `KEPT`, and those that no object has any more are dropped.
     limit: usize,
-}
-
-impl Default for Texts {
-    fn default() -> Self {
-        Self {
-            known: HashSet::new(),
-            limit: KEPT,
-        }
-    }
 }
 
 impl Texts {
@@ -34,9 +25,9 @@ impl Texts {
             *text = known.clone();
             return;
         }
-        if self.known.len() >= self.limit {
+        if self.known.len() >= self.limit.max(KEPT) {
             self.known.retain(Text::has_copies);
-            self.limit = KEPT.max(self.known.len().saturating_mul(2));
+            self.limit = self.known.len().saturating_mul(2);
         }
         self.known.insert(text.clone());
     }
