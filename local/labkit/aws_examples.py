@@ -1,6 +1,7 @@
 """Owns what only the lab's virtual environment can tell of examples/aws: it has YAML, AWS's models of its services, and boto3.
 
-Runs there as a program, and prints JSON: `yaml FILE…`, `operations SERVICE…`, or `deploy FOLDER`.
+Runs there as a program, and prints JSON: `yaml FILE…`, `operations SERVICE…`, or `deploy FOLDER`. AWS's packages are loaded where they are
+needed: that takes longer than to read YAML, which is most of what is asked.
 """
 
 import json
@@ -8,10 +9,7 @@ import sys
 from pathlib import Path
 from typing import Any
 
-import boto3
-import botocore.session
 import yaml
-from botocore import xform_name
 
 # Template by template, as docs/aws.md makes them; the stand-in has no network to connect to.
 STACKS = {
@@ -27,6 +25,9 @@ def documents(files: list[str]) -> dict[str, list[Any]]:
 
 def operations(services: list[str]) -> dict[str, list[str]]:
     """Each service's operations, named as the methods of a client."""
+    import botocore.session  # noqa: PLC0415
+    from botocore import xform_name  # noqa: PLC0415
+
     session = botocore.session.get_session()
     models = {service: session.get_service_model(service) for service in services}
     return {service: [xform_name(name) for name in model.operation_names] for service, model in models.items()}
@@ -34,6 +35,8 @@ def operations(services: list[str]) -> dict[str, list[str]]:
 
 def deploy(folder: str) -> dict[str, Any]:
     """Makes the stacks, and prints what is there then."""
+    import boto3  # noqa: PLC0415
+
     formation = boto3.client("cloudformation")
     for name, parameters in STACKS.items():
         given = [{"ParameterKey": key, "ParameterValue": value} for key, value in parameters.items()]
@@ -41,7 +44,7 @@ def deploy(folder: str) -> dict[str, Any]:
         formation.create_stack(StackName=name, TemplateBody=body, Parameters=given)
         formation.get_waiter("stack_create_complete").wait(StackName=name, WaiterConfig={"Delay": 1, "MaxAttempts": 30})
     return {
-        "queues": queues(),
+        "queues": queues(boto3.client("sqs")),
         "keys": boto3.client("dynamodb").describe_table(TableName="leaderboard-20")["Table"]["KeySchema"],
         "groups": boto3.client("logs").describe_log_groups()["logGroups"],
         "encryption": boto3.client("s3").get_bucket_encryption(Bucket="my-challenge-leaderboard-20")[
@@ -53,8 +56,7 @@ def deploy(folder: str) -> dict[str, Any]:
     }
 
 
-def queues() -> dict[str, dict[str, str]]:
-    sqs = boto3.client("sqs")
+def queues(sqs: Any) -> dict[str, dict[str, str]]:
     urls = sqs.list_queues().get("QueueUrls", [])
     attributes = {url: sqs.get_queue_attributes(QueueUrl=url, AttributeNames=["All"])["Attributes"] for url in urls}
     return {url.rpartition("/")[2]: found for url, found in attributes.items()}
