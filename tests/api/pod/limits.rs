@@ -1,7 +1,7 @@
 //! Limits of a run: every byte and every object that it stores or sends counts, over restarts too. An agent cannot hide a log or keep a
 //! report back.
 
-use leaderboard_contract::keys::known_logs;
+use leaderboard_contract::keys::{COLLECTED, known_logs};
 
 use super::shelf::Shelf;
 use super::*;
@@ -213,6 +213,31 @@ async fn a_file_that_never_arrives_keeps_no_report_back() {
     );
     logcopy.end().await;
     assert!(!shelf.order().iter().any(|key| LOST.contains(&key.as_str())));
+}
+
+#[tokio::test]
+async fn what_the_evaluators_read_arrives_however_long_it_takes_and_keeps_no_report_back() {
+    const LARGE: &str = "input/large";
+    const CUT: &str = "agent/agent1/large";
+    let (shelf, pod) = shelved().await;
+    for key in [LARGE, CUT] {
+        pod.put(key, &noise(20 * MIB, 1));
+        shelf.lose(key);
+    }
+    pod.put("input/small", b"x");
+    pod.put(COLLECTED, b"{}");
+    let logcopy = pod.logcopy();
+    // Both have had the time of a round's files then.
+    shelf.until(|shelf| shelf.aborted(CUT) == 1).await;
+    pod.checkpoint(1, 1);
+    pod.reported(|report| report.done == 1).await;
+    let is_stored = |shelf: &Shelf, key: &str| shelf.order().iter().any(|stored| stored == key);
+    shelf.until(|shelf| is_stored(shelf, "input/small")).await;
+    assert!(!is_stored(&shelf, LARGE));
+    shelf.find(LARGE);
+    shelf.until(|shelf| is_stored(shelf, LARGE)).await;
+    assert_eq!(shelf.aborted(LARGE), 0);
+    logcopy.end().await;
 }
 
 #[tokio::test]

@@ -1,4 +1,4 @@
-//! S3 in memory, as much of it as logcopy asks for: keeps the order of what is stored, and never answers for chosen keys.
+//! S3 in memory, as much of it as logcopy asks for: keeps the order of what is stored, and does not answer for chosen keys.
 
 use std::collections::{BTreeMap, BTreeSet};
 use std::sync::Arc;
@@ -23,7 +23,7 @@ struct State {
     order: Vec<String>,
     /// Keys whose uploads were given up.
     aborted: Vec<String>,
-    /// Keys for which no content ever arrives.
+    /// Keys for which no content arrives.
     lost: BTreeSet<String>,
     parts: usize,
 }
@@ -46,10 +46,17 @@ impl Shelf {
         (shelf, endpoint)
     }
 
-    /// Loses each later write to this key.
+    /// Keeps each later write to this key from arriving.
     pub(super) fn lose(&self, key: &str) {
         self.state.send_modify(|state| {
             state.lost.insert(key.to_owned());
+        });
+    }
+
+    /// Lets the writes to this key arrive.
+    pub(super) fn find(&self, key: &str) {
+        self.state.send_modify(|state| {
+            state.lost.remove(key);
         });
     }
 
@@ -87,8 +94,9 @@ impl Shelf {
             let value = head.headers.get(name)?.to_str().ok()?;
             Some(value.trim_matches('"').to_owned())
         };
-        if head.method == Method::PUT && self.state.borrow().lost.contains(&key) {
-            return std::future::pending().await;
+        if head.method == Method::PUT {
+            let mut changes = self.state.subscribe();
+            drop(changes.wait_for(|state| !state.lost.contains(&key)).await);
         }
         let body = to_bytes(body, usize::MAX).await.unwrap().to_vec();
         let if_none_match = header("if-none-match");

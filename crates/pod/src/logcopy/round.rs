@@ -313,6 +313,7 @@ impl Rounds {
     async fn give_up(&mut self) {
         tracing::warn!("another Pod owns this run's prefix; this one stores nothing more and stops");
         self.fenced = true;
+        self.uploader.give_up();
         let status = self.setting.places.status();
         create(StatusFile::Cancel, &status).await;
         // Frees the host's containers from waiting for a store that will not come.

@@ -9,6 +9,8 @@ use std::sync::atomic::{AtomicBool, Ordering};
 use std::time::{Duration, Instant};
 
 use futures::StreamExt;
+use tokio::sync::Semaphore;
+use tokio::task::JoinSet;
 
 use super::complaints::{Complaints, Why};
 use super::job::{Job, Outcome, put};
@@ -68,6 +70,8 @@ pub struct Uploader {
     complaints: Complaints,
     /// Files that were cut.
     slow: BTreeMap<String, Slow>,
+    /// What the evaluators read, on its way beside the rounds: it may take longer than one, and its end ends no round.
+    beside: JoinSet<(String, Outcome)>,
 }
 
 /// A file that was cut.
@@ -89,6 +93,7 @@ impl Uploader {
             epoch: Instant::now(),
             complaints: Complaints::default(),
             slow: BTreeMap::new(),
+            beside: JoinSet::new(),
         }
     }
 
@@ -127,14 +132,25 @@ impl Uploader {
         failed.map_or(Ok(sent), Err)
     }
 
+    /// Gives up what is on its way beside the rounds.
+    pub fn give_up(&mut self) {
+        self.beside = JoinSet::new();
+    }
+
     /// Stores what is due, the known logs first, as far as several at once allow. The first failure of S3 ends it; what was
     /// stored until then is remembered.
     pub async fn sync(&mut self, files: &[Wanted], window: Window) -> Result<Sent, ArchiveError> {
         let began = Instant::now();
         let mut sent = Sent::default();
         self.memory.sent.begin(today());
+        let arrived: Vec<_> = std::iter::from_fn(|| self.beside.try_join_next()).flatten().collect();
+        let mut has_changed = !arrived.is_empty();
+        let failed_beside = self.settle(arrived, None, &mut sent);
+        if window.is_last {
+            self.give_up();
+        }
         let (jobs, left_out) = self.due(files, window);
-        sent.left_out = left_out.len();
+        sent.left_out = sent.left_out.saturating_add(left_out.len());
         for (key, why) in &left_out {
             self.complaints.say(key, why);
         }
@@ -143,24 +159,8 @@ impl Uploader {
             self.complaints.say(key, &Why::Shortened(stamp.size));
         }
         let new = self.count_new(&jobs).await;
-        // After a failure, or the end of the window, no upload begins. Uploads under way end or are cut, so that each is remembered.
-        let broken = Arc::new(AtomicBool::new(false));
-        let work = jobs.into_iter().map(|job| {
-            let broken = Arc::clone(&broken);
-            async move {
-                let is_over = window.begin_until.is_some_and(|until| Instant::now() >= until);
-                if is_over || broken.load(Ordering::Relaxed) {
-                    return (job, Outcome::Late);
-                }
-                let outcome = job.store(window.cut_at).await;
-                if matches!(outcome, Outcome::Failed(_)) {
-                    broken.store(true, Ordering::Relaxed);
-                }
-                (job, outcome)
-            }
-        });
-        let outcomes: Vec<(Job, Outcome)> = futures::stream::iter(work).buffer_unordered(AT_ONCE).collect().await;
-        let has_changed = !outcomes.is_empty();
+        let outcomes = send(self.send_beside(jobs, window), window).await;
+        has_changed |= !outcomes.is_empty();
         let outcomes = outcomes.into_iter().map(|(job, outcome)| {
             let key = job.wanted.key;
             if !matches!(outcome, Outcome::Late) {
@@ -173,11 +173,27 @@ impl Uploader {
         });
         let outcomes = outcomes.collect();
         let time = window.cut_at.map(|cut_at| cut_at.saturating_duration_since(began));
-        let failed = self.settle(outcomes, time, &mut sent);
+        let failed = self.settle(outcomes, time, &mut sent).or(failed_beside);
         if has_changed {
             self.remember().await;
         }
         failed.map_or(Ok(sent), Err)
+    }
+
+    /// Begins to send what the evaluators read, unless no round follows. Returns the other files.
+    fn send_beside(&mut self, jobs: Vec<Job>, window: Window) -> Vec<Job> {
+        let is_beside = |job: &Job| !window.is_last && self.quota.kind(&job.wanted.key) == Kind::Input;
+        let (beside, others): (Vec<Job>, Vec<Job>) = jobs.into_iter().partition(is_beside);
+        let places = Arc::new(Semaphore::new(AT_ONCE));
+        for job in beside {
+            let places = Arc::clone(&places);
+            self.beside.spawn(async move {
+                let _place = places.acquire().await;
+                let outcome = job.store(None).await;
+                (job.wanted.key, outcome)
+            });
+        }
+        others
     }
 
     /// Counts the objects that are going to be made, before the first of them is: a logcopy that is killed meanwhile must not
@@ -258,6 +274,10 @@ impl Uploader {
         let (mut jobs, mut left_out, mut keys) = (Vec::new(), Vec::new(), BTreeSet::new());
         for file in files {
             let key = file.key.as_str();
+            // Each of them is begun again only when all have ended.
+            if !self.beside.is_empty() && self.quota.kind(key) == Kind::Input {
+                continue;
+            }
             // Two files under one key would overwrite each other in any order.
             if !keys.insert(key) {
                 left_out.push((key.to_owned(), Why::SameKey));
@@ -325,6 +345,26 @@ impl Uploader {
             tracing::warn!("what is stored can't be noted down, a restart will send it again: {error}");
         }
     }
+}
+
+/// Stores files. After a failure, or the end of the window, none begins. Those under way end or are cut, so that each is remembered.
+async fn send(jobs: Vec<Job>, window: Window) -> Vec<(Job, Outcome)> {
+    let broken = Arc::new(AtomicBool::new(false));
+    let work = jobs.into_iter().map(|job| {
+        let broken = Arc::clone(&broken);
+        async move {
+            let is_over = window.begin_until.is_some_and(|until| Instant::now() >= until);
+            if is_over || broken.load(Ordering::Relaxed) {
+                return (job, Outcome::Late);
+            }
+            let outcome = job.store(window.cut_at).await;
+            if matches!(outcome, Outcome::Failed(_)) {
+                broken.store(true, Ordering::Relaxed);
+            }
+            (job, outcome)
+        }
+    });
+    futures::stream::iter(work).buffer_unordered(AT_ONCE).collect().await
 }
 
 #[cfg(test)]
