@@ -8,11 +8,9 @@ use serde_json::{Map, Value};
 use serde_saphyr::{Location, Spanned};
 
 /// A value and its line, from 1.
-#[derive(Debug)]
-pub struct Node {
-    line: u64,
-    tree: Tree,
-}
+#[derive(Deserialize, Debug)]
+#[serde(transparent)]
+pub struct Node(Spanned<Tree>);
 
 #[derive(Debug)]
 enum Tree {
@@ -34,23 +32,26 @@ pub fn parse(text: &str) -> Result<Vec<Node>, (u64, String)> {
 impl Node {
     /// The items of a `List`, as kubectl takes them; else the object itself.
     fn unlisted(self) -> Vec<Self> {
-        let is_list = self.value()["kind"] == "List";
-        let (line, tree) = (self.line, self.tree);
-        match tree {
-            Tree::Map(fields) if is_list => {
-                let items = fields.into_iter().find(|(key, ..)| key == "items");
-                match items.map(|(_, _, node)| node.tree) {
-                    Some(Tree::List(items)) => items,
-                    _ => Vec::new(),
-                }
-            }
-            tree => vec![Self { line, tree }],
+        if self.value()["kind"] != "List" {
+            return vec![self];
         }
+        let Tree::Map(fields) = self.0.value else {
+            return Vec::new();
+        };
+        let items = fields.into_iter().find(|(key, ..)| key == "items");
+        match items.map(|(_, _, node)| node.0.value) {
+            Some(Tree::List(items)) => items,
+            _ => Vec::new(),
+        }
+    }
+
+    fn line(&self) -> u64 {
+        self.0.referenced.line()
     }
 
     /// The value without its lines.
     pub fn value(&self) -> Value {
-        match &self.tree {
+        match &self.0.value {
             Tree::Scalar(value) => value.clone(),
             Tree::List(items) => items.iter().map(Self::value).collect(),
             Tree::Map(fields) => {
@@ -62,14 +63,14 @@ impl Node {
 
     /// The line of what a path such as `spec.tracks[0].name` names, or of the nearest that is there.
     pub fn line_of(&self, path: &str) -> u64 {
-        let (mut node, mut line) = (self, self.line);
+        let (mut node, mut line) = (self, self.line());
         for step in path.split(['.', '[', ']']).filter(|step| !step.is_empty()) {
-            let found = match &node.tree {
+            let found = match &node.0.value {
                 Tree::Map(fields) => fields.iter().find(|(key, ..)| key == step),
                 Tree::List(items) => {
                     let item = step.parse().ok().and_then(|index: usize| items.get(index));
                     let Some(item) = item else { break };
-                    (node, line) = (item, item.line);
+                    (node, line) = (item, item.line());
                     continue;
                 }
                 Tree::Scalar(_) => None,
@@ -78,16 +79,6 @@ impl Node {
             (node, line) = (inner, *at);
         }
         line
-    }
-}
-
-impl<'de> Deserialize<'de> for Node {
-    fn deserialize<D: Deserializer<'de>>(deserializer: D) -> Result<Self, D::Error> {
-        let Spanned { value, referenced, .. } = Spanned::<Tree>::deserialize(deserializer)?;
-        Ok(Self {
-            line: referenced.line(),
-            tree: value,
-        })
     }
 }
 
@@ -107,10 +98,6 @@ impl<'de> Visitor<'de> for Values {
     }
 
     fn visit_unit<E>(self) -> Result<Tree, E> {
-        Ok(Tree::Scalar(Value::Null))
-    }
-
-    fn visit_none<E>(self) -> Result<Tree, E> {
         Ok(Tree::Scalar(Value::Null))
     }
 

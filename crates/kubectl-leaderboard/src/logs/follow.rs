@@ -4,8 +4,8 @@ use std::collections::BTreeSet;
 use std::pin::pin;
 use std::process::ExitCode;
 
+use futures::StreamExt;
 use futures::stream::{BoxStream, SelectAll};
-use futures::{Stream, StreamExt};
 use k8s_openapi::api::core::v1::{ContainerStatus, Pod};
 use kube::ResourceExt;
 use leaderboard_api::Submission;
@@ -21,54 +21,23 @@ use crate::output::note;
 type Life = (String, String, i32);
 type Lines = BoxStream<'static, (Source, Result<String, Error>)>;
 
-/// The open logs, and the lives and lines that were shown.
-struct Following<'a> {
-    cluster: &'a Cluster,
-    wanted: &'a Logs,
-    submission: Submission,
-    begun: BTreeSet<Life>,
-    lines: SelectAll<Lines>,
-}
-
 /// Prints the lines as they come.
-pub(super) async fn follow(cluster: &Cluster, wanted: &Logs, submission: Submission) -> Result<ExitCode, Error> {
+pub(super) async fn follow(cluster: &Cluster, wanted: &Logs, mut submission: Submission) -> Result<ExitCode, Error> {
     if facts::status(&submission).job_name.is_none() {
         note(&begins_later(&submission));
     }
     let mut changes = pin!(changes(cluster, &wanted.name));
     let mut pods = pin!(uninterrupted(cluster.pod_changes(&wanted.name)));
-    let mut following = Following {
-        cluster,
-        wanted,
-        submission,
-        begun: BTreeSet::new(),
-        lines: SelectAll::new(),
-    };
-    while !following.is_over() {
-        following.step(&mut changes, &mut pods).await?;
-    }
-    note(&end(&following.submission));
-    Ok(ExitCode::SUCCESS)
-}
-
-impl Following<'_> {
-    /// True if the submission has ended and every open log is shown to its end.
-    fn is_over(&self) -> bool {
-        facts::has_ended(&self.submission) && self.lines.is_empty()
-    }
-
-    /// Takes whichever comes first: a line, a change of the submission, or one of a Pod.
-    async fn step(
-        &mut self,
-        changes: &mut (impl Stream<Item = Result<Submission, Error>> + Unpin),
-        pods: &mut (impl Stream<Item = Result<Pod, Error>> + Unpin),
-    ) -> Result<(), Error> {
+    let mut begun: BTreeSet<Life> = BTreeSet::new();
+    let mut lines: SelectAll<Lines> = SelectAll::new();
+    // Every open log is shown to its end.
+    while !facts::has_ended(&submission) || !lines.is_empty() {
         tokio::select! {
             // A log that never pauses hides no change.
             biased;
-            changed = next(changes) => self.submission = changed?,
-            pod = next(pods) => self.begin(&pod?),
-            line = self.lines.next(), if !self.lines.is_empty() => match line {
+            changed = next(&mut changes) => submission = changed?,
+            pod = next(&mut pods) => lines.extend(begin(cluster, wanted, &submission, &pod?, &mut begun)),
+            line = lines.next(), if !lines.is_empty() => match line {
                 // The last log has ended.
                 None => {}
                 Some((source, Ok(line))) => source.print(&line),
@@ -76,33 +45,39 @@ impl Following<'_> {
                 Some((source, Err(error))) => note(&format!("the log of {} was interrupted: {error}", source.container)),
             },
         }
-        Ok(())
     }
+    note(&end(&submission));
+    Ok(ExitCode::SUCCESS)
+}
 
-    /// Begins the logs of containers that have one and were not begun.
-    fn begin(&mut self, pod: &Pod) {
-        let mut new = Vec::new();
-        let (of, only) = (self.wanted.whose(&self.submission), self.wanted.worker);
-        for source in of.sources(workers(&self.submission, of).max(only.unwrap_or(0)), only) {
-            let Some(restarts) = life(pod, &source.container) else {
-                continue;
-            };
-            let life = (pod.uid().unwrap_or_default(), source.container.clone(), restarts);
-            if self.begun.contains(&life) {
-                continue;
-            }
-            self.begun.insert(life);
-            if restarts > 0 {
-                note(&begins_again(&source.container, restarts));
-            }
-            let lines = self.cluster.followed_log(&pod.name_any(), &source.container);
-            new.push(lines.map(move |line| (source.clone(), line)).boxed());
+/// The logs of a Pod's containers that have one and were not begun.
+fn begin(
+    cluster: &Cluster,
+    wanted: &Logs,
+    submission: &Submission,
+    pod: &Pod,
+    begun: &mut BTreeSet<Life>,
+) -> Vec<Lines> {
+    let mut new: Vec<Lines> = Vec::new();
+    let (of, only) = (wanted.whose(submission), wanted.worker);
+    for source in of.sources(workers(submission, of).max(only.unwrap_or(0)), only) {
+        let Some(restarts) = life(pod, &source.container) else {
+            continue;
+        };
+        let life = (pod.uid().unwrap_or_default(), source.container.clone(), restarts);
+        if !begun.insert(life) {
+            continue;
         }
-        if of.is_in_turn() {
-            self.lines.push(futures::stream::iter(new).flatten().boxed());
-        } else {
-            self.lines.extend(new);
+        if restarts > 0 {
+            note(&begins_again(&source.container, restarts));
         }
+        let lines = cluster.followed_log(&pod.name_any(), &source.container);
+        new.push(lines.map(move |line| (source.clone(), line)).boxed());
+    }
+    if of.is_in_turn() {
+        vec![futures::stream::iter(new).flatten().boxed()]
+    } else {
+        new
     }
 }
 
