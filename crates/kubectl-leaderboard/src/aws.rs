@@ -25,22 +25,24 @@ pub enum Unread {
     Failed(String),
 }
 
-/// The flags that name the place of a bucket.
-pub fn place(storage: Option<&S3Bucket>) -> Vec<String> {
+/// The flags that name the place of a bucket, with their values.
+pub fn place(storage: Option<&S3Bucket>) -> impl Iterator<Item = (&'static str, &String)> {
     let places = [
         ("--region", storage.and_then(|storage| storage.region.as_ref())),
         ("--endpoint-url", storage.and_then(|storage| storage.endpoint.as_ref())),
     ];
-    let flags = places
-        .into_iter()
-        .filter_map(|(flag, value)| Some(format!("{flag}={}", value?)));
-    flags.collect()
+    places.into_iter().filter_map(|(flag, value)| Some((flag, value?)))
+}
+
+/// The same as arguments of the program. No value is taken for a flag.
+pub fn flags(storage: Option<&S3Bucket>) -> impl Iterator<Item = String> {
+    place(storage).map(|(flag, value)| format!("{flag}={value}"))
 }
 
 /// Arguments of `aws` for the copy of one object, with only errors printed.
 pub fn copy(from: &str, to: &str, storage: Option<&S3Bucket>) -> Vec<String> {
     let mut arguments = ["s3", "cp", "--only-show-errors"].map(str::to_owned).to_vec();
-    arguments.extend(place(storage));
+    arguments.extend(flags(storage));
     arguments.extend([from.to_owned(), to.to_owned()]);
     arguments
 }

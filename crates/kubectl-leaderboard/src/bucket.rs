@@ -4,6 +4,8 @@ use std::path::Path;
 
 use leaderboard_api::S3Bucket;
 
+use crate::aws;
+
 /// Prints one object.
 pub fn print(object: &str, storage: Option<&S3Bucket>) -> String {
     format!("aws s3 cp {} -{}", word(object), flags(storage))
@@ -33,10 +35,8 @@ fn word(text: &str) -> String {
 
 /// Where a bucket is, as flags of `aws`.
 fn flags(storage: Option<&S3Bucket>) -> String {
-    let flag = |name: &str, value: Option<&String>| value.map(|v| format!(" {name} {}", word(v))).unwrap_or_default();
-    let region = flag("--region", storage.and_then(|s| s.region.as_ref()));
-    let endpoint = flag("--endpoint-url", storage.and_then(|s| s.endpoint.as_ref()));
-    format!("{region}{endpoint}")
+    let flags = aws::place(storage).map(|(flag, value)| format!(" {flag} {}", word(value)));
+    flags.collect()
 }
 
 #[cfg(test)]

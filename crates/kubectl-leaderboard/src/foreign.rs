@@ -5,6 +5,8 @@
 
 use std::env;
 
+use leaderboard_api::S3Bucket;
+
 use crate::error::Error;
 
 /// The ends of the names of AWS's own endpoints.
@@ -17,20 +19,16 @@ const OF_AWS: [&str; 4] = [
 /// Variables by which a person names the endpoint that the own program asks.
 const OWN: [&str; 2] = ["AWS_ENDPOINT_URL", "AWS_ENDPOINT_URL_S3"];
 
-/// The endpoint, if it is neither AWS's nor one that the person's own variables name.
-fn endpoint(named: Option<&String>) -> Option<&str> {
-    let own: Vec<String> = OWN.into_iter().filter_map(|name| env::var(name).ok()).collect();
-    named.map(String::as_str).filter(|named| is_foreign(named, &own))
-}
-
 /// Goes on only if the person trusts an endpoint that is not AWS's, by the flag `--endpoint` or by an answer.
 pub fn confirm(
     name: &str,
-    named: Option<&String>,
+    storage: Option<&S3Bucket>,
     trusted: Option<&str>,
     ask: impl FnOnce(&str) -> Option<bool>,
 ) -> Result<(), Error> {
-    let Some(endpoint) = endpoint(named).filter(|endpoint| trusted != Some(*endpoint)) else {
+    let own: Vec<String> = OWN.into_iter().filter_map(|name| env::var(name).ok()).collect();
+    let named = storage.and_then(|storage| storage.endpoint.as_deref());
+    let Some(endpoint) = named.filter(|named| is_foreign(named, &own) && trusted != Some(*named)) else {
         return Ok(());
     };
     let what = format!(
@@ -71,8 +69,9 @@ mod tests {
 
     #[test]
     fn a_server_that_is_not_awss_gets_no_credentials_unless_a_person_trusts_it() {
-        let endpoint = "https://minio.example".to_owned();
-        let confirmed = |answer, trusted| confirm("mine", Some(&endpoint), trusted, |_| answer);
+        let storage = serde_json::json!({"bucket": "b", "endpoint": "https://minio.example"});
+        let storage: S3Bucket = serde_json::from_value(storage).unwrap();
+        let confirmed = |answer, trusted| confirm("mine", Some(&storage), trusted, |_| answer);
         assert!(confirmed(Some(true), None).is_ok() && confirmed(None, Some("https://minio.example")).is_ok());
         for (answer, expected) in [
             (Some(false), "nothing was sent to https://minio.example"),

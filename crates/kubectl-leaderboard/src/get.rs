@@ -50,8 +50,7 @@ pub async fn get(cluster: &Cluster, wanted: &Get) -> Result<ExitCode, Error> {
     if let Some(folder) = &wanted.download {
         is_free(folder).map_err(Error::Unfit)?;
     }
-    let named = storage.and_then(|storage| storage.endpoint.as_ref());
-    foreign::confirm(&wanted.name, named, wanted.endpoint.as_deref(), ask)?;
+    foreign::confirm(&wanted.name, storage, wanted.endpoint.as_deref(), ask)?;
     let stored = match list(results, storage).await {
         Ok(stored) => stored,
         Err(Unread::NoProgram) => {
@@ -122,7 +121,7 @@ async fn list(results: &str, storage: Option<&S3Bucket>) -> Result<Vec<Stored>, 
     ]
     .map(str::to_owned)
     .to_vec();
-    arguments.extend(aws::place(storage));
+    arguments.extend(aws::flags(storage));
     arguments.extend([format!("--bucket={bucket}"), format!("--prefix={prefix}")]);
     let mut text = String::new();
     aws::run(&arguments, |line| text.push_str(line)).await?;

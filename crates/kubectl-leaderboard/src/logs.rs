@@ -239,8 +239,7 @@ async fn from_bucket(submission: &Submission, wanted: &Logs, of: Whose, sources:
     let commands = in_bucket(submission, of, sources, frame()).map_err(Error::Unfit)?;
     let results = facts::status(submission).results_url.as_deref().unwrap_or_default();
     let storage = facts::storage(submission);
-    let named = storage.and_then(|storage| storage.endpoint.as_ref());
-    foreign::confirm(&submission.name_any(), named, wanted.endpoint.as_deref(), ask)?;
+    foreign::confirm(&submission.name_any(), storage, wanted.endpoint.as_deref(), ask)?;
     let mut is_read = true;
     for (source, key) in stored(sources) {
         let address = format!("{results}/{key}");

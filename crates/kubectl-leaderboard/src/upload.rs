@@ -40,7 +40,7 @@ pub async fn upload(
     object["spec"]["input"] = json!(measured(path, board)?);
     let storage = &board.spec.storage.s3;
     let of = format!("Leaderboard {}", wanted.leaderboard);
-    foreign::confirm(&of, storage.endpoint.as_ref(), wanted.endpoint.as_deref(), ask)?;
+    foreign::confirm(&of, Some(storage), wanted.endpoint.as_deref(), ask)?;
     // The name is part of the key. The API server chooses it, or refuses the object before anything is written.
     let tried = cluster.create(object, true).await?;
     (object["metadata"]["name"], object["metadata"]["generateName"]) = (json!(tried.name_any()), Value::Null);
