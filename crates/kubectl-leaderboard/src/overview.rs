@@ -76,7 +76,15 @@ pub fn lines(
     page.gap();
     let mut ordered: Vec<&Submission> = submissions.iter().collect();
     ordered.sort_by_cached_key(|one| (order(one, now), place.name_of(*one)));
-    let rows: Vec<Vec<String>> = ordered.into_iter().filter_map(|one| row(place, one, now)).collect();
+    let mut rows = Vec::new();
+    for one in ordered {
+        let trouble = trouble(one, now);
+        if !trouble.is_empty() {
+            let state = facts::status(one).known_state().map_or("(new)", State::as_str);
+            let since = facts::since(one).map(|at| age(at, now)).unwrap_or_default();
+            rows.push(vec![place.name_of(one), state.to_owned(), since, trouble]);
+        }
+    }
     if rows.is_empty() {
         let here = if place.is_all {
             "The cluster".to_owned()
@@ -100,10 +108,6 @@ pub fn lines(
 
 /// The submissions that have a line, as JSON; each as `why NAME -o json` has it.
 pub fn value(submissions: &[Submission], leaderboards: Option<&[Leaderboard]>, now: Timestamp) -> Value {
-    let place = Place {
-        namespace: "",
-        is_all: true,
-    };
     let board_of = |submission: &Submission| {
         let Some(all) = leaderboards else {
             return Observed::Forbidden;
@@ -113,7 +117,7 @@ pub fn value(submissions: &[Submission], leaderboards: Option<&[Leaderboard]>, n
         };
         all.iter().find(is_its).map_or(Observed::Missing, Observed::Found)
     };
-    let shown = submissions.iter().filter(|one| row(place, one, now).is_some());
+    let shown = submissions.iter().filter(|one| !trouble(one, now).is_empty());
     Value::Array(shown.map(|one| why::value(one, board_of(one))).collect())
 }
 
@@ -145,24 +149,15 @@ fn order(submission: &Submission, now: Timestamp) -> (u8, i64) {
     }
 }
 
-/// The line of a submission, unless it has no problem.
-fn row(place: Place<'_>, submission: &Submission, now: Timestamp) -> Option<Vec<String>> {
+/// What is wrong with a submission; empty if nothing is.
+fn trouble(submission: &Submission, now: Timestamp) -> String {
     let status = facts::status(submission);
-    let others = other_systems(status, now);
-    let doubt = is_false(status, conditions::PLAUSIBLE);
     let is_deleting = submission.metadata.deletion_timestamp.is_some();
-    let own = own_reason(submission, status);
-    if own.is_none() && others.is_none() && doubt.is_none() && !is_deleting {
-        return None;
-    }
     let deleting = if is_deleting { "Being deleted." } else { "" };
-    let doubt = doubt.map(|c| format!("{}.", c.reason)).unwrap_or_default();
-    Some(vec![
-        place.name_of(submission),
-        status.known_state().map_or("(new)", State::as_str).to_owned(),
-        facts::since(submission).map(|at| age(at, now)).unwrap_or_default(),
-        join(&[deleting, &others.unwrap_or_default(), &doubt, &own.unwrap_or_default()]),
-    ])
+    let others = other_systems(status, now).unwrap_or_default();
+    let doubt = is_false(status, conditions::PLAUSIBLE).map(|c| format!("{}.", c.reason));
+    let own = own_reason(submission, status).unwrap_or_default();
+    join(&[deleting, &others, &doubt.unwrap_or_default(), &own])
 }
 
 /// Why a submission is in its state; nothing if it is running, has finished, or was cancelled as requested.

@@ -67,13 +67,10 @@ pub async fn scores(cluster: &Cluster, wanted: &Scores) -> Result<ExitCode, Erro
         _ => cluster.leaderboards(&scope).await?.ok_or_else(no_leaderboards)?,
     };
     let submissions = cluster.submissions(&scope).await?;
-    let boards = boards(&leaderboards, &submissions, wanted.track.as_deref());
+    let track = wanted.track.as_deref();
+    let boards = boards(&leaderboards, &submissions, track);
     if boards.is_empty() {
-        return Err(Error::Unfit(nothing(
-            &leaderboards,
-            wanted.track.as_deref(),
-            &cluster.namespace,
-        )));
+        return Err(Error::Unfit(nothing(&leaderboards, track, &cluster.namespace)));
     }
     print(&printed(&boards, wanted.format, frame()));
     Ok(ExitCode::SUCCESS)
@@ -162,11 +159,7 @@ pub(super) fn text(boards: &[Board], frame: Frame) -> Vec<String> {
 
 /// The table of a track. Metrics that a narrow page has no room for are left out, the last ones first.
 fn of_board(board: &Board, frame: Frame) -> Vec<String> {
-    let metric = board
-        .ranking
-        .as_ref()
-        .map(|ranking| ranking.metric.as_str())
-        .unwrap_or_default();
+    let metric = board.ranking.as_ref().map_or("", |ranking| ranking.metric.as_str());
     let mut metrics = metric_names(&board.rows);
     loop {
         let (head, rows) = cells(&board.rows, metric, &metrics);

@@ -66,43 +66,33 @@ fn uses(submissions: &[Submission]) -> Vec<Use> {
 }
 
 /// The slots of a Leaderboard: `2/4`, or `2` where nothing limits them.
-fn slots(leaderboards: &[Leaderboard], namespace: &str, name: &str, running: usize) -> String {
-    let board = leaderboards
-        .iter()
-        .find(|board| board.name_any() == name && board.namespace().as_deref().unwrap_or_default() == namespace);
+fn slots(board: Option<&Leaderboard>, running: usize) -> String {
     let total = board.and_then(|board| board.spec.concurrency.total);
-    let paused = board.is_some_and(|board| board.spec.paused);
-    let paused = if paused { ", paused" } else { "" };
-    match total {
-        Some(total) => format!("{running}/{total}{paused}"),
-        None => format!("{running}{paused}"),
-    }
+    let total = total.map(|total| format!("/{total}")).unwrap_or_default();
+    let is_paused = board.is_some_and(|board| board.spec.paused);
+    let paused = if is_paused { ", paused" } else { "" };
+    format!("{running}{total}{paused}")
 }
 
 /// The table, and above it the slots of each Leaderboard.
 pub fn lines(submissions: &[Submission], leaderboards: &[Leaderboard], frame: Frame) -> Vec<String> {
     let uses = uses(submissions);
-    let mut boards: BTreeMap<(String, String), (usize, usize)> = BTreeMap::new();
+    let mut boards: BTreeMap<(String, String), (Option<&Leaderboard>, usize, usize)> = BTreeMap::new();
     for board in leaderboards {
-        boards.insert((board.namespace().unwrap_or_default(), board.name_any()), (0, 0));
+        let key = (board.namespace().unwrap_or_default(), board.name_any());
+        boards.insert(key, (Some(board), 0, 0));
     }
     for each in &uses {
-        let entry = boards
-            .entry((each.namespace.clone(), each.leaderboard.clone()))
-            .or_default();
-        (entry.0, entry.1) = (entry.0 + each.running, entry.1 + each.waiting);
+        let key = (each.namespace.clone(), each.leaderboard.clone());
+        let (_, running, waiting) = boards.entry(key).or_default();
+        *running += each.running;
+        *waiting += each.waiting;
     }
-    let rows: Vec<Vec<String>> = boards
-        .iter()
-        .map(|((namespace, name), (running, waiting))| {
-            vec![
-                namespace.clone(),
-                name.clone(),
-                slots(leaderboards, namespace, name, *running),
-                waiting.to_string(),
-            ]
-        })
-        .collect();
+    let row = |((namespace, name), (board, running, waiting)): (&(String, String), &(_, usize, usize))| {
+        let slots = slots(*board, *running);
+        vec![namespace.clone(), name.clone(), slots, waiting.to_string()]
+    };
+    let rows: Vec<Vec<String>> = boards.iter().map(row).collect();
     let mut lines = table(&["NAMESPACE", "LEADERBOARD", "SLOTS", "WAITING"], &rows, frame.width);
     lines.push(String::new());
     // Leaderboards of several namespaces may have one name.

@@ -162,29 +162,25 @@ impl Explanation<'_> {
     fn attempt(&mut self) {
         let status = self.status;
         let Some(attempt) = status.attempt else { return };
-        let mut text = attempt.to_string();
-        let first = text.clone();
+        let mut parts = vec![attempt.to_string()];
         if status.retry > 0 {
             let of = self.leaderboard.leaderboard();
             let of = of.map(|l| format!(" of {}", l.spec.retries.infrastructure));
-            text = format!(
-                "{text}; {}{} retries after infrastructure failures",
-                status.retry,
-                of.unwrap_or_default()
-            );
+            let of = of.unwrap_or_default();
+            parts.push(format!("{}{of} retries after infrastructure failures", status.retry));
         }
         if status.recreated > 0 {
-            text = format!("{text}; somebody else deleted its Job {} times", status.recreated);
+            parts.push(format!("somebody else deleted its Job {} times", status.recreated));
         }
         if is_attempt_requested(self.submission) {
             let wanted = self.submission.spec.attempt;
-            text = format!("{text}; attempt {wanted} is requested and follows it");
+            parts.push(format!("attempt {wanted} is requested and follows it"));
         }
         if self.submission.spec.cancel && !has_ended(self.submission) {
-            text = format!("{text}; its cancellation is requested");
+            parts.push("its cancellation is requested".to_owned());
         }
-        if text != first || attempt > Attempt::FIRST {
-            self.page.row("Attempt", &sentence(&text));
+        if parts.len() > 1 || attempt > Attempt::FIRST {
+            self.page.row("Attempt", &sentence(&parts.join("; ")));
         }
     }
 
