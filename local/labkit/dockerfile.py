@@ -39,9 +39,8 @@ USUAL_MINUTES = {"local": 5, "release": 25}
 def run(settings: Settings, profile: str) -> None:
     """Builds the Dockerfile with cargo's `profile` and checks the image."""
     engine.ensure(settings)
-    # What the image's build finds of others in its caches, it need not compile.
+    # Its libraries are those of the image's base.
     build.programs(settings)
-    build.released_runner(settings)
     spec = parse((settings.local / "operator-image.toml").read_text(), "operator-image.toml")[0]
     with engine.opened(settings) as own:
         work = own.storage / "work"
@@ -182,6 +181,8 @@ def warm(settings: Settings, own: Engine, profile: str, mounts: Mapping[Path, st
             # They are copies: whatever broke them, new ones are as good.
             say(f"the caches of the build are thrown away and filled anew: {error}")
     engine.forget(own)
+    # What the image's build finds of others in its caches, it need not compile.
+    build.released_runner(settings)
     built = [folder for folder in folders(profile) if (target / folder / "deps").is_dir()]
     in_caches(settings, own, seed(built), options, work)
     mark.write_text(key)

@@ -190,6 +190,7 @@ class Caches(unittest.TestCase):
         settings = SimpleNamespace(repository=REPOSITORY, logs=work)
         with (
             patch.object(dockerfile, "cache_key", return_value="key"),
+            patch.object(dockerfile.build, "released_runner", side_effect=lambda _: built.append("released runner")),
             patch.dict(os.environ, {"CARGO_TARGET_DIR": str(own.caches.parent / "target")}),
             redirect_stderr(StringIO()),
         ):
@@ -202,8 +203,8 @@ class Caches(unittest.TestCase):
             own = SimpleNamespace(caches=Path(folder) / "caches")
             own.caches.mkdir()
             filled = self.warm(own)
-            self.assertEqual(len(filled), 1)
-            self.assertIn("cp -a .fingerprint", filled[0])
+            self.assertEqual((len(filled), filled[0]), (2, "released runner"))
+            self.assertIn("cp -a .fingerprint", filled[1])
             kept = self.warm(own)
             self.assertEqual(len(kept), 1)
             self.assertNotIn("cp -a", kept[0])
