@@ -144,7 +144,12 @@ where
 
 async fn lead(options: Controller) -> End {
     let telemetry = Observability::new(on_signals()?);
-    let (telemetry, sending) = Sending::start(telemetry)?;
+    #[cfg(feature = "otel")]
+    let (telemetry, sending) = otlp::begin(telemetry)?;
+    #[cfg(not(feature = "otel"))]
+    if std::env::var_os("OTEL_EXPORTER_OTLP_ENDPOINT").is_some() {
+        tracing::warn!("OTEL_EXPORTER_OTLP_ENDPOINT is set, but this program was built without traces (feature otel)");
+    }
     let health = HealthServer::start(options.server.http, telemetry.clone()).await?;
     let config = cluster("controller").await?;
     let clients = run::Clients {
@@ -176,7 +181,10 @@ async fn lead(options: Controller) -> End {
         None => None,
     };
     let result = run::run(clients, lease, settings, aws, page, telemetry).await;
-    sending.finish().await;
+    #[cfg(feature = "otel")]
+    if let Some(sending) = sending {
+        sending.finish().await;
+    }
     health.close().await;
     Ok(result?)
 }
@@ -203,38 +211,4 @@ pub(super) async fn cluster(program: &str) -> Result<Config, String> {
     let agent = HeaderValue::try_from(agent).map_err(|e| format!("the program's name is no header: {e}"))?;
     config.headers.push((USER_AGENT, agent));
     Ok(config)
-}
-
-/// The task that sends traces, where the environment names a collector.
-struct Sending(#[cfg(feature = "otel")] Option<otlp::Sending>);
-
-impl Sending {
-    #[cfg(feature = "otel")]
-    fn start(mut telemetry: Observability) -> Result<(Observability, Self), Box<dyn Error>> {
-        if !otlp::is_wanted(|name| std::env::var(name).ok()) {
-            return Ok((telemetry, Self(None)));
-        }
-        let (traces, sending) = otlp::start(None, &telemetry.metrics, &telemetry.tasks)?;
-        telemetry.traces = traces;
-        Ok((telemetry, Self(Some(sending))))
-    }
-
-    #[cfg(not(feature = "otel"))]
-    #[allow(clippy::unnecessary_wraps, reason = "with traces it can fail")]
-    fn start(telemetry: Observability) -> Result<(Observability, Self), Box<dyn Error>> {
-        if std::env::var_os("OTEL_EXPORTER_OTLP_ENDPOINT").is_some() {
-            tracing::warn!(
-                "OTEL_EXPORTER_OTLP_ENDPOINT is set, but this program was built without traces (feature otel)"
-            );
-        }
-        Ok((telemetry, Self()))
-    }
-
-    #[cfg_attr(not(feature = "otel"), allow(clippy::unused_async, reason = "with traces it waits"))]
-    async fn finish(self) {
-        #[cfg(feature = "otel")]
-        if let Some(sending) = self.0 {
-            sending.finish().await;
-        }
-    }
 }

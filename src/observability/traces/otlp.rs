@@ -15,6 +15,7 @@ use tokio::task::JoinHandle;
 
 use super::{Kind, Span, Traces, Value};
 use crate::metrics::Metrics;
+use crate::observability::Observability;
 use leaderboard_api::names::OPERATOR;
 use leaderboard_base::tasks::Tasks;
 
@@ -73,8 +74,21 @@ impl Sending {
     }
 }
 
+/// Sends from here on, where the environment names a collector.
+///
+/// # Errors
+/// If the settings cannot be used.
+pub fn begin(mut telemetry: Observability) -> Result<(Observability, Option<Sending>), TracesError> {
+    if !is_wanted(|name| std::env::var(name).ok()) {
+        return Ok((telemetry, None));
+    }
+    let (traces, sending) = start(None, &telemetry.metrics, &telemetry.tasks)?;
+    telemetry.traces = traces;
+    Ok((telemetry, Some(sending)))
+}
+
 /// True if the environment names a collector, and does not switch traces off.
-pub fn is_wanted(variable: impl Fn(&str) -> Option<String>) -> bool {
+fn is_wanted(variable: impl Fn(&str) -> Option<String>) -> bool {
     let is = |name: &str, value: &str| variable(name).is_some_and(|is| is.trim().eq_ignore_ascii_case(value));
     let has_endpoint = ENDPOINTS
         .iter()
