@@ -15,7 +15,7 @@ from . import chartdocs, chartmetrics, chartshows
 from .chartcases import IMAGE, RELEASE, SET_IMAGE, SYSTEM
 from .chartshown import ABSENT, MONITORING, Case, Shown
 from .errors import LabError
-from .kube import Kube
+from .kube import Kube, at_once
 
 SOURCE = re.compile(r"^# Source: leaderboard-operator/(templates/\S+)$", re.MULTILINE)
 MONITORING_KINDS = ("PodMonitor", "ServiceMonitor", "PrometheusRule")
@@ -135,7 +135,7 @@ def fault(rendered: Mapping[str, Any], shown: Shown) -> str | None:
 
 def every_value(kube: Kube, chart: Path) -> str:
     """Renders each case; then no value and no template may be without one."""
-    texts = [template(kube, chart, lean(case), case.kinds) for case in chartshows.CASES]
+    texts = at_once(lambda case: template(kube, chart, lean(case), case.kinds), chartshows.CASES)
     sources = set(SOURCE.findall("\n".join(texts)))
     for case, rendered in zip(chartshows.CASES, objects_of_each(kube, texts), strict=True):
         faults = [text for shown in case.shown if (text := fault(rendered, shown))]

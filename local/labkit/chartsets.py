@@ -10,7 +10,7 @@ from . import chartrender
 from .chartcases import RELEASE, SET_IMAGE, SYSTEM
 from .chartshown import ABSENT, BRIDGE, CONTAINER, CONTROLLER, CRD, POD, Shown
 from .errors import LabError
-from .kube import Kube
+from .kube import Kube, at_once
 
 ACCOUNT = f"ServiceAccount/{RELEASE}-controller"
 # What is typed, and an object, a path in it and what stands there.
@@ -75,7 +75,7 @@ TYPED: tuple[tuple[str, str, str, Any], ...] = (
 def typed(kube: Kube, chart: Path) -> str:
     """Renders the chart with each of them, and looks for its effect."""
     argv = ["template", RELEASE, str(chart), f"--namespace={SYSTEM}", SET_IMAGE]
-    texts = [kube.run("helm", *argv, *lean(name), f"--set={words}") for words, name, _, _ in TYPED]
+    texts = at_once(lambda one: kube.run("helm", *argv, *lean(one[1]), f"--set={one[0]}"), TYPED)
     for (words, name, path, holds), rendered in zip(TYPED, chartrender.objects_of_each(kube, texts), strict=True):
         fault = chartrender.fault(rendered, Shown(name, path, holds))
         if fault:

@@ -36,7 +36,7 @@ from .chartcases import RELEASE, SET_IMAGE, SYSTEM, Access
 from .chartrender import documents
 from .console import say, seconds
 from .errors import LabError
-from .kube import Kube
+from .kube import Kube, at_once
 from .settings import Settings
 
 # The Jobs that the operator's tests hold its own against.
@@ -184,8 +184,11 @@ def aws_values(kube: Kube, chart: Path, examples: Path) -> str:
 
 
 def refused_values(kube: Kube, chart: Path) -> str:
-    for settings, word in chartcases.REFUSED:
-        done = kube.attempt("helm", "template", "x", str(chart), SET_IMAGE, *(f"--set-json={one}" for one in settings))
+    argv = ["template", "x", str(chart), SET_IMAGE]
+    answers = at_once(
+        lambda case: kube.attempt("helm", *argv, *(f"--set-json={one}" for one in case[0])), chartcases.REFUSED
+    )
+    for (settings, word), done in zip(chartcases.REFUSED, answers, strict=True):
         if done.returncode == 0:
             raise LabError(f"{' '.join(settings)} was taken")
         if word not in done.stderr:

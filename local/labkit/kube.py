@@ -3,7 +3,8 @@
 import json
 import os
 import subprocess
-from collections.abc import Sequence
+from collections.abc import Callable, Iterable, Sequence
+from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -39,6 +40,12 @@ class Kube:
     def json(self, *argv: str) -> Any:
         """What `kubectl get … ` prints, as JSON."""
         return json.loads(self.run(*argv, "--output=json"))
+
+
+def at_once(work: Callable[[Any], Any], given: Iterable[Any]) -> list[Any]:
+    """What comes of each, in their order: helm has to start for each rendering, on one processor."""
+    with ThreadPoolExecutor(os.cpu_count()) as pool:
+        return list(pool.map(work, given))
 
 
 def of_lab(settings: Settings, tools: Path) -> Kube:
