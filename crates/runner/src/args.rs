@@ -9,7 +9,7 @@ use std::time::Duration;
 
 use thiserror::Error;
 
-use leaderboard_protocol::files::{Host, Member, Pair, RESULT, Side};
+use leaderboard_protocol::files::{Host, Member, Pair, RESULT};
 use leaderboard_protocol::graphics::Needs;
 
 pub const USAGE: &str = "\
@@ -61,14 +61,47 @@ const TERMINATION_LOG: &str = "/dev/termination-log";
 /// The one option that needs no value.
 const ALONE: &str = "--alone";
 
-/// Work of one container.
+/// Part of a container in its pair.
+#[derive(Debug, Clone, Copy, PartialEq, Eq)]
+pub enum Part {
+    Simulator,
+    /// A simulator's agent, which evaluates itself, and keeps a checkpoint.
+    Driver,
+    Evaluator,
+    /// An evaluator's agent.
+    Plain,
+}
+
+impl Part {
+    pub const fn is_host(self) -> bool {
+        matches!(self, Self::Simulator | Self::Evaluator)
+    }
+
+    /// True if its results are the pair's, and its peer follows it.
+    pub const fn has_last_word(self) -> bool {
+        matches!(self, Self::Driver | Self::Evaluator)
+    }
+
+    /// Kind of the pair's host.
+    pub const fn host(self) -> Host {
+        match self {
+            Self::Simulator | Self::Driver => Host::Simulator,
+            Self::Evaluator | Self::Plain => Host::Evaluator,
+        }
+    }
+}
+
+/// Work of one container. What other parts have is empty.
 #[derive(Debug, Clone, PartialEq)]
 pub struct Job {
+    pub part: Part,
     pub pair: Pair,
     pub status: PathBuf,
     pub ready: Duration,
     pub grace: Duration,
     pub peer: Duration,
+    /// Where output is kept. An agent always has one.
+    pub log: Option<PathBuf>,
     /// Bytes of output that are kept in the log.
     pub log_limit: u64,
     pub termination_log: PathBuf,
@@ -78,120 +111,58 @@ pub struct Job {
     pub root: PathBuf,
     /// True if an evaluator, or its agent, has no peer beside it.
     pub alone: bool,
-    pub role: Role,
+    /// True if the pair's agent is to see a GPU: its runner reports whether it does, and its host's waits for that.
+    pub agent_gpu: bool,
+    /// A host's time to hold its exit, until the results are stored, and after a cancel.
+    pub flush: Duration,
+    pub cancel: Duration,
+    /// Port on which a host's agent finds it. An evaluator's need not.
+    pub port: Option<u16>,
+    /// Time that a simulator's server may take to answer when its agent has crashed, or an evaluator from its agent's regular end to the
+    /// complete result.
+    pub answer: Duration,
+    /// Driver that a host's command draws with, if it is to have a GPU.
+    pub gpu: Option<Needs>,
+    /// Variables that a host's command does not get.
+    pub unset: Vec<OsString>,
+    /// Folder of an evaluator's result.
+    pub results: Option<PathBuf>,
+    /// Folder with the results of the pairs before this one, after which an evaluator's command begins.
+    pub after: Option<PathBuf>,
+    /// How long an agent may print nothing.
+    pub idle: Option<Duration>,
+    /// A driver's.
+    pub checkpoint: Option<PathBuf>,
+    pub python_path: Option<OsString>,
+    /// How many route runs a driver is to drive, if that is known.
+    pub route_runs: Option<u32>,
+    /// Folder in which an agent leaves files for its evaluator, if it is alone.
+    pub leaves: Option<PathBuf>,
     /// The command and its arguments; never empty.
     pub command: Vec<OsString>,
 }
 
-/// Settings of one side.
-#[derive(Debug, Clone, PartialEq)]
-pub enum Role {
-    Host {
-        server: Server,
-        flush: Duration,
-        cancel: Duration,
-        log: Option<PathBuf>,
-        /// Driver that the command draws with, if it is to have a GPU.
-        gpu: Option<Needs>,
-        /// True if its agent is to see a GPU.
-        agent_gpu: bool,
-        /// Variables that the command does not get.
-        unset: Vec<OsString>,
-    },
-    Agent {
-        program: Program,
-        work: PathBuf,
-        idle: Duration,
-        /// True if it reports that it sees a GPU.
-        report_gpu: bool,
-    },
-}
-
-/// Command of a host's container.
-#[derive(Debug, Clone, PartialEq)]
-pub enum Server {
-    Simulator {
-        port: u16,
-        /// Time that the server may take to answer when its agent has crashed.
-        answer: Duration,
-    },
-    Evaluator {
-        /// Port on which its agent finds it. None: its agent need not find it.
-        port: Option<u16>,
-        /// Folder of its result.
-        results: PathBuf,
-        /// Time from its agent's regular end to the complete result.
-        answer: Duration,
-        /// Folder with the results of the pairs before this one, after which its command begins.
-        after: Option<PathBuf>,
-    },
-}
-
-/// Command of an agent's container.
-#[derive(Debug, Clone, PartialEq)]
-pub enum Program {
-    /// It evaluates itself against a simulator, and keeps a checkpoint.
-    Driver {
-        checkpoint: PathBuf,
-        python_path: Option<OsString>,
-        /// How many route runs it is to drive, if that is known.
-        route_runs: Option<u32>,
-    },
-    /// An evaluator evaluates it.
-    Plain {
-        /// Folder in which it leaves files for its evaluator, if it is alone.
-        leaves: Option<PathBuf>,
-    },
-}
-
 impl Job {
-    pub fn member(&self) -> Member {
-        let side = match self.role {
-            Role::Host { .. } => Side::Host(self.host()),
-            Role::Agent { .. } => Side::Agent,
-        };
-        Member { side, pair: self.pair }
+    pub const fn member(&self) -> Member {
+        if self.part.is_host() {
+            self.pair.host(self.part.host())
+        } else {
+            self.pair.agent()
+        }
     }
 
     /// The other container of the pair.
-    pub fn peer(&self) -> Member {
-        match self.role {
-            Role::Host { .. } => self.pair.agent(),
-            Role::Agent { .. } => self.pair.host(self.host()),
+    pub const fn peer(&self) -> Member {
+        if self.part.is_host() {
+            self.pair.agent()
+        } else {
+            self.pair.host(self.part.host())
         }
     }
 
     /// The file of an evaluator's result.
     pub fn result(&self) -> Option<PathBuf> {
-        match &self.role {
-            Role::Host {
-                server: Server::Evaluator { results, .. },
-                ..
-            } => Some(results.join(RESULT)),
-            _ => None,
-        }
-    }
-
-    /// Kind of the pair's host.
-    pub const fn host(&self) -> Host {
-        match &self.role {
-            Role::Host {
-                server: Server::Simulator { .. },
-                ..
-            }
-            | Role::Agent {
-                program: Program::Driver { .. },
-                ..
-            } => Host::Simulator,
-            Role::Host {
-                server: Server::Evaluator { .. },
-                ..
-            }
-            | Role::Agent {
-                program: Program::Plain { .. },
-                ..
-            } => Host::Evaluator,
-        }
+        self.results.as_ref().map(|folder| folder.join(RESULT))
     }
 }
 
@@ -253,48 +224,122 @@ pub enum UsageError {
 pub fn parse(arguments: impl IntoIterator<Item = OsString>) -> Result<Request, UsageError> {
     let mut arguments = arguments.into_iter();
     let first = arguments.next().ok_or(UsageError::Nothing)?;
-    let side = match first.to_str() {
+    let of_host = match first.to_str() {
         Some("--version" | "-V") => return Ok(Request::Version),
         Some("--help" | "-h" | "help") => return Ok(Request::Help),
-        Some("simulator") => Side::Host(Host::Simulator),
-        Some("evaluator") => Side::Host(Host::Evaluator),
-        Some("agent") => Side::Agent,
+        Some("simulator") => Some(Part::Simulator),
+        Some("evaluator") => Some(Part::Evaluator),
+        Some("agent") => None,
         Some("keep") => return keep(arguments).map(Request::Keep),
         Some("copy") => return copy(arguments).map(Request::Copy),
         _ => return Err(UsageError::Subcommand(first)),
     };
     let mut options = Options::collect(&mut arguments)?;
-    let command: Vec<OsString> = arguments.collect();
-    let mut job = Job {
-        pair: options.required("--pair", "a number from 1 to 999")?,
-        status: options.path("--status")?,
-        ready: options.seconds("--ready-seconds", 3600)?,
-        grace: options.seconds("--grace-seconds", grace_seconds(side))?,
-        peer: options.seconds("--peer-seconds", 600)?,
-        log_limit: options.log_limit()?,
-        termination_log: options.termination_log()?,
-        inotify: options.optional("--inotify", "true or false")?.unwrap_or(true),
-        root: options.take("--root")?.map_or_else(|| "/".into(), PathBuf::from),
-        alone: false,
-        role: role(side, &mut options)?,
-        command,
+    let part = match of_host {
+        Some(part) => part,
+        None => agent(&mut options)?,
     };
-    if job.host() == Host::Evaluator {
-        job.alone = options.optional(ALONE, "true or false")?.unwrap_or(false);
-    }
-    if job.alone
-        && let Role::Agent {
-            program: Program::Plain { leaves },
-            ..
-        } = &mut job.role
-    {
-        *leaves = options.take("--leaves")?.map(PathBuf::from);
-    }
+    let job = job(part, &mut options, arguments.collect())?;
     options.finish()?;
     if job.command.is_empty() {
         return Err(UsageError::NoCommand);
     }
     Ok(Request::Run(Box::new(job)))
+}
+
+/// The part of an agent, by its host.
+fn agent(options: &mut Options) -> Result<Part, UsageError> {
+    let host = options.take("--host")?;
+    match host.as_deref().map(OsStr::as_bytes) {
+        None | Some(b"simulator") => Ok(Part::Driver),
+        Some(b"evaluator") => Ok(Part::Plain),
+        Some(_) => Err(UsageError::Invalid {
+            option: "--host",
+            value: host.unwrap_or_default(),
+            expected: "simulator or evaluator",
+        }),
+    }
+}
+
+fn job(part: Part, options: &mut Options, command: Vec<OsString>) -> Result<Job, UsageError> {
+    // An evaluator has to write down what it knows so far.
+    let grace = if part == Part::Evaluator { 30 } else { 20 };
+    let mut job = Job {
+        part,
+        pair: options.required("--pair", "a number from 1 to 999")?,
+        status: options.path("--status")?,
+        ready: options.seconds("--ready-seconds", 3600)?,
+        grace: options.seconds("--grace-seconds", grace)?,
+        peer: options.seconds("--peer-seconds", 600)?,
+        log: None,
+        log_limit: options.log_limit()?,
+        termination_log: options.termination_log()?,
+        inotify: options.optional("--inotify", "true or false")?.unwrap_or(true),
+        root: options.place("--root")?.unwrap_or_else(|| "/".into()),
+        alone: false,
+        agent_gpu: false,
+        flush: Duration::ZERO,
+        cancel: Duration::ZERO,
+        port: None,
+        answer: Duration::ZERO,
+        gpu: None,
+        unset: Vec::new(),
+        results: None,
+        after: None,
+        idle: None,
+        checkpoint: None,
+        python_path: None,
+        route_runs: None,
+        leaves: None,
+        command,
+    };
+    if part.is_host() {
+        fill_host(&mut job, options)?;
+    } else {
+        fill_agent(&mut job, options)?;
+    }
+    Ok(job)
+}
+
+fn fill_host(job: &mut Job, options: &mut Options) -> Result<(), UsageError> {
+    job.flush = options.seconds("--flush-seconds", 1800)?;
+    job.cancel = options.seconds("--cancel-seconds", 120)?;
+    job.log = options.place("--log")?.filter(|path| !path.as_os_str().is_empty());
+    job.gpu = options.optional("--gpu", "any, vulkan or opengl")?;
+    job.agent_gpu = options.flag("--agent-gpu")?;
+    job.unset = options.list("--unset")?;
+    let port = options.optional::<NonZeroU16>("--port", "a port from 1 to 65535")?;
+    job.port = port.map(NonZeroU16::get);
+    if job.part == Part::Evaluator {
+        job.results = Some(options.path("--results")?);
+        job.answer = options.seconds("--answer-seconds", 600)?;
+        job.after = options.place("--after")?;
+        job.alone = options.flag(ALONE)?;
+        return Ok(());
+    }
+    job.answer = options.seconds("--answer-seconds", 10)?;
+    match job.port {
+        Some(_) => Ok(()),
+        None => Err(UsageError::Missing("--port")),
+    }
+}
+
+fn fill_agent(job: &mut Job, options: &mut Options) -> Result<(), UsageError> {
+    let work = options.place("--work")?.unwrap_or_else(|| WORK.into());
+    job.log = Some(work.join("leaderboard.log"));
+    job.idle = Some(options.seconds("--idle-seconds", 800)?);
+    job.agent_gpu = options.flag("--report-gpu")?;
+    if job.part == Part::Driver {
+        job.checkpoint = Some(options.path("--checkpoint")?);
+        job.python_path = options.take("--python-path")?.filter(|value| !value.is_empty());
+        job.route_runs = options.optional("--route-runs", "a number of routes")?;
+        return Ok(());
+    }
+    job.alone = options.flag(ALONE)?;
+    if job.alone {
+        job.leaves = options.place("--leaves")?;
+    }
+    Ok(())
 }
 
 fn keep(mut arguments: impl Iterator<Item = OsString>) -> Result<Kept, UsageError> {
@@ -322,70 +367,6 @@ fn copy(mut arguments: impl Iterator<Item = OsString>) -> Result<Copied, UsageEr
     match arguments.next() {
         None => Ok(copied),
         Some(word) => Err(UsageError::Unknown(word.to_string_lossy().into_owned())),
-    }
-}
-
-/// An evaluator has to write down what it knows so far.
-const fn grace_seconds(side: Side) -> u32 {
-    match side {
-        Side::Host(Host::Evaluator) => 30,
-        Side::Host(Host::Simulator) | Side::Agent => 20,
-    }
-}
-
-fn role(side: Side, options: &mut Options) -> Result<Role, UsageError> {
-    Ok(match side {
-        Side::Host(host) => Role::Host {
-            server: server(host, options)?,
-            flush: options.seconds("--flush-seconds", 1800)?,
-            cancel: options.seconds("--cancel-seconds", 120)?,
-            log: options
-                .take("--log")?
-                .filter(|path| !path.is_empty())
-                .map(PathBuf::from),
-            gpu: options.optional("--gpu", "any, vulkan or opengl")?,
-            agent_gpu: options.optional("--agent-gpu", "true or false")?.unwrap_or(false),
-            unset: options.list("--unset")?,
-        },
-        Side::Agent => Role::Agent {
-            program: program(options)?,
-            work: options.take("--work")?.map_or_else(|| WORK.into(), PathBuf::from),
-            idle: options.seconds("--idle-seconds", 800)?,
-            report_gpu: options.optional("--report-gpu", "true or false")?.unwrap_or(false),
-        },
-    })
-}
-
-fn server(host: Host, options: &mut Options) -> Result<Server, UsageError> {
-    let port = options.optional::<NonZeroU16>("--port", "a port from 1 to 65535")?;
-    Ok(match host {
-        Host::Simulator => Server::Simulator {
-            port: port.ok_or(UsageError::Missing("--port"))?.get(),
-            answer: options.seconds("--answer-seconds", 10)?,
-        },
-        Host::Evaluator => Server::Evaluator {
-            port: port.map(NonZeroU16::get),
-            results: options.path("--results")?,
-            answer: options.seconds("--answer-seconds", 600)?,
-            after: options.take("--after")?.map(PathBuf::from),
-        },
-    })
-}
-
-fn program(options: &mut Options) -> Result<Program, UsageError> {
-    let host = options.take("--host")?;
-    match host.as_deref().map(OsStr::as_bytes) {
-        None | Some(b"simulator") => Ok(Program::Driver {
-            checkpoint: options.path("--checkpoint")?,
-            python_path: options.take("--python-path")?.filter(|value| !value.is_empty()),
-            route_runs: options.optional("--route-runs", "a number of routes")?,
-        }),
-        Some(b"evaluator") => Ok(Program::Plain { leaves: None }),
-        Some(_) => Err(UsageError::Invalid {
-            option: "--host",
-            value: host.unwrap_or_default(),
-            expected: "simulator or evaluator",
-        }),
     }
 }
 
@@ -418,8 +399,8 @@ impl Options {
     }
 
     fn termination_log(&mut self) -> Result<PathBuf, UsageError> {
-        let path = self.take("--termination-log")?;
-        Ok(path.map_or_else(|| TERMINATION_LOG.into(), PathBuf::from))
+        let path = self.place("--termination-log")?;
+        Ok(path.unwrap_or_else(|| TERMINATION_LOG.into()))
     }
 
     fn log_limit(&mut self) -> Result<u64, UsageError> {
@@ -465,6 +446,14 @@ impl Options {
             });
         }
         Ok(value.into())
+    }
+
+    fn place(&mut self, option: &'static str) -> Result<Option<PathBuf>, UsageError> {
+        Ok(self.take(option)?.map(PathBuf::from))
+    }
+
+    fn flag(&mut self, option: &'static str) -> Result<bool, UsageError> {
+        Ok(self.optional(option, "true or false")?.unwrap_or(false))
     }
 
     /// The parts of a value between commas.

@@ -11,42 +11,7 @@
 //! the two counts meet again however far apart the containers restart.
 
 use leaderboard_protocol::verdict::{CODE_NO_GRAPHICS, CODE_NO_PROCESS, CODE_NODE_REFUSED};
-use leaderboard_runner::args::{Program, Role, Server};
-
-/// Part of a container in its pair.
-#[derive(Debug, Clone, Copy, PartialEq, Eq)]
-pub(crate) enum Part {
-    Simulator,
-    /// A simulator's agent, which evaluates itself.
-    Driver,
-    Evaluator,
-    /// An evaluator's agent.
-    Plain,
-}
-
-impl Part {
-    pub(crate) const fn of(role: &Role) -> Self {
-        match role {
-            Role::Host { server, .. } => match server {
-                Server::Simulator { .. } => Self::Simulator,
-                Server::Evaluator { .. } => Self::Evaluator,
-            },
-            Role::Agent { program, .. } => match program {
-                Program::Driver { .. } => Self::Driver,
-                Program::Plain { .. } => Self::Plain,
-            },
-        }
-    }
-
-    pub(crate) const fn is_host(self) -> bool {
-        matches!(self, Self::Simulator | Self::Evaluator)
-    }
-
-    /// True if its results are the pair's, and its peer follows it.
-    const fn has_last_word(self) -> bool {
-        matches!(self, Self::Driver | Self::Evaluator)
-    }
-}
+pub(crate) use leaderboard_runner::args::Part;
 
 /// How far this container has come.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]

@@ -1,18 +1,14 @@
 //! A command whose output goes to a file too, and that is all: no peer, no status files, no verdict. Called by `main` for the host's
 //! private contents.
 
-use std::io;
-use std::os::fd::AsFd;
 use std::time::{Duration, Instant};
 
-use nix::errno::Errno;
-use nix::poll::{PollFd, PollFlags, PollTimeout, poll};
 use nix::sys::signal::Signal;
 
 use crate::group::{self, Status, spawn_code};
 use crate::launch::teed;
 use crate::say;
-use crate::tee::Tee;
+use crate::tee;
 use crate::wake::Signals;
 use leaderboard_runner::args::Kept;
 
@@ -44,7 +40,7 @@ pub(crate) fn run(kept: Kept, mut signals: Signals) -> i32 {
         if let Some(status) = group.status().filter(|_| tee.finished() || is_late) {
             return code(status);
         }
-        if wait(&tee, &signals) {
+        if tee::wait(signals.fds().into_iter(), Some(&tee), SLOW_POLL) {
             tee.read();
         }
         tee.write();
@@ -59,30 +55,4 @@ fn code(status: Status) -> i32 {
         Status::Exited(code) => code,
         Status::Killed(signal) => BY_SIGNAL + signal.unwrap_or_default(),
     }
-}
-
-/// Waits until something may have changed; whether the output is readable.
-fn wait(tee: &Tee, signals: &Signals) -> bool {
-    let stdout = io::stdout();
-    let mut descriptors: Vec<_> = signals
-        .fds()
-        .into_iter()
-        .map(|fd| PollFd::new(fd, PollFlags::POLLIN))
-        .collect();
-    let input = tee.input();
-    if let Some(input) = input {
-        descriptors.push(PollFd::new(input, PollFlags::POLLIN));
-    } else if tee.wants_stdout() {
-        descriptors.push(PollFd::new(stdout.as_fd(), PollFlags::POLLOUT));
-    }
-    let milliseconds = u16::try_from(SLOW_POLL.as_millis()).unwrap_or(u16::MAX);
-    match poll(&mut descriptors, PollTimeout::from(milliseconds)) {
-        Ok(_) | Err(Errno::EINTR) => {}
-        Err(error) => {
-            say(format_args!("cannot wait for events: {error}"));
-            std::thread::sleep(SLOW_POLL);
-            return false;
-        }
-    }
-    input.is_some() && descriptors.last().and_then(PollFd::any) == Some(true)
 }

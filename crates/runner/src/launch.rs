@@ -15,7 +15,7 @@ use crate::decide::Cause;
 use crate::group::{self, Group};
 use crate::kernel;
 use crate::tee::Tee;
-use leaderboard_runner::args::{Job, Program, Role, Server};
+use leaderboard_runner::args::Job;
 use leaderboard_runner::expand::expand;
 use leaderboard_runner::graphics::{self, NoGraphics};
 
@@ -43,29 +43,18 @@ impl CannotLaunch {
 
 /// Starts the command, with the tee of its output if that is kept. `round`: crashes so far.
 pub(crate) fn launch(job: &Job, round: u32) -> Result<(Group, Option<Tee>), CannotLaunch> {
-    let started = match &job.role {
-        Role::Host { log, .. } => {
-            let mut command = of_host(job)?;
-            match log {
-                None => Group::spawn(command.stdin(no_input())).map(|group| (group, None)),
-                Some(log) => teed(command, log.clone(), job.log_limit),
-            }
-        }
-        Role::Agent {
-            work,
-            program,
-            report_gpu,
-            ..
-        } => {
-            if job.alone && *report_gpu && graphics::devices(&job.root) == 0 {
-                // No host reads its report.
-                return Err(NoGraphics::NoGpu.into());
-            }
-            let environment = of_agent(program, round);
-            let words = expand_all(&job.command, &environment);
-            let log = work.join("leaderboard.log");
-            teed(group::command(&words, &environment), log, job.log_limit)
-        }
+    let mut command = if job.part.is_host() {
+        of_host(job)?
+    } else if job.alone && job.agent_gpu && graphics::devices(&job.root) == 0 {
+        // No host reads its report.
+        return Err(NoGraphics::NoGpu.into());
+    } else {
+        let environment = of_agent(job, round);
+        group::command(&expand_all(&job.command, &environment), &environment)
+    };
+    let started = match &job.log {
+        None => Group::spawn(command.stdin(no_input())).map(|group| (group, None)),
+        Some(log) => teed(command, log.clone(), job.log_limit),
     };
     started.map_err(|source| CannotLaunch::Spawn {
         program: program(job).to_owned(),
@@ -77,40 +66,32 @@ pub(crate) fn launch(job: &Job, round: u32) -> Result<(Group, Option<Tee>), Cann
 /// a simulator stay as they are.
 fn of_host(job: &Job) -> Result<Command, NoGraphics> {
     let (mut words, mut environment) = (job.command.clone(), Vec::new());
-    let Role::Host { server, gpu, unset, .. } = &job.role else {
-        return Ok(group::command(&words, &environment));
-    };
-    if let Some(needs) = gpu {
-        let adapter = graphics::adapter(&job.root, *needs, |name| env::var_os(name))?;
+    if let Some(needs) = job.gpu {
+        let adapter = graphics::adapter(&job.root, needs, |name| env::var_os(name))?;
         words = words.iter().map(|word| graphics::with_adapter(word, adapter)).collect();
         environment.push((ADAPTER, adapter.to_string().into()));
     }
-    if let Server::Evaluator { results, .. } = server {
+    if let Some(results) = &job.results {
         // A later attempt may begin without files: those of an evaluator go when its agent runs anew.
         let has_files = results.read_dir().is_ok_and(|mut files| files.next().is_some());
         environment.push(("RESUME", one_or_empty(has_files)));
         words = expand_all(&words, &environment);
     }
     let mut command = group::command(&words, &environment);
-    for name in unset {
+    for name in &job.unset {
         command.env_remove(name);
     }
     Ok(command)
 }
 
 /// What the runner adds to the environment of an agent.
-fn of_agent(program: &Program, round: u32) -> Vec<(&'static str, OsString)> {
-    let Program::Driver {
-        checkpoint,
-        python_path,
-        ..
-    } = program
-    else {
+fn of_agent(job: &Job, round: u32) -> Vec<(&'static str, OsString)> {
+    let Some(checkpoint) = &job.checkpoint else {
         return Vec::new();
     };
     let partial = checkpoint::read(checkpoint).is_ok_and(|found| found.partial);
     let mut environment = vec![("RESUME", resume(env::var_os("RESUME"), round, partial))];
-    if let Some(front) = python_path {
+    if let Some(front) = &job.python_path {
         environment.push(("PYTHONPATH", in_front(front, env::var_os("PYTHONPATH"))));
     }
     environment

@@ -7,24 +7,20 @@ mod evaluated;
 mod nothing_left;
 mod own_server;
 
-use std::io;
-use std::os::fd::AsFd;
 use std::time::{Duration, Instant};
 
 use leaderboard_protocol::files::{KEPT_CHECKPOINT, MAX_ROUNDS, Mark, Member, Progress, StatusFile};
 use leaderboard_protocol::verdict::{CODE_NODE_REFUSED, Verdict};
-use nix::errno::Errno;
-use nix::poll::{PollFd, PollFlags, PollTimeout, poll};
 use nix::sys::signal::Signal;
 
 use crate::decide::{self, Action, Cause, Child, Conclusion, EndMark, Hold, Leave, Part, Phase, Seen, Skip};
 use crate::group::{self, Group, Status};
 use crate::keep::Keeper;
 use crate::launch;
-use crate::tee::Tee;
+use crate::tee::{self, Tee};
 use crate::wake::{Folders, Signals};
 use crate::{kernel, memory, own_folder, report, result, say};
-use leaderboard_runner::args::{Job, Program, Role};
+use leaderboard_runner::args::Job;
 
 /// Behind inotify, for whatever it misses.
 const SLOW_POLL: Duration = Duration::from_secs(1);
@@ -71,14 +67,7 @@ impl Runner {
     pub(crate) fn new(job: Job, signals: Signals) -> Self {
         let (me, peer) = (job.member(), job.peer());
         let logcopy = StatusFile::Stored.folder();
-        let checkpoint = match &job.role {
-            Role::Agent {
-                program: Program::Driver { checkpoint, .. },
-                ..
-            } => Some(checkpoint.clone()),
-            _ => None,
-        };
-        let result = job.result();
+        let (checkpoint, result) = (job.checkpoint.clone(), job.result());
         let watched = checkpoint.as_deref().or(result.as_deref());
         let folders = Folders::watch(&job.status, &[peer.to_string(), logcopy], watched, job.inotify);
         let own = job.status.join(me.to_string());
@@ -87,7 +76,7 @@ impl Runner {
         let round = Progress::read(&job.status, me).crashes;
         let now = Instant::now();
         Self {
-            part: Part::of(&job.role),
+            part: job.part,
             job,
             me,
             peer,
@@ -197,13 +186,11 @@ impl Runner {
 
     /// Until the agent has been silent for too long.
     fn idle_left(&self) -> Option<Duration> {
-        let (Role::Agent { idle, .. }, Some(tee)) = (&self.job.role, &self.tee) else {
-            return None;
-        };
+        let (idle, tee) = (self.job.idle?, self.tee.as_ref()?);
         // Output that waits in its pipe while the node reads no standard output is no silence. Only the node reads
         // there, so no command can bring this about.
         if tee.wants_stdout() {
-            return Some(*idle);
+            return Some(idle);
         }
         Some(idle.saturating_sub(tee.last_output().elapsed()))
     }
@@ -213,8 +200,8 @@ impl Runner {
         let (since, limit) = match self.phase {
             Phase::Opening if !self.part.is_host() => (self.since, self.job.ready + self.job.peer),
             Phase::Booting => (self.since, self.job.ready),
-            Phase::Running => (self.agent_done?, self.result_limit()?),
-            Phase::Opening => return None,
+            Phase::Running if self.part == Part::Evaluator => (self.agent_done?, self.job.answer),
+            Phase::Opening | Phase::Running => return None,
         };
         Some(limit.saturating_sub(since.elapsed()))
     }
@@ -416,22 +403,18 @@ impl Runner {
     }
 
     fn hold_limit(&self, hold: Hold) -> Duration {
-        match (hold, &self.job.role) {
-            (Hold::Peer, _) if !self.job.alone => self.job.peer,
-            (Hold::Flush, Role::Host { flush, .. }) => *flush,
-            (Hold::Cancel, Role::Host { cancel, .. }) => *cancel,
-            _ => Duration::ZERO,
+        match hold {
+            Hold::Peer if !self.job.alone => self.job.peer,
+            Hold::Flush => self.job.flush,
+            Hold::Cancel => self.job.cancel,
+            Hold::Free | Hold::Peer => Duration::ZERO,
         }
     }
 
     /// Waits until something may have changed, at most `limit`, and handles signals and output.
     fn wait(&mut self, limit: Duration) {
-        let readable = self.poll(limit).unwrap_or_else(|error| {
-            self.say(&format!("cannot wait for events: {error}"));
-            // Only a lack of kernel memory can bring us here; a pause keeps it from becoming a busy loop.
-            std::thread::sleep(PROBE_EVERY);
-            false
-        });
+        let awake = self.signals.fds().into_iter().chain(self.folders.fd());
+        let readable = tee::wait(awake, self.tee.as_ref(), limit);
         self.terminated |= self.signals.drain();
         let written = self.folders.drain();
         if let Some(keeper) = self.keeper.as_mut().filter(|_| self.group.is_some()) {
@@ -446,28 +429,6 @@ impl Runner {
         if let Some(group) = &mut self.group {
             group.reap();
         }
-    }
-
-    /// Polls; whether the command's output is readable.
-    fn poll(&self, limit: Duration) -> nix::Result<bool> {
-        let stdout = io::stdout();
-        let awake = self.signals.fds().into_iter().chain(self.folders.fd());
-        let mut descriptors: Vec<_> = awake.map(|fd| PollFd::new(fd, PollFlags::POLLIN)).collect();
-        // Input is read only while stdout has taken all of it, so a slow reader slows the command and costs no memory.
-        let input = self.tee.as_ref().and_then(Tee::input);
-        let output = self.tee.as_ref().is_some_and(Tee::wants_stdout);
-        if let Some(input) = input {
-            descriptors.push(PollFd::new(input, PollFlags::POLLIN));
-        } else if output {
-            descriptors.push(PollFd::new(stdout.as_fd(), PollFlags::POLLOUT));
-        }
-        // A millisecond more, so that what is waited for is over when we look again.
-        let milliseconds = u16::try_from(limit.as_millis() + 1).unwrap_or(u16::MAX);
-        match poll(&mut descriptors, PollTimeout::from(milliseconds)) {
-            Ok(_) | Err(Errno::EINTR) => {}
-            Err(error) => return Err(error),
-        }
-        Ok(input.is_some() && descriptors.last().and_then(PollFd::any) == Some(true))
     }
 
     /// How the command ended, if it has.

@@ -7,7 +7,7 @@ use std::io::{self, PipeReader, PipeWriter, Read, Write};
 use std::os::fd::{AsFd, BorrowedFd};
 use std::os::unix::fs::OpenOptionsExt;
 use std::path::{Path, PathBuf};
-use std::time::Instant;
+use std::time::{Duration, Instant};
 
 use nix::errno::Errno;
 use nix::fcntl::OFlag;
@@ -16,6 +16,32 @@ use nix::poll::{PollFd, PollFlags, PollTimeout, poll};
 const BUFFER: usize = 64 << 10;
 /// A pipe that `poll` calls writable takes this much (PIPE_BUF) without blocking.
 const PIECE: usize = 4096;
+
+/// Pause where the kernel cannot wait, which only a lack of its memory brings about: no busy loop follows.
+const PAUSE: Duration = Duration::from_millis(100);
+
+/// Waits until one of these descriptors or the output has something, at most `limit`. Returns whether the output is readable.
+pub(crate) fn wait<'a>(awake: impl Iterator<Item = BorrowedFd<'a>>, tee: Option<&'a Tee>, limit: Duration) -> bool {
+    let stdout = io::stdout();
+    let mut descriptors: Vec<_> = awake.map(|fd| PollFd::new(fd, PollFlags::POLLIN)).collect();
+    // Input is read only while stdout has taken all of it, so a slow reader slows the command and costs no memory.
+    let input = tee.and_then(Tee::input);
+    if let Some(input) = input {
+        descriptors.push(PollFd::new(input, PollFlags::POLLIN));
+    } else if tee.is_some_and(Tee::wants_stdout) {
+        descriptors.push(PollFd::new(stdout.as_fd(), PollFlags::POLLOUT));
+    }
+    // A millisecond more, so that what is waited for is over when the caller looks again.
+    let milliseconds = u16::try_from(limit.as_millis() + 1).unwrap_or(u16::MAX);
+    match poll(&mut descriptors, PollTimeout::from(milliseconds)) {
+        Ok(_) | Err(Errno::EINTR) => input.is_some() && descriptors.last().and_then(PollFd::any) == Some(true),
+        Err(error) => {
+            crate::say(format_args!("cannot wait for events: {error}"));
+            std::thread::sleep(PAUSE);
+            false
+        }
+    }
+}
 
 /// Copies output.
 #[derive(Debug)]

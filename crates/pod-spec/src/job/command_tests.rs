@@ -65,14 +65,7 @@ pub(super) fn behind_runner(words: &[String], env: &mut BTreeMap<String, String>
     let args::Request::Run(job) = args::parse(words[1..].iter().map(OsString::from)).unwrap() else {
         panic!("{words:?} asks for nothing to run");
     };
-    if let args::Role::Agent {
-        program: args::Program::Driver {
-            python_path: Some(front),
-            ..
-        },
-        ..
-    } = &job.role
-    {
+    if let Some(front) = &job.python_path {
         let image = env
             .get("PYTHONPATH")
             .map(|image| format!(":{image}"))
@@ -322,21 +315,15 @@ fn the_runner_gets_the_deadlines() {
         ("simulator-3", seconds(60))
     );
     assert_eq!(simulator.status, Path::new("/tmp/status"));
+    assert_eq!((simulator.part, simulator.port), (args::Part::Simulator, Some(2200)));
     assert_eq!(
-        simulator.role,
-        args::Role::Host {
-            server: args::Server::Simulator {
-                port: 2200,
-                answer: Duration::from_secs(10),
-            },
-            flush: seconds(50),
-            cancel: seconds(40),
-            log: Some("/home/carla/CarlaUE4/Saved/console-3.log".into()),
-            gpu: Some(leaderboard_protocol::graphics::Needs::Vulkan),
-            agent_gpu: false,
-            unset: vec!["DISPLAY".into(), "XAUTHORITY".into()],
-        }
+        [simulator.answer, simulator.flush, simulator.cancel],
+        [10, 50, 40].map(seconds)
     );
+    assert_eq!(simulator.log, Some("/home/carla/CarlaUE4/Saved/console-3.log".into()));
+    let gpu = Some(leaderboard_protocol::graphics::Needs::Vulkan);
+    assert_eq!((simulator.gpu, simulator.agent_gpu), (gpu, false));
+    assert_eq!(simulator.unset, ["DISPLAY", "XAUTHORITY"]);
     assert_eq!(simulator.log_limit, 64 << 20);
     assert_eq!(
         command,
@@ -353,17 +340,12 @@ fn the_runner_gets_the_deadlines() {
     let (words, mut env) = started(container(&job, "agent-3"), &[]);
     let (agent, _) = behind_runner(&words, &mut env);
     assert_eq!(agent.member().to_string(), "agent-3");
-    let role = args::Role::Agent {
-        program: args::Program::Driver {
-            checkpoint: "/tmp/agent/agent_results.json".into(),
-            python_path: Some(FRONT.into()),
-            route_runs: Some(5),
-        },
-        work: "/tmp/agent".into(),
-        idle: seconds(30),
-        report_gpu: false,
-    };
-    assert_eq!((agent.role, agent.log_limit), (role, 2_097_152));
+    assert_eq!((agent.part, agent.route_runs), (args::Part::Driver, Some(5)));
+    assert_eq!(agent.checkpoint, Some("/tmp/agent/agent_results.json".into()));
+    assert_eq!(agent.python_path, Some(FRONT.into()));
+    assert_eq!((agent.idle, agent.agent_gpu), (Some(seconds(30)), false));
+    let log = Some("/tmp/agent/leaderboard.log".into());
+    assert_eq!((agent.log, agent.log_limit), (log, 2_097_152));
 }
 
 #[test]

@@ -17,24 +17,19 @@ fn an_evaluator_and_its_agent_stand_behind_the_runner_with_their_own_words() {
     let seconds = Duration::from_secs;
     let (words, mut env) = started(container(&job, "evaluator-2"), &[]);
     let (evaluator, command) = behind_runner(&words, &mut env);
-    let role = args::Role::Host {
-        server: args::Server::Evaluator {
-            port: Some(9100),
-            results: "/results".into(),
-            answer: seconds(60),
-            after: None,
-        },
-        flush: seconds(50),
-        cancel: seconds(40),
-        log: Some("/results/console.log".into()),
-        gpu: None,
-        agent_gpu: false,
-        unset: Vec::new(),
-    };
+    assert_eq!(evaluator.member().to_string(), "evaluator-2");
+    assert_eq!((evaluator.part, evaluator.port), (args::Part::Evaluator, Some(9100)));
     assert_eq!(
-        (evaluator.member().to_string().as_str(), &evaluator.role),
-        ("evaluator-2", &role)
+        [evaluator.answer, evaluator.flush, evaluator.cancel],
+        [60, 50, 40].map(seconds)
     );
+    assert_eq!(
+        (&evaluator.results, &evaluator.after),
+        (&Some("/results".into()), &None)
+    );
+    assert_eq!(evaluator.log, Some("/results/console.log".into()));
+    assert_eq!((evaluator.gpu, evaluator.agent_gpu), (None, false));
+    assert!(evaluator.unset.is_empty());
     assert_eq!(
         (evaluator.ready, evaluator.peer().to_string().as_str()),
         (seconds(60), "agent-2")
@@ -45,13 +40,13 @@ fn an_evaluator_and_its_agent_stand_behind_the_runner_with_their_own_words() {
 
     let (words, mut env) = started(container(&job, "agent-2"), &[]);
     let (agent, command) = behind_runner(&words, &mut env);
-    let role = args::Role::Agent {
-        program: args::Program::Plain { leaves: None },
-        work: "/tmp/agent".into(),
-        idle: seconds(30),
-        report_gpu: false,
-    };
-    assert_eq!((agent.peer().to_string().as_str(), &agent.role), ("evaluator-2", &role));
+    assert_eq!(
+        (agent.peer().to_string().as_str(), agent.part),
+        ("evaluator-2", args::Part::Plain)
+    );
+    assert_eq!((&agent.leaves, agent.idle), (&None, Some(seconds(30))));
+    assert_eq!(agent.log, Some("/tmp/agent/leaderboard.log".into()));
+    assert!(!agent.agent_gpu);
     assert_eq!(agent.log_limit, 2_097_152);
     assert_eq!(command, ["/agent", "$(EVALUATOR_ADDRESS)"]);
 }

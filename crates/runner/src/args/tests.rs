@@ -1,5 +1,7 @@
 //! Command lines, and what each becomes.
 
+use std::path::Path;
+
 use super::*;
 
 const PAIR: Pair = Pair::new(3).unwrap();
@@ -21,20 +23,14 @@ fn a_simulator_has_its_defaults() {
     assert_eq!(job.member().to_string(), "simulator-2");
     let flush = Duration::from_mins(30);
     assert_eq!(
-        job.role,
-        Role::Host {
-            server: Server::Simulator {
-                port: 2100,
-                answer: Duration::from_secs(10),
-            },
-            flush,
-            cancel: Duration::from_mins(2),
-            log: None,
-            gpu: None,
-            agent_gpu: false,
-            unset: Vec::new(),
-        }
+        (job.part, job.port, job.answer),
+        (Part::Simulator, Some(2100), Duration::from_secs(10))
     );
+    assert_eq!(
+        (job.flush, job.cancel, &job.log),
+        (flush, Duration::from_mins(2), &None)
+    );
+    assert_eq!((job.gpu, job.agent_gpu, job.unset), (None, false, Vec::new()));
     assert_eq!(job.termination_log, PathBuf::from("/dev/termination-log"));
     assert_eq!((job.log_limit, job.inotify), (2 << 30, true));
     assert_eq!(
@@ -48,45 +44,28 @@ fn a_simulator_has_its_defaults() {
 fn a_simulator_has_a_gpu_and_loses_variables() {
     let line = "simulator --pair 1 --status /s --port 1 --gpu=vulkan --agent-gpu=true --unset=DISPLAY,XAUTHORITY --root /r -- a";
     let job = job(line);
-    let Role::Host {
-        gpu, agent_gpu, unset, ..
-    } = job.role
-    else {
-        panic!("a simulator's line");
-    };
-    assert_eq!((gpu, agent_gpu, job.root), (Some(Needs::Vulkan), true, "/r".into()));
-    assert_eq!(unset, ["DISPLAY", "XAUTHORITY"]);
+    assert_eq!(
+        (job.gpu, job.agent_gpu, job.root),
+        (Some(Needs::Vulkan), true, "/r".into())
+    );
+    assert_eq!(job.unset, ["DISPLAY", "XAUTHORITY"]);
 }
 
 #[test]
 fn an_agent_has_its_defaults_and_options() {
     let line = "agent --pair 1 --status /s --checkpoint /w/c.json";
-    let role = |job: Job| match job.role {
-        Role::Agent {
-            program:
-                Program::Driver {
-                    python_path,
-                    route_runs,
-                    ..
-                },
-            work,
-            idle,
-            report_gpu,
-        } => (
-            (work, idle.as_secs(), job.log_limit),
-            python_path,
-            (report_gpu, route_runs),
-        ),
-        _ => panic!("a driver's line"),
-    };
-    assert_eq!(
-        role(job(&format!("{line} -- a"))),
-        ((WORK.into(), 800, 2 << 30), None, (false, None))
-    );
+    let first = job(&format!("{line} -- a"));
+    let log = |folder: &str| Some(Path::new(folder).join("leaderboard.log"));
+    assert_eq!((first.part, first.checkpoint), (Part::Driver, Some("/w/c.json".into())));
+    assert_eq!((first.log, first.log_limit), (log(WORK), 2 << 30));
+    assert_eq!((first.idle, first.agent_gpu), (Some(Duration::from_secs(800)), false));
+    assert_eq!((first.python_path, first.route_runs), (None, None));
     let more = job(&format!(
         "{line} --work /w --idle-seconds 3 --log-limit 9 --python-path=/a:/b --report-gpu=true --route-runs 5 -- a"
     ));
-    assert_eq!(role(more), (("/w".into(), 3, 9), Some("/a:/b".into()), (true, Some(5))));
+    assert_eq!((more.log, more.log_limit), (log("/w"), 9));
+    assert_eq!((more.idle, more.agent_gpu), (Some(Duration::from_secs(3)), true));
+    assert_eq!((more.python_path, more.route_runs), (Some("/a:/b".into()), Some(5)));
 }
 
 #[test]
@@ -97,37 +76,37 @@ fn an_evaluator_has_its_defaults_and_options() {
         (first.member(), first.peer()),
         (PAIR.host(Host::Evaluator), PAIR.agent())
     );
-    let expected = Server::Evaluator {
-        port: None,
-        results: "/r".into(),
-        answer: Duration::from_mins(10),
-        after: None,
-    };
-    assert!(matches!(&first.role, Role::Host { server, .. } if *server == expected));
+    assert_eq!(
+        (first.part, first.port, first.answer),
+        (Part::Evaluator, None, Duration::from_mins(10))
+    );
+    assert_eq!((first.result(), &first.after), (Some("/r/result.json".into()), &None));
     assert_eq!([first.ready, first.grace].map(|time| time.as_secs()), [3600, 30]);
     let more = job(&format!(
         "{line} --port=9000 --answer-seconds 7 --after /others --log /r/c.log --gpu=any -- a"
     ));
-    let expected = Server::Evaluator {
-        port: Some(9000),
-        results: "/r".into(),
-        answer: Duration::from_secs(7),
-        after: Some("/others".into()),
-    };
-    assert!(matches!(more.role, Role::Host { server, log: Some(_), gpu: Some(Needs::Any), .. } if server == expected));
+    assert_eq!(
+        (more.port, more.answer, more.gpu),
+        (Some(9000), Duration::from_secs(7), Some(Needs::Any))
+    );
+    assert_eq!(
+        (more.log, more.after),
+        (Some("/r/c.log".into()), Some("/others".into()))
+    );
 }
 
 #[test]
 fn an_evaluators_agent_is_a_plain_program() {
     let job = job("agent --pair 3 --status /s --host=evaluator --idle-seconds 3 -- a");
     assert_eq!((job.member(), job.peer()), (PAIR.agent(), PAIR.host(Host::Evaluator)));
-    let expected = Role::Agent {
-        program: Program::Plain { leaves: None },
-        work: WORK.into(),
-        idle: Duration::from_secs(3),
-        report_gpu: false,
-    };
-    assert_eq!((job.role, job.grace), (expected, Duration::from_secs(20)));
+    assert_eq!(
+        (job.part, job.idle, job.leaves),
+        (Part::Plain, Some(Duration::from_secs(3)), None)
+    );
+    assert_eq!(
+        (job.checkpoint, job.agent_gpu, job.grace),
+        (None, false, Duration::from_secs(20))
+    );
 }
 
 #[test]
@@ -275,11 +254,8 @@ fn an_evaluator_and_its_agent_may_be_alone() {
 fn an_agent_that_is_alone_may_leave_files() {
     let line = "agent --pair 1 --status /s --host evaluator --alone";
     for (option, expected) in [("", None), ("--leaves=/l", Some("/l")), ("--leaves /l", Some("/l"))] {
-        let Role::Agent { program, .. } = job(&format!("{line} {option} -- a")).role else {
-            panic!("an agent's line");
-        };
-        let leaves = expected.map(PathBuf::from);
-        assert_eq!(program, Program::Plain { leaves }, "{option}");
+        let leaves = job(&format!("{line} {option} -- a")).leaves;
+        assert_eq!(leaves, expected.map(PathBuf::from), "{option}");
     }
 }
 

@@ -4,7 +4,6 @@
 //! into its folder. So the host asks for the report of the agent's runner before that, believes it, and asks no more later.
 
 use leaderboard_protocol::files::{Mark, StatusFile};
-use leaderboard_runner::args::Role;
 use leaderboard_runner::graphics;
 
 use super::Runner;
@@ -13,7 +12,7 @@ use crate::decide::{AgentGpu, Cause, Phase};
 impl Runner {
     /// An agent reports what it sees, before it does anything else.
     pub(super) fn report_gpu(&mut self) -> Result<(), Cause> {
-        if !matches!(self.job.role, Role::Agent { report_gpu: true, .. }) {
+        if self.part.is_host() || !self.job.agent_gpu {
             return Ok(());
         }
         let is_there = graphics::devices(&self.job.root) > 0;
@@ -27,7 +26,7 @@ impl Runner {
 
     /// GPU of the agent, as its host has read it.
     pub(super) fn agent_gpu(&self) -> AgentGpu {
-        let is_asked = !self.job.alone && matches!(self.job.role, Role::Host { agent_gpu: true, .. });
+        let is_asked = !self.job.alone && self.part.is_host() && self.job.agent_gpu;
         if !is_asked || self.phase != Phase::Booting || self.has_announced() {
             return AgentGpu::NotAsked;
         }

@@ -6,14 +6,12 @@
 use std::path::Path;
 use std::time::{Duration, Instant};
 
-use leaderboard_protocol::files::{Host, Mark, Pair, RESULT, StatusFile};
-use leaderboard_runner::args::{Program, Role, Server};
-
 use super::Runner;
 use crate::decide::{Cause, Part};
 use crate::group::Status;
 use crate::result::{self, REFUSED, State};
 use crate::{checkpoint, left_files, report};
+use leaderboard_protocol::files::{Host, Mark, Pair, RESULT, StatusFile};
 
 /// Time that an evaluator with a complete result has to end by itself: what it has printed last may still be in its own buffers.
 const LAST_WORDS: Duration = Duration::from_secs(5);
@@ -29,15 +27,7 @@ impl Runner {
 
     /// True if a pair before this one is not done, or has no final result, and the evaluator's command begins after them.
     pub(super) fn is_held(&self) -> bool {
-        let Role::Host {
-            server: Server::Evaluator {
-                after: Some(folder), ..
-            },
-            ..
-        } = &self.job.role
-        else {
-            return false;
-        };
+        let Some(folder) = &self.job.after else { return false };
         let mut before = Pair::first(self.job.pair.index());
         !before.all(|pair| {
             // All its processes have ended then, so that nothing is written any more.
@@ -62,44 +52,22 @@ impl Runner {
         }
     }
 
-    /// How long an evaluator may take for its result once its agent is done.
-    pub(super) fn result_limit(&self) -> Option<Duration> {
-        match self.job.role {
-            Role::Host {
-                server: Server::Evaluator { answer, .. },
-                ..
-            } => Some(answer),
-            _ => None,
-        }
-    }
-
     /// Completeness of the results, and what is left, in words. Asked once every process has ended.
     pub(super) fn results(&self, cause: Cause) -> (bool, Option<String>) {
-        match (&self.job.role, self.job.result()) {
-            (_, Some(path)) => {
+        let job = &self.job;
+        match (self.part, job.result(), &job.checkpoint) {
+            (_, Some(path), _) => {
                 let state = self.result(&path, cause);
                 (state.is_complete(), Some(state.to_string()))
             }
-            (
-                Role::Agent {
-                    program: Program::Driver { checkpoint, .. },
-                    ..
-                },
-                _,
-            ) if self.group.is_some() => {
+            (_, _, Some(checkpoint)) if self.group.is_some() => {
                 checkpoint::make_readable(checkpoint);
                 let found = checkpoint::read(checkpoint);
                 let complete = matches!(&found, Ok(found) if found.complete || self.is_driven(found));
                 (complete, Some(report::of_checkpoint(&found)))
             }
-            (
-                Role::Agent {
-                    program: Program::Plain { leaves },
-                    ..
-                },
-                _,
-            ) if self.status() == Some(Status::Exited(0)) => {
-                if let Some(folder) = leaves {
+            (Part::Plain, ..) if self.status() == Some(Status::Exited(0)) => {
+                if let Some(folder) = &job.leaves {
                     left_files::make_readable(folder, left_files::ENTRIES);
                 }
                 (true, None)

@@ -4,7 +4,6 @@
 //! sensors, which are named at the set-up of a route. The file's own total is no measure: a checkpoint can be of an earlier plan.
 
 use leaderboard_protocol::files::Mark;
-use leaderboard_runner::args::{Program, Role};
 
 use super::Runner;
 use crate::checkpoint::{self, Checkpoint};
@@ -13,11 +12,7 @@ use crate::decide::Cause;
 impl Runner {
     /// An agent whose routes are all driven is done before it begins. Its simulator, which waits for no more than that, ends too.
     pub(super) fn close_if_driven(&mut self) -> Result<(), Cause> {
-        let Role::Agent {
-            program: Program::Driver { checkpoint, .. },
-            ..
-        } = &self.job.role
-        else {
+        let Some(checkpoint) = &self.job.checkpoint else {
             return Ok(());
         };
         if let Some(keeper) = &mut self.keeper {
@@ -34,13 +29,6 @@ impl Runner {
 
     /// True if the checkpoint has all routes that were to be driven.
     pub(super) fn is_driven(&self, found: &Checkpoint) -> bool {
-        let Role::Agent {
-            program: Program::Driver { route_runs, .. },
-            ..
-        } = self.job.role
-        else {
-            return false;
-        };
-        route_runs.is_some() && found.driven == route_runs
+        self.job.route_runs.is_some() && found.driven == self.job.route_runs
     }
 }

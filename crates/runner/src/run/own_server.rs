@@ -4,8 +4,6 @@
 use std::ops::RangeInclusive;
 use std::time::{Duration, Instant};
 
-use leaderboard_runner::args::{Role, Server};
-
 use super::Runner;
 use crate::decide::{Cause, Part, Phase};
 use crate::report;
@@ -17,13 +15,9 @@ const MANY_CONNECTIONS: usize = 256;
 impl Runner {
     /// Ports that a host's command may take, the one that its agent knows first.
     fn ports(&self) -> Option<RangeInclusive<u16>> {
-        let Role::Host { server, .. } = &self.job.role else {
-            return None;
-        };
-        match server {
-            Server::Simulator { port, .. } => Some(server::ports_of(*port)),
-            Server::Evaluator { port, .. } => port.map(|port| port..=port),
-        }
+        let port = self.job.port?;
+        let has_more = self.part == Part::Simulator;
+        Some(if has_more { server::ports_of(port) } else { port..=port })
     }
 
     /// True if a host's command can be reached. One without a port cannot be late. Another container's listener is no readiness.
@@ -78,7 +72,7 @@ impl Runner {
     pub(super) fn of_its_ports(&mut self, cause: Cause) -> Cause {
         let Some(ports) = self.ports() else { return cause };
         let has_failed = self.phase == Phase::Booting && matches!(cause, Cause::ChildEnded | Cause::NotReady);
-        if !has_failed || !server::may_agents_run(&self.job.status, self.job.host()) {
+        if !has_failed || !server::may_agents_run(&self.job.status, self.part.host()) {
             return cause;
         }
         if let Some(port) = self.taken_port.or_else(|| server::held(ports)) {
@@ -94,11 +88,7 @@ impl Runner {
 
     /// True if a simulator's server hangs. One that ends while it is asked does not.
     fn is_server_silent(&mut self) -> bool {
-        let Role::Host {
-            server: Server::Simulator { port, answer },
-            ..
-        } = self.job.role
-        else {
+        let (Part::Simulator, Some(port)) = (self.part, self.job.port) else {
             return false;
         };
         let begin = Instant::now();
@@ -108,7 +98,7 @@ impl Runner {
             if has_ended || self.terminated || question.as_mut().is_ok_and(Question::is_answered) {
                 return false;
             }
-            if begin.elapsed() >= answer {
+            if begin.elapsed() >= self.job.answer {
                 return true;
             }
             self.wait(Duration::from_millis(20));
