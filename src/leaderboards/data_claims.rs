@@ -5,21 +5,19 @@
 use k8s_openapi::api::core::v1::PersistentVolumeClaim;
 use kube::{Api, Client, ResourceExt};
 
-use super::priority::Problems;
+use super::tried_pods::TriedPods;
 use crate::kubernetes::call;
 use leaderboard_api::{DataSource, Leaderboard};
 
 /// Reads the claims that the Leaderboard names.
-pub(super) async fn look(client: &Client, leaderboard: &Leaderboard) -> Problems {
+pub(super) async fn look(client: &Client, leaderboard: &Leaderboard, tried: &mut TriedPods) {
     let namespace = leaderboard.namespace().unwrap_or_default();
     let api: Api<PersistentVolumeClaim> = Api::namespaced(client.clone(), &namespace);
-    let mut problems = Problems::default();
     for (field, claim) in named(leaderboard) {
         if let Ok(found) = call("reading the PersistentVolumeClaim", claim, api.get_opt(claim)).await {
-            judge(field, claim, found.map(access_modes).as_deref(), &mut problems);
+            judge(field, claim, found.map(access_modes).as_deref(), tried);
         }
     }
-    problems
 }
 
 /// The claims, each with the field that names it.
@@ -43,11 +41,11 @@ fn access_modes(claim: PersistentVolumeClaim) -> Vec<String> {
 }
 
 /// `modes`: its access modes; None: there is no such claim.
-fn judge(field: &str, claim: &str, modes: Option<&[String]>, problems: &mut Problems) {
+fn judge(field: &str, claim: &str, modes: Option<&[String]>, tried: &mut TriedPods) {
     let what = format!("PersistentVolumeClaim {claim} of evaluation.container.{field}");
     let Some(modes) = modes else {
         let text = format!("{what} does not exist in this namespace. Create it, or correct its name.");
-        problems.refused.get_or_insert(text);
+        tried.refused.get_or_insert(text);
         return;
     };
     let is = |mode: &str| modes.iter().any(|found| found == mode);
@@ -59,7 +57,7 @@ fn judge(field: &str, claim: &str, modes: Option<&[String]>, problems: &mut Prob
     } else {
         "by one Pod at a time, so that submissions run one by one"
     };
-    problems.notes.push(format!(
+    tried.notes.push(format!(
         "{what} can be mounted {limit}. Use one with ReadOnlyMany or ReadWriteMany."
     ));
 }
@@ -121,7 +119,7 @@ mod tests {
                 Some("can be mounted by one Pod at a time"),
             ),
         ] {
-            let mut problems = Problems::default();
+            let mut problems = TriedPods::default();
             judge("dataset", "d", seen.as_deref(), &mut problems);
             let begins = |found: Option<&String>, rest: Option<&str>| match (found, rest) {
                 (Some(found), Some(rest)) => found.starts_with(&format!("{what} {rest}")),
@@ -165,7 +163,8 @@ mod tests {
                 *response.status_mut() = StatusCode::from_u16(code).unwrap();
                 send.send_response(response);
             };
-            let (found, ()) = tokio::join!(look(&client, &board), serve);
+            let mut found = TriedPods::default();
+            tokio::join!(look(&client, &board, &mut found), serve);
             assert_eq!(
                 (found.refused.is_some(), found.notes.len()),
                 (is_refused, notes),

@@ -197,8 +197,8 @@ async fn apply(client: &Client, leaderboard: &Leaderboard) -> Policy {
     }
 }
 
-/// The last measurement for this generation: that of a Pod which this process has seen, or else that of the condition, which is remembered
-/// while the condition shows something else. None if there is none, or the condition does not show any.
+/// The last measurement for this generation: that of a Pod which this process has seen, or else that of the condition. It is remembered while
+/// the condition shows something else. None if there is none, or the condition does not show any.
 pub(super) fn measured(state: &LeaderboardState, leaderboard: &Leaderboard) -> Option<WorkspaceVerdict> {
     let network = &leaderboard.spec.network;
     if network.policy == PolicySource::External || network.enforcement == Enforcement::Disabled {

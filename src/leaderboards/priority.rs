@@ -8,6 +8,7 @@ use k8s_openapi::api::scheduling::v1::PriorityClass;
 use kube::{Api, Client};
 use serde_json::Value;
 
+use super::tried_pods::TriedPods;
 use crate::kubernetes::call;
 use leaderboard_api::Track;
 use leaderboard_pod_spec::notes::TrackPods;
@@ -18,14 +19,6 @@ pub(super) struct Asked {
     tracks: Vec<String>,
     /// By `priorityClassName` of a track; else by `podOverrides`.
     is_of_track: bool,
-}
-
-/// Problems of the classes.
-#[derive(Clone, Debug, Default, PartialEq, Eq)]
-pub(super) struct Problems {
-    /// No Pod could be made, or it would preempt against the rule of the field.
-    pub(super) refused: Option<String>,
-    pub(super) notes: Vec<String>,
 }
 
 /// The classes that the Pods of the tracks have.
@@ -43,19 +36,17 @@ pub(super) fn asked(tracks: &[Track], pods: &[TrackPods]) -> BTreeMap<String, As
     found
 }
 
-/// Reads the classes.
-pub(super) async fn look(client: &Client, asked: &BTreeMap<String, Asked>) -> Problems {
+/// Reads the classes. One is refused if no Pod could be made, or if it would preempt against the rule of the field.
+pub(super) async fn look(client: &Client, asked: &BTreeMap<String, Asked>, tried: &mut TriedPods) {
     let api: Api<PriorityClass> = Api::all(client.clone());
-    let mut problems = Problems::default();
     for (class, asked) in asked {
         if let Ok(found) = call("reading the PriorityClass", class, api.get_opt(class)).await {
-            judge(class, asked, found.as_ref(), &mut problems);
+            judge(class, asked, found.as_ref(), tried);
         }
     }
-    problems
 }
 
-fn judge(class: &str, asked: &Asked, found: Option<&PriorityClass>, problems: &mut Problems) {
+fn judge(class: &str, asked: &Asked, found: Option<&PriorityClass>, tried: &mut TriedPods) {
     let named = if asked.tracks.len() == 1 { "track" } else { "tracks" };
     let tracks = asked.tracks.join(", ");
     let what = format!("PriorityClass {class} of the {named} {tracks}");
@@ -68,9 +59,9 @@ fn judge(class: &str, asked: &Asked, found: Option<&PriorityClass>, problems: &m
         ),
     };
     if found.is_none() || asked.is_of_track {
-        problems.refused.get_or_insert(text);
+        tried.refused.get_or_insert(text);
     } else {
-        problems.notes.push(text);
+        tried.notes.push(text);
     }
 }
 
@@ -124,7 +115,7 @@ mod tests {
                 tracks: vec!["a".into(), "b".into()],
                 is_of_track,
             };
-            let mut problems = Problems::default();
+            let mut problems = TriedPods::default();
             judge("high", &asked, seen, &mut problems);
             let found = (problems.refused.is_some(), !problems.notes.is_empty());
             assert_eq!(found, (is_refused, has_note), "{seen:?} {is_of_track}");

@@ -106,34 +106,32 @@ async fn try_templates(client: &Client, settings: &Settings, leaderboard: &Leade
     let jobs: Vec<(&Track, DynamicObject)> = tracks
         .filter_map(|track| Some((track, sample_job(settings, leaderboard, track)?)))
         .collect();
-    let template = |job: &DynamicObject| job.data.pointer("/spec/template").cloned().unwrap_or_default();
     let pods_of = |(track, job): &(&Track, DynamicObject)| TrackPods {
         track: track.name.clone(),
-        template: template(job),
+        template: job.data.pointer("/spec/template").cloned().unwrap_or_default(),
     };
     let pods: Vec<TrackPods> = jobs.iter().map(pods_of).collect();
     let hosts = match leaderboard.spec.network.dns {
         Dns::None => endpoints::of_pods(&leaderboard.spec, settings.own.region.as_deref()).await,
         Dns::Cluster => Ok(Vec::new()),
     };
-    let mut templates = jobs.iter().map(|(_, job)| template(job));
-    let unclear = templates.find_map(|template| job_spec::unclear(&leaderboard.spec, &template));
+    let unclear = (pods.iter()).find_map(|pods| job_spec::unclear(&leaderboard.spec, &pods.template));
     let refused = match (unclear, jobs.first()) {
         (Some(unclear), _) => Some(unclear),
         (None, Some((_, job))) => refused_job(client, leaderboard, job).await,
         (None, None) => None,
     };
     let asked = priority::asked(&leaderboard.spec.tracks, &pods);
-    let classes = priority::look(client, &asked).await;
-    let data = data_claims::look(client, leaderboard).await;
     let notes = notes(&pods).into_iter().chain(pod_notes::unnamed(&pods, hosts));
-    let notes = notes.chain(pod_notes::unused(&leaderboard.spec));
-    TriedPods {
-        refused: refused.or(classes.refused).or(data.refused),
-        notes: notes.chain(classes.notes).chain(data.notes).collect(),
+    let mut tried = TriedPods {
+        refused,
+        notes: notes.chain(pod_notes::unused(&leaderboard.spec)).collect(),
         claims: Claims::default(),
         may_change: !asked.is_empty(),
-    }
+    };
+    priority::look(client, &asked, &mut tried).await;
+    data_claims::look(client, leaderboard, &mut tried).await;
+    tried
 }
 
 async fn refused_job(client: &Client, leaderboard: &Leaderboard, job: &DynamicObject) -> Option<String> {
