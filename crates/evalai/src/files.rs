@@ -14,13 +14,14 @@ use url::Url;
 
 use super::answer::{About, Answer, Refusal, Silence};
 use super::row::{FileUrl, image};
-use super::transport::{Body, Failure, Need, Timeouts, Transport, late, read, send, unsendable};
+use super::transport::{Body, Failure, Timeouts, Transport, body, late, send, unsendable};
 use super::types::{ImageAnswer, Key};
 
 /// Largest file that is read for the image that it names, in bytes.
 const LARGEST_UPLOAD: usize = 64 << 10;
 /// How often a file may be somewhere else.
 const REDIRECTS: usize = 5;
+const READING: &str = "reading the uploaded file";
 const PAGE: &str = "the address of the uploaded file answers with a page and not with the file";
 
 /// Where the uploaded file of a submission is. Its `Debug` does not show the address.
@@ -51,12 +52,6 @@ pub enum InputError {
     Silent(String),
 }
 
-/// Why no answer came that has a file.
-enum Unfound {
-    Refused(String),
-    Silent(Silence),
-}
-
 /// Reads uploaded files.
 pub(super) struct Files {
     transport: Arc<dyn Transport>,
@@ -70,11 +65,18 @@ impl Files {
 
     /// The image that an uploaded file names.
     pub(super) async fn image(&self, url: &FileUrl) -> Answer<ImageAnswer> {
-        let end = Instant::now() + self.timeouts.read;
-        match self.found(url, end).await {
-            Ok(response) => content(response, end).await,
-            Err(Unfound::Refused(why)) => refused(why),
-            Err(Unfound::Silent(silence)) => Answer::Unanswered(silence),
+        let read = async { body(self.open(url).await?, LARGEST_UPLOAD).await };
+        let read = timeout(self.timeouts.read, read).await;
+        match read.unwrap_or_else(|_| Err(InputError::Silent(late(READING).why))) {
+            // No JSON begins so: a login page, or the start page of a web application, stands in the file's place.
+            Ok(Some(file)) if file.trim_ascii_start().starts_with(b"<") => refused(check_media_url(PAGE)),
+            Ok(Some(file)) => Answer::Done(image(&file).map_or_else(ImageAnswer::NotAnImage, ImageAnswer::Named)),
+            Ok(None) => {
+                let why = format!("the uploaded file is larger than {LARGEST_UPLOAD} bytes");
+                Answer::Done(ImageAnswer::NotAnImage(why))
+            }
+            Err(InputError::Silent(why)) => Answer::Unanswered(Silence { sent: true, why }),
+            Err(error) => refused(error.to_string()),
         }
     }
 
@@ -82,10 +84,7 @@ impl Files {
     /// whole.
     pub(super) async fn open(&self, url: &FileUrl) -> Result<InputStream, InputError> {
         let end = Instant::now() + self.timeouts.read;
-        let response = self.found(url, end).await.map_err(|unfound| match unfound {
-            Unfound::Refused(why) => InputError::Refused(why),
-            Unfound::Silent(silence) => InputError::Silent(silence.why),
-        })?;
+        let response = self.found(url, end).await?;
         let answers = |code: u16| format!("the address of the uploaded file answers {code}");
         match response.status().as_u16() {
             200 if is_page(url, &response) => Err(InputError::Refused(check_media_url(PAGE))),
@@ -97,7 +96,7 @@ impl Files {
     }
 
     /// The first answer that is no redirect.
-    async fn found(&self, url: &FileUrl, end: Instant) -> Result<Response<Body>, Unfound> {
+    async fn found(&self, url: &FileUrl, end: Instant) -> Result<Response<Body>, InputError> {
         let mut url = Url::parse(url.as_str()).map_err(|_| unfound("the address of the uploaded file is no URL"))?;
         for _ in 0..=REDIRECTS {
             let response = send(&*self.transport, get(&url)?, end).await.map_err(failed)?;
@@ -112,16 +111,16 @@ impl Files {
     }
 }
 
-fn get(url: &Url) -> Result<Request<Bytes>, Unfound> {
+fn get(url: &Url) -> Result<Request<Bytes>, InputError> {
     if !["http", "https"].contains(&url.scheme()) {
         return Err(unfound("the address of the uploaded file is neither http nor https"));
     }
     let request = Request::get(url.as_str()).body(Bytes::new());
-    request.map_err(|error| Unfound::Silent(unsendable(&error)))
+    request.map_err(|error| InputError::Silent(unsendable(&error).why))
 }
 
 /// Where a redirect leads; None: this is the answer.
-fn next(url: &Url, response: &Response<Body>) -> Option<Result<Url, Unfound>> {
+fn next(url: &Url, response: &Response<Body>) -> Option<Result<Url, InputError>> {
     let redirects = [
         StatusCode::MOVED_PERMANENTLY,
         StatusCode::FOUND,
@@ -153,7 +152,7 @@ fn chunks(response: Response<Body>, longest: Duration) -> InputStream {
     let begun = (response.into_body(), 0_u64);
     let chunks = stream::try_unfold(begun, move |(mut body, read)| async move {
         let next = timeout(longest, body.try_next()).await;
-        let next = next.unwrap_or_else(|_| Err(late("reading the uploaded file")));
+        let next = next.unwrap_or_else(|_| Err(late(READING)));
         match next.map_err(|silence| InputError::Silent(silence.why))? {
             Some(chunk) => {
                 let read = read.saturating_add(chunk.len() as u64);
@@ -170,35 +169,17 @@ fn chunks(response: Response<Body>, longest: Duration) -> InputStream {
     chunks.boxed()
 }
 
-async fn content(response: Response<Body>, end: Instant) -> Answer<ImageAnswer> {
-    match read(response, end, LARGEST_UPLOAD, Need::Body).await {
-        // The file is there, and too large for what names an image.
-        Answer::Refused(refusal) if (200..300).contains(&refusal.status) => {
-            let why = format!("the uploaded file is larger than {LARGEST_UPLOAD} bytes");
-            Answer::Done(ImageAnswer::NotAnImage(why))
-        }
-        other => other.and_then(|(_, body)| {
-            // No JSON begins so: a login page, or the start page of a web application, stands in the file's place.
-            if body.trim_ascii_start().starts_with(b"<") {
-                return refused(check_media_url(PAGE));
-            }
-            let named = image(&body).map(ImageAnswer::Named);
-            Answer::Done(named.unwrap_or_else(ImageAnswer::NotAnImage))
-        }),
-    }
-}
-
-fn failed(failure: Failure) -> Unfound {
+fn failed(failure: Failure) -> InputError {
     match failure {
-        Failure::Silent(silence) => Unfound::Silent(silence),
+        Failure::Silent(silence) => InputError::Silent(silence.why),
         Failure::NotPublic(error) => unfound(&format!(
             "the uploaded file is not read: {error}, and no part of evalai.apiServer"
         )),
     }
 }
 
-fn unfound(why: &str) -> Unfound {
-    Unfound::Refused(check_media_url(why))
+fn unfound(why: &str) -> InputError {
+    InputError::Refused(check_media_url(why))
 }
 
 fn check_media_url(why: &str) -> String {

@@ -106,7 +106,7 @@ pub(super) async fn send(
     response.unwrap_or_else(|_| Err(Failure::Silent(late("error sending request"))))
 }
 
-pub(super) async fn read(response: Response<Body>, end: Instant, largest: usize, need: Need) -> Answer<(u16, Vec<u8>)> {
+async fn read(response: Response<Body>, end: Instant, largest: usize, need: Need) -> Answer<(u16, Vec<u8>)> {
     let status = response.status();
     let code = status.as_u16();
     let retry_after = response
@@ -124,8 +124,11 @@ pub(super) async fn read(response: Response<Body>, end: Instant, largest: usize,
     classify(code, retry_after.as_deref(), &body).map(|()| (code, body))
 }
 
-/// A whole body; none if it has more than `largest` bytes.
-async fn body(mut chunks: Body, largest: usize) -> Result<Option<Vec<u8>>, Silence> {
+/// All that comes; none if that is more than `largest` bytes.
+pub(super) async fn body<E>(
+    mut chunks: BoxStream<'static, Result<Bytes, E>>,
+    largest: usize,
+) -> Result<Option<Vec<u8>>, E> {
     let mut body = Vec::new();
     while let Some(chunk) = chunks.try_next().await? {
         if body.len() + chunk.len() > largest {
