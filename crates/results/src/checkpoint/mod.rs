@@ -10,7 +10,7 @@ pub(crate) use record::{Meta, Record, Scores};
 use crate::json::{self, Limit, ReadError, Text, Value};
 use crate::names::{CRASHED, FINISHED, INVALID};
 use crate::plan::Verify;
-use crate::{Plan, Refusal};
+use crate::{Plan, RecordName, RecordProblem, Refusal};
 
 const MAX_RECORDS: usize = 10_000;
 const MAX_SENSORS: usize = 1_000;
@@ -175,7 +175,7 @@ struct File {
 
 impl File {
     fn of(pair: usize, value: Value) -> Result<Self, Refusal> {
-        let shape = |place, wanted| Refusal::Shape { pair, place, wanted };
+        let shape = |place, wanted| shape(pair, place, wanted);
         let Value::Object(mut outer) = value else {
             return Err(shape("the whole file", "an object"));
         };
@@ -205,35 +205,27 @@ impl File {
     }
 }
 
+fn shape(pair: usize, place: &'static str, wanted: &'static str) -> Refusal {
+    Refusal::Shape { pair, place, wanted }
+}
+
 fn sensors(plan: &Plan, pair: usize, value: &Value) -> Result<Vec<Text>, Refusal> {
     if value.is_falsy() {
         return Ok(Vec::new());
     }
-    let list = value.as_list().ok_or(Refusal::Shape {
-        pair,
-        place: "sensors",
-        wanted: "a list",
-    })?;
+    let list = value.as_list().ok_or(shape(pair, "sensors", "a list"))?;
     if list.len() > MAX_SENSORS {
-        return Err(Refusal::Limit {
-            pair,
-            limit: Limit::Sensors,
-        });
+        let limit = Limit::Sensors;
+        return Err(Refusal::Limit { pair, limit });
     }
     let mut sensors = Vec::with_capacity(list.len());
-    for (i, item) in list.iter().enumerate() {
+    for (sensor, item) in (1..).zip(list) {
         let Value::Text(text) = item else {
-            return Err(Refusal::Shape {
-                pair,
-                place: "sensors",
-                wanted: "a list of names",
-            });
+            return Err(shape(pair, "sensors", "a list of names"));
         };
         if plan.is_pod() && text.as_str().and_then(crate::names::sensor_name).is_none() {
-            return Err(Refusal::Sensor {
-                pair: Some(pair),
-                sensor: i.saturating_add(1),
-            });
+            let pair = Some(pair);
+            return Err(Refusal::Sensor { pair, sensor });
         }
         sensors.push(text.clone());
     }
@@ -241,11 +233,7 @@ fn sensors(plan: &Plan, pair: usize, value: &Value) -> Result<Vec<Text>, Refusal
 }
 
 fn total(plan: &Plan, pair: usize, progress: &[Value]) -> Result<u32, Refusal> {
-    let shape = Refusal::Shape {
-        pair,
-        place: "_checkpoint.progress",
-        wanted: "a pair of whole numbers",
-    };
+    let shape = shape(pair, "_checkpoint.progress", "a pair of whole numbers");
     let [done, Value::Int(total @ 0..=MAX_TOTAL), ..] = progress else {
         return Err(shape);
     };
@@ -258,21 +246,19 @@ fn total(plan: &Plan, pair: usize, progress: &[Value]) -> Result<u32, Refusal> {
 
 fn records(plan: &Plan, pair: usize, values: Vec<Value>) -> Result<Vec<Record>, Refusal> {
     if values.len() > MAX_RECORDS {
-        return Err(Refusal::Limit {
-            pair,
-            limit: Limit::Records,
-        });
+        let limit = Limit::Records;
+        return Err(Refusal::Limit { pair, limit });
     }
     let mut records = Vec::with_capacity(values.len());
     for (place, value) in (1..).zip(values) {
-        let record = Record::of(plan.format, place, value).map_err(|(record, problem)| Refusal::Record {
-            pair,
-            record,
-            problem,
-        })?;
-        records.push(record);
+        let record = Record::of(plan.format, place, value);
+        records.push(record.map_err(|(record, problem)| refused(pair, record, problem))?);
     }
     Ok(records)
+}
+
+fn refused(pair: usize, record: RecordName, problem: RecordProblem) -> Refusal {
+    Refusal::Record { pair, record, problem }
 }
 
 fn verified(plan: &Plan, pair: usize, records: &[Record]) -> Result<Vec<String>, Refusal> {
@@ -282,11 +268,7 @@ fn verified(plan: &Plan, pair: usize, records: &[Record]) -> Result<Vec<String>,
     }
     for record in records {
         if let Err(problem) = verify::check(plan.format, record) {
-            let refusal = Refusal::Record {
-                pair,
-                record: record.name.clone(),
-                problem,
-            };
+            let refusal = refused(pair, record.name.clone(), problem);
             if plan.verify == Verify::Refuse {
                 return Err(refusal);
             }

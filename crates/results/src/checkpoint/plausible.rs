@@ -5,7 +5,7 @@ use std::collections::HashMap;
 
 use super::record::Record;
 use crate::names::{self, MIN_SPEED};
-use crate::plan::{Format, Plan};
+use crate::plan::{Format, Plan, Slice};
 use crate::{RecordName, RecordProblem, Refusal};
 
 /// No route is longer than 10,000 km, no drive takes longer than 100 days.
@@ -17,18 +17,12 @@ const LEAST_DURATION: f64 = 1e-6;
 pub(super) fn check_file(plan: &Plan, pair: usize, total: u32, records: &[Record]) -> Result<(), Refusal> {
     if let Some(expected) = plan.expected_of(pair) {
         if total != expected {
-            return Err(Refusal::Total {
-                pair,
-                found: total,
-                expected,
-            });
+            let found = total;
+            return Err(Refusal::Total { pair, found, expected });
         }
-        if u32::try_from(records.len()).is_ok_and(|found| found > expected) {
-            return Err(Refusal::TooManyRecords {
-                pair,
-                found: records.len(),
-                expected,
-            });
+        let found = records.len();
+        if u32::try_from(found).is_ok_and(|found| found > expected) {
+            return Err(Refusal::TooManyRecords { pair, found, expected });
         }
     }
     // V1 names all repetitions of a route alike.
@@ -39,11 +33,7 @@ pub(super) fn check_file(plan: &Plan, pair: usize, total: u32, records: &[Record
     };
     let mut runs: HashMap<(i64, i64), u32> = HashMap::new();
     for record in records {
-        let refuse = |problem| Refusal::Record {
-            pair,
-            record: record.name.clone(),
-            problem,
-        };
+        let refuse = |problem| super::refused(pair, record.name.clone(), problem);
         check(plan, pair, record).map_err(refuse)?;
         let times = runs.entry(record.key).or_default();
         *times = times.saturating_add(1);
@@ -57,21 +47,17 @@ pub(super) fn check_file(plan: &Plan, pair: usize, total: u32, records: &[Record
 fn check(plan: &Plan, pair: usize, record: &Record) -> Result<(), RecordProblem> {
     let (route, repetition) = record.key;
     if matches!(record.name, RecordName::Place(_)) || route < 0 || repetition < 0 {
-        return Err(RecordProblem::RouteId {
-            repetition: plan.format == Format::V2,
-        });
+        let repetition = plan.format == Format::V2;
+        return Err(RecordProblem::RouteId { repetition });
     }
     if let Some(slice) = plan.pairs.get(pair) {
         if !slice.contains(route) {
-            return Err(RecordProblem::OutsideSlice {
-                first: slice.first,
-                last: slice.last,
-            });
+            let Slice { first, last } = *slice;
+            return Err(RecordProblem::OutsideSlice { first, last });
         }
-        if !(0..i64::from(plan.repetitions)).contains(&repetition) {
-            return Err(RecordProblem::Repetition {
-                repetitions: plan.repetitions,
-            });
+        let repetitions = plan.repetitions;
+        if !(0..i64::from(repetitions)).contains(&repetition) {
+            return Err(RecordProblem::Repetition { repetitions });
         }
     }
     if !names::is_known_status(plan.format, &record.status) {

@@ -83,17 +83,11 @@ impl Record {
         let Value::Object(object) = value else {
             return Err(unnamed(RecordProblem::NotAnObject));
         };
-        let route_id = object.get("route_id").and_then(Value::as_str).ok_or_else(|| {
-            unnamed(RecordProblem::Shape {
-                key: "route_id",
-                wanted: "a text",
-            })
-        })?;
-        let key = route_key(format, route_id).ok_or_else(|| {
-            unnamed(RecordProblem::RouteId {
-                repetition: format == Format::V2,
-            })
-        })?;
+        let route_id = object.get("route_id").and_then(Value::as_str);
+        let route_id = route_id.ok_or_else(|| unnamed(shape("route_id", "a text")))?;
+        let repetition = format == Format::V2;
+        let key = route_key(format, route_id);
+        let key = key.ok_or_else(|| unnamed(RecordProblem::RouteId { repetition }))?;
         let name = name(format, place, route_id, key);
         let named = |problem| (name.clone(), problem);
 
@@ -154,13 +148,14 @@ fn name(format: Format, place: usize, route_id: &str, (id, repetition): (i64, i6
     }
 }
 
+fn shape(key: &'static str, wanted: &'static str) -> RecordProblem {
+    RecordProblem::Shape { key, wanted }
+}
+
 fn status(format: Format, object: &Object) -> Result<&str, RecordProblem> {
     match object.get("status") {
         None if format == Format::V2 => Ok(names::STARTED),
-        value => value.and_then(Value::as_str).ok_or(RecordProblem::Shape {
-            key: "status",
-            wanted: "a text",
-        }),
+        value => value.and_then(Value::as_str).ok_or(shape("status", "a text")),
     }
 }
 
@@ -169,17 +164,11 @@ fn infractions(format: Format, object: &Object) -> Result<(Vec<usize>, f64), Rec
     let Some(value) = object.get("infractions") else {
         return Ok((vec![0; known.len()], 0.0));
     };
-    let all = value.as_object().ok_or(RecordProblem::Shape {
-        key: "infractions",
-        wanted: "an object",
-    })?;
+    let all = value.as_object().ok_or(shape("infractions", "an object"))?;
     let mut counts = Vec::with_capacity(known.len());
     for key in known {
-        let messages = all.get(key).and_then(Value::as_list).ok_or(RecordProblem::Shape {
-            key,
-            wanted: "a list of messages",
-        })?;
-        counts.push(messages.len());
+        let messages = all.get(key).and_then(Value::as_list);
+        counts.push(messages.ok_or(shape(key, "a list of messages"))?.len());
     }
     let off_road = match format {
         Format::V1 => 0.0,
@@ -208,10 +197,7 @@ fn scores(object: &Object) -> Result<Scores, RecordProblem> {
     let Some(value) = object.get("scores") else {
         return Ok(Scores::each(|_| Number::ZERO));
     };
-    let all = value.as_object().ok_or(RecordProblem::Shape {
-        key: "scores",
-        wanted: "an object",
-    })?;
+    let all = value.as_object().ok_or(shape("scores", "an object"))?;
     Ok(Scores {
         route: number(all, Score::Route.key())?,
         penalty: number(all, Score::Penalty.key())?,
@@ -222,17 +208,11 @@ fn scores(object: &Object) -> Result<Scores, RecordProblem> {
 fn meta(format: Format, object: &Object) -> Result<Meta, RecordProblem> {
     let Some(value) = object.get("meta") else {
         return match format {
-            Format::V1 => Err(RecordProblem::Shape {
-                key: "meta",
-                wanted: "an object",
-            }),
+            Format::V1 => Err(shape("meta", "an object")),
             Format::V2 => Ok(Meta::ZERO),
         };
     };
-    let all = value.as_object().ok_or(RecordProblem::Shape {
-        key: "meta",
-        wanted: "an object",
-    })?;
+    let all = value.as_object().ok_or(shape("meta", "an object"))?;
     Ok(Meta {
         length: number(all, "route_length")?,
         game: number(all, "duration_game")?,
@@ -241,10 +221,7 @@ fn meta(format: Format, object: &Object) -> Result<Meta, RecordProblem> {
 }
 
 fn number(object: &Object, key: &'static str) -> Result<Number, RecordProblem> {
-    object.get(key).and_then(Number::of).ok_or(RecordProblem::Shape {
-        key,
-        wanted: "a number",
-    })
+    object.get(key).and_then(Number::of).ok_or(shape(key, "a number"))
 }
 
 #[cfg(test)]
