@@ -25,8 +25,6 @@ pub fn of(submission: &Submission, new: &SubmissionStatus, ended: &[Ended]) -> V
             Phase::Record | Phase::Publish => (leaf(&uid, one), Some(root)),
             _ => (leaf(&uid, one), Some(of_attempt)),
         };
-        let mut attributes = common(submission, new);
-        attributes.extend(particular(submission, new, one.phase));
         Span {
             trace: TraceId::of(&uid),
             id: own,
@@ -35,7 +33,7 @@ pub fn of(submission: &Submission, new: &SubmissionStatus, ended: &[Ended]) -> V
             kind: kind(submission, one.phase),
             start: one.start,
             end: one.end,
-            attributes,
+            attributes: attributes(submission, new, one.phase),
             error: failed(new, one.phase),
         }
     };
@@ -60,43 +58,37 @@ fn kind(submission: &Submission, phase: Phase) -> Kind {
     }
 }
 
-fn common(submission: &Submission, new: &SubmissionStatus) -> Vec<(&'static str, Value)> {
-    let meta = &submission.metadata;
-    let text = |text: Option<&str>| Value::Text(text.unwrap_or_default().to_owned());
-    vec![
-        ("k8s.namespace.name", text(meta.namespace.as_deref())),
-        ("leaderboard.name", text(Some(&submission.spec.leaderboard_name))),
-        ("leaderboard.submission", text(meta.name.as_deref())),
+/// What a phase has in common with all others, and its own.
+fn attributes(submission: &Submission, new: &SubmissionStatus, phase: Phase) -> Vec<(&'static str, Value)> {
+    let (meta, old) = (&submission.metadata, submission.status.as_ref());
+    let name = meta.name.as_deref().unwrap_or_default();
+    let namespace = meta.namespace.as_deref().unwrap_or_default();
+    let text = |text: &str| Value::Text(text.to_owned());
+    let mut found = vec![
+        ("k8s.namespace.name", text(namespace)),
+        ("leaderboard.name", text(&submission.spec.leaderboard_name)),
+        ("leaderboard.submission", text(name)),
         ("leaderboard.attempt", Value::Number(new.attempt.unwrap_or_default().0)),
-    ]
-}
-
-/// The attributes of one phase.
-fn particular(submission: &Submission, new: &SubmissionStatus, phase: Phase) -> Vec<(&'static str, Value)> {
-    let old = submission.status.as_ref();
+    ];
     match phase {
-        Phase::Intake => submission.spec.evalai.map_or_else(Vec::new, |evalai| {
-            vec![
+        Phase::Intake => found.extend(submission.spec.evalai.into_iter().flat_map(|evalai| {
+            [
                 ("evalai.challenge", Value::Number(evalai.challenge)),
                 ("evalai.phase", Value::Number(evalai.phase)),
                 ("evalai.submission", Value::Number(evalai.submission)),
             ]
-        }),
-        Phase::Attempt => of_attempt(new),
+        })),
+        Phase::Attempt => found.extend(of_attempt(new)),
         Phase::Schedule | Phase::Start | Phase::Run => {
             let job = old.filter(|old| old.attempt == new.attempt).unwrap_or(new).job_number();
-            let job = names::job(submission.metadata.name.as_deref().unwrap_or_default(), job);
-            let node = [Some(new), old]
-                .into_iter()
-                .flatten()
-                .find_map(|of| of.node_name.clone());
-            let node = node.map(|node| ("k8s.node.name", Value::Text(node)));
-            let mut found = vec![("k8s.job.name", Value::Text(job))];
-            found.extend(node);
-            found
+            found.push(("k8s.job.name", Value::Text(names::job(name, job))));
+            let mut nodes = [Some(new), old].into_iter().flatten();
+            let node = nodes.find_map(|of| of.node_name.as_deref());
+            found.extend(node.map(|node| ("k8s.node.name", text(node))));
         }
-        Phase::Accept | Phase::Wait | Phase::Archive | Phase::Record | Phase::Publish => Vec::new(),
+        Phase::Accept | Phase::Wait | Phase::Archive | Phase::Record | Phase::Publish => {}
     }
+    found
 }
 
 fn of_attempt(new: &SubmissionStatus) -> Vec<(&'static str, Value)> {
