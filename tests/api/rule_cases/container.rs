@@ -114,6 +114,22 @@ fn modes() -> Vec<Case> {
             &mode("Predictions", &for_agent(&dataset)),
         ),
         case("split and metric have at most 63", &score(31, 32), &score(32, 32)),
+        case(
+            "merge Command a track has at most 15 workers",
+            &container(&json!({"merge": "Command", "workers": 15})),
+            &container(&json!({"workers": 16})),
+        ),
+        case(
+            "merge Command a track has at most 15 workers",
+            &merged(
+                container(&json!({"workers": 16})),
+                &tracks(&json!({"container": {"workers": 15}})),
+            ),
+            &merged(
+                container(&json!({"merge": "Command"})),
+                &tracks(&json!({"container": {"workers": 16}})),
+            ),
+        ),
     ]
 }
 
