@@ -122,13 +122,10 @@ fn modes() -> Vec<Case> {
         case(
             "merge Command a track has at most 15 workers",
             &merged(
-                container(&json!({"workers": 16})),
+                container(&json!({"merge": "Command", "workers": 16})),
                 &tracks(&json!({"container": {"workers": 15}})),
             ),
-            &merged(
-                container(&json!({"merge": "Command"})),
-                &tracks(&json!({"container": {"workers": 16}})),
-            ),
+            &tracks(&json!({"container": {"workers": 16}})),
         ),
     ]
 }
