@@ -53,12 +53,12 @@ use crate::submissions::records;
 use backoff::BackoffMap;
 use context::Context;
 use leader::{Leader, Leadership};
-use leaderboard_api::Leaderboard;
+use leaderboard_api::{Leaderboard, Submission};
 use leaderboard_aws::clients::Aws;
 use leaderboard_aws::table::Tables;
 use leaderboard_base::object_key::ObjectKey;
 use leaderboard_base::tasks::TaskFailed;
-use leaderboard_evalai::{Changed, Hub, Network, Options, PayloadReader, SweepRow, Timeouts, Timing};
+use leaderboard_evalai::{Changed, Hub, Network, Options, SweepRow, Timeouts, Timing};
 use leaderboard_policy::phases::Phase;
 use queue::{Class, urgency};
 use reconciles::Queues;
@@ -116,15 +116,22 @@ pub async fn run(
         if let Some(page) = page {
             page.start(watches.for_page(&leader), &telemetry);
         }
-        let parts = Parts {
-            client: clients.api,
-            watch_client: clients.watch,
-            settings,
-            aws: aws.counted_by(telemetry.metrics.meter()),
-            watches,
-            telemetry,
+        let is_answered = if await_lead(&leader, &watches, &telemetry).await? {
+            let parts = Parts {
+                client: clients.api,
+                watch_client: clients.watch,
+                queues: Queues::new(settings.concurrency, &telemetry.metrics),
+                settings,
+                aws: aws.counted_by(telemetry.metrics.meter()),
+                watches,
+                fence: leader.fence(),
+                telemetry,
+            };
+            parts.lead(&leader).await?
+        } else {
+            true
         };
-        if parts.lead(&leader).await? {
+        if is_answered {
             leader.release().await;
         } else {
             tracing::warn!(
@@ -147,39 +154,32 @@ pub struct Clients {
     pub lease: Client,
 }
 
-/// Parts of one process.
+/// Parts of a process that leads.
 struct Parts {
     client: Client,
     watch_client: Client,
     settings: Settings,
     aws: Aws,
     watches: Watches,
+    fence: leader::Fence,
+    queues: Queues,
     telemetry: Observability,
 }
 
 impl Parts {
     /// Until the stop. Returns whether EvalAI has answered all that was written to it.
     async fn lead(self, leader: &Leader) -> Result<bool, RunError> {
-        if !await_lead(leader, &self.telemetry).await? {
-            return Ok(true);
-        }
-        tokio::select! {
-            biased;
-            () = self.telemetry.stop.wait() => return Ok(true),
-            () = self.watches.synced() => {}
-        }
         // Prometheus sees no increase in a sample that begins with 1.
         for phase in Phase::ALL {
             self.telemetry.metrics.submissions.phases.of([phase.as_str()]);
         }
-        let queues = Queues::new(self.settings.concurrency, &self.telemetry.metrics);
         let (evalai, changed) = mpsc::unbounded_channel();
         let tables = Arc::new(Tables::new(self.aws.clone()));
-        let external = self.external(&leader.fence(), Arc::clone(&tables), evalai, &queues);
+        let external = self.external(Arc::clone(&tables), evalai);
         let hub = external.hub.clone();
         let shared = Arc::new(Shared {
-            context: Arc::new(self.context(&leader.fence(), tables, external, &queues)),
-            queues,
+            context: Arc::new(self.context(tables, external)),
+            queues: self.queues.clone(),
             backoff: BackoffMap::default(),
             telemetry: self.telemetry.clone(),
         });
@@ -196,23 +196,35 @@ impl Parts {
         end(reconciles, stop, hub.drain(), lost).await
     }
 
-    /// The services, and what counts them.
-    fn external(
-        &self,
-        fence: &leader::Fence,
-        tables: Arc<Tables>,
-        evalai: mpsc::UnboundedSender<Changed>,
-        queues: &Queues,
-    ) -> ExternalSystems {
-        let telemetry = &self.telemetry;
-        let payloads = payloads::reader(self.aws.clone(), telemetry.clock.clone());
-        let hub = hub(fence, evalai, self.sweep(), payloads, telemetry);
+    /// The services.
+    fn external(&self, tables: Arc<Tables>, changed: mpsc::UnboundedSender<Changed>) -> ExternalSystems {
+        let (hub, fence, tasks) = (self.hub(changed), self.fence.clone(), &self.telemetry.tasks);
         let inbox = inbox::read(self.inbox(), hub.clone(), self.settings.operator.clone());
-        telemetry.tasks.stay("inbox", inbox);
-        let fence = fence.clone();
-        let wake = by_key(events::waking(&queues.submissions, &self.watches.submissions.store));
-        let records = records::start(tables, move || fence.may_write(), &telemetry.tasks, wake);
+        tasks.stay("inbox", inbox);
+        let records = records::start(tables, move || fence.may_write(), tasks, by_key(self.answered()));
         ExternalSystems::new(hub, records, self.settings.allowed.clone())
+    }
+
+    fn hub(&self, changed: mpsc::UnboundedSender<Changed>) -> Hub {
+        let (fence, telemetry) = (self.fence.clone(), &self.telemetry);
+        Hub::new(Options {
+            connect: Arc::new(Network::connect),
+            clock: telemetry.clock.clone(),
+            not_before: fence.evalai_not_before().unwrap_or_else(Instant::now),
+            write_guard: Arc::new(move || fence.may_write()),
+            payloads: payloads::reader(self.aws.clone(), telemetry.clock.clone()),
+            changed,
+            sweep: self.sweep(),
+            timing: Timing::default(),
+            timeouts: Timeouts::default(),
+            meter: telemetry.metrics.meter(),
+            tasks: telemetry.tasks.clone(),
+        })
+    }
+
+    /// Wakes a Submission that has an answer.
+    fn answered(&self) -> Wake<Submission> {
+        events::waking(&self.queues.submissions, &self.watches.submissions.store)
     }
 
     /// Where the sweep's finds go.
@@ -240,17 +252,9 @@ impl Parts {
     }
 
     /// Parts that all reconciles share.
-    fn context(
-        &self,
-        fence: &leader::Fence,
-        tables: Arc<Tables>,
-        external: ExternalSystems,
-        queues: &Queues,
-    ) -> Context {
-        let fence = fence.clone();
+    fn context(&self, tables: Arc<Tables>, external: ExternalSystems) -> Context {
         let (aws, client, tasks) = (&self.aws, &self.client, &self.telemetry.tasks);
-        let submissions = &self.watches.submissions.store;
-        let answered = || events::waking(&queues.submissions, submissions);
+        let (fence, queues, submissions) = (self.fence.clone(), &self.queues, &self.watches.submissions.store);
         let turned = events::waking_as(urgency::of_submission, &queues.submissions, submissions);
         let board = || -> Wake<Leaderboard> {
             let boards = Arc::clone(&queues.leaderboards);
@@ -263,8 +267,8 @@ impl Parts {
             settings: self.settings.clone(),
             stores: self.watches.stores(),
             memory: Memory::default(),
-            workers: Workers::start(aws, tables, &external.hub, client, tasks, answered),
-            causes: self.causes(queues),
+            workers: Workers::start(aws, tables, &external.hub, client, tasks, || self.answered()),
+            causes: self.causes(),
             slots: Arc::new(Slots::new(self.watches.stores(), turned)),
             leaderboards: LeaderboardState::default(),
             asks: Asks::start(client, aws, &self.settings, tasks, || by_key(board())),
@@ -280,22 +284,21 @@ impl Parts {
             context.measured(&pod);
         }
         if let Some(nodes) = &self.watches.nodes {
-            let woken = node::wake(nodes.subscribe(), context.stores.pods.clone(), answered());
+            let woken = node::wake(nodes.subscribe(), context.stores.pods.clone(), self.answered());
             tasks.stay("nodes", woken);
         }
         context
     }
 
     /// Why Jobs have no Pod and Pods no node, as events show. Without the right to them no reason is shown, and the log names it.
-    fn causes(&self, queues: &Queues) -> Causes {
+    fn causes(&self) -> Causes {
         let causes = Causes::default();
         let objects = Objects {
             jobs: self.watches.jobs.store.clone(),
             pods: self.watches.pods.store.clone(),
         };
         for (name, selector) in [("events of Jobs", OF_JOBS), ("events of Pods", OF_PODS)] {
-            let wake = events::waking(&queues.submissions, &self.watches.submissions.store);
-            let take = causes.taking(objects.clone(), wake);
+            let take = causes.taking(objects.clone(), self.answered());
             let apis = self.settings.namespaces.apis::<Event>(&self.watch_client);
             spawn_uncached(name, apis, Config::default().fields(selector), &self.telemetry, take);
         }
@@ -342,15 +345,19 @@ async fn end<T>(
     result
 }
 
-/// Waits to become the leader. False if the stop comes before.
-async fn await_lead(leader: &Leader, telemetry: &Observability) -> Result<bool, RunError> {
+/// Waits to become the leader, with caches that are complete. False if the stop comes before.
+async fn await_lead(leader: &Leader, watches: &Watches, telemetry: &Observability) -> Result<bool, RunError> {
+    let leads = async {
+        if let Leadership::Lost { why } = after(leader.leadership(), |now| *now == Leadership::Standby).await {
+            return Err(RunError::LostLease(why));
+        }
+        watches.synced().await;
+        Ok(true)
+    };
     tokio::select! {
         biased;
         () = telemetry.stop.wait() => Ok(false),
-        next = after(leader.leadership(), |now| *now == Leadership::Standby) => match next {
-            Leadership::Lost { why } => Err(RunError::LostLease(why)),
-            _ => Ok(true),
-        },
+        leads = leads => leads,
     }
 }
 
@@ -368,30 +375,6 @@ async fn after(mut leadership: watch::Receiver<Leadership>, holds: fn(&Leadershi
         Ok(next) => next,
         Err(_) => std::future::pending().await,
     }
-}
-
-fn hub(
-    fence: &leader::Fence,
-    changed: mpsc::UnboundedSender<Changed>,
-    sweep: mpsc::UnboundedSender<SweepRow>,
-    payloads: PayloadReader,
-    telemetry: &Observability,
-) -> Hub {
-    let not_before = fence.evalai_not_before().unwrap_or_else(Instant::now);
-    let writes = fence.clone();
-    Hub::new(Options {
-        connect: Arc::new(Network::connect),
-        clock: telemetry.clock.clone(),
-        write_guard: Arc::new(move || writes.may_write()),
-        payloads,
-        not_before,
-        changed,
-        sweep,
-        timing: Timing::default(),
-        timeouts: Timeouts::default(),
-        meter: telemetry.metrics.meter(),
-        tasks: telemetry.tasks.clone(),
-    })
 }
 
 #[cfg(test)]

@@ -42,7 +42,8 @@ const CREATES_PER_NAMESPACE: usize = 4;
 /// Leaderboards that are reconciled at once.
 const LEADERBOARDS: usize = 4;
 
-/// One for each kind.
+/// One for each kind. Clones are the same.
+#[derive(Clone)]
 pub(super) struct Queues {
     pub(super) submissions: Arc<Queue>,
     pub(super) leaderboards: Arc<Queue>,
