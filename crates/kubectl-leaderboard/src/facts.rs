@@ -55,6 +55,24 @@ pub(super) fn since(submission: &Submission) -> Option<Timestamp> {
     found.or_else(|| submission.creation_timestamp().map(|t| t.0))
 }
 
+/// Running ones first, then what starts or is new, then waiting ones by their position, then ended ones, the latest first.
+pub(super) fn ordered(submissions: &[Submission], now: Timestamp) -> Vec<&Submission> {
+    let place = |one: &&Submission| {
+        let status = status(one);
+        let age = since(one).map_or(0, |at| now.duration_since(at).as_secs());
+        let position = status.waiting.as_ref().map_or(0, |waiting| waiting.position.into());
+        let place = match status.known_state() {
+            Some(State::Running | State::Resumed) => (0, -age),
+            None | Some(State::Pending) => (1, position),
+            Some(State::Finished | State::Failed | State::Cancelled) => (2, age),
+        };
+        (place, one.namespace(), one.name_any())
+    };
+    let mut ordered: Vec<&Submission> = submissions.iter().collect();
+    ordered.sort_by_cached_key(place);
+    ordered
+}
+
 /// Why it is in its state: the status's reason with the message, or the message alone. Empty without a reason if there is progress, which
 /// says what the message would; a cancelled one keeps its message.
 pub(super) fn reason(status: &SubmissionStatus, message: &str) -> String {

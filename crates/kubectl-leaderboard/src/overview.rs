@@ -74,10 +74,8 @@ pub fn lines(
         page.paragraph(&text);
     }
     page.gap();
-    let mut ordered: Vec<&Submission> = submissions.iter().collect();
-    ordered.sort_by_cached_key(|one| (order(one, now), place.name_of(*one)));
     let mut rows = Vec::new();
-    for one in ordered {
+    for one in facts::ordered(submissions, now) {
         let trouble = trouble(one, now);
         if !trouble.is_empty() {
             let state = facts::status(one).known_state().map_or("(new)", State::as_str);
@@ -136,17 +134,6 @@ fn of_leaderboards(place: Place<'_>, submissions: &[Submission], leaderboards: O
     observed.extend(leaderboards.iter().map(|l| (place.name_of(l), Observed::Found(l))));
     let problems = observed.iter().flat_map(|(name, board)| board::problems(name, *board));
     problems.map(|problem| problem.text).collect()
-}
-
-/// Running ones first, then waiting ones by their position, then ended ones, the latest first.
-fn order(submission: &Submission, now: Timestamp) -> (u8, i64) {
-    let status = facts::status(submission);
-    let age = facts::since(submission).map_or(0, |at| now.duration_since(at).as_secs());
-    match status.known_state() {
-        Some(State::Running | State::Resumed) => (0, age),
-        None | Some(State::Pending) => (1, status.waiting.as_ref().map_or(0, |waiting| waiting.position.into())),
-        Some(State::Finished | State::Failed | State::Cancelled) => (2, age),
-    }
 }
 
 /// What is wrong with a submission; empty if nothing is.

@@ -148,11 +148,9 @@ fn systems(status: &SubmissionStatus) -> String {
 const HEAD: [&str; 7] = ["NAME", "STATE", "REASON", "PROGRESS", "SCORE", "SINCE", "QUEUE"];
 const WIDE: [&str; 6] = ["LEADERBOARD", "TRACK", "TEAM", "ATTEMPT", "CRASHES", "NODE"];
 
-/// One line of each submission: running ones first, then waiting ones by place, then ended ones, the latest first.
+/// One line of each submission.
 pub fn lines(submissions: &[Submission], is_qualified: bool, is_wide: bool, frame: Frame) -> Vec<String> {
     let now = frame.now;
-    let mut all: Vec<&Submission> = submissions.iter().collect();
-    all.sort_by_key(|one| order(one, now));
     let head = [&["NAMESPACE"][..], &HEAD, &WIDE].concat();
     // `-o wide` is printed whole: the person has the space, or accepts broken lines.
     let (left_out, width) = if is_wide {
@@ -161,26 +159,11 @@ pub fn lines(submissions: &[Submission], is_qualified: bool, is_wide: bool, fram
         (WIDE.len(), frame.width)
     };
     let shown = usize::from(!is_qualified)..head.len() - left_out;
-    let rows: Vec<Vec<String>> = all
+    let rows: Vec<Vec<String>> = facts::ordered(submissions, now)
         .into_iter()
         .map(|one| row(one, now)[shown.clone()].to_vec())
         .collect();
     table(&head[shown], &rows, width)
-}
-
-fn order(submission: &Submission, now: Timestamp) -> (u8, i64, String) {
-    let status = facts::status(submission);
-    let since = facts::since(submission).map_or(0, |at| now.duration_since(at).as_secs());
-    let place = status
-        .waiting
-        .as_ref()
-        .map_or(i64::MAX, |waiting| waiting.position.into());
-    let (class, within) = match status.known_state() {
-        Some(State::Running | State::Resumed) => (0, -since),
-        None | Some(State::Pending) => (1, place),
-        Some(_) => (2, since),
-    };
-    (class, within, submission.name_any())
 }
 
 fn row(submission: &Submission, now: Timestamp) -> Vec<String> {
