@@ -71,7 +71,7 @@ pub fn document(format: Format, value: &Value) -> Option<Vec<String>> {
         })]),
         Format::Yaml => {
             let mut lines = Vec::new();
-            yaml(value, 0, &mut lines);
+            yaml("", value, 0, &mut lines);
             // YAML has no pairs for what is beyond 16 bits.
             let escape = |c: char| format!("\\U{:08x}", u32::from(c));
             Some(lines.iter().map(|line| escaped(line, escape)).collect())
@@ -93,33 +93,24 @@ fn escaped(document: &str, escape: impl Fn(char) -> String) -> String {
     harmless
 }
 
-/// YAML in blocks. Strings are quoted as in JSON, which YAML reads alike.
-fn yaml(value: &Value, indent: usize, lines: &mut Vec<String>) {
-    let space = " ".repeat(indent);
-    match value {
-        Value::Object(fields) if !fields.is_empty() => {
-            for (key, value) in fields {
-                let key = Value::from(key.as_str());
-                nested(&format!("{space}{key}:"), value, indent + 2, lines);
-            }
+/// YAML in blocks: what a line begins with, and its value. Strings are quoted as in JSON, which YAML reads alike.
+fn yaml(start: &str, value: &Value, indent: usize, lines: &mut Vec<String>) {
+    let inner: Vec<(String, &Value)> = match value {
+        Value::Object(fields) => {
+            let start = |key: &String| format!("{}:", Value::from(key.as_str()));
+            fields.iter().map(|(key, value)| (start(key), value)).collect()
         }
-        Value::Array(items) if !items.is_empty() => {
-            for item in items {
-                nested(&format!("{space}-"), item, indent + 2, lines);
-            }
-        }
-        scalar => lines.push(format!("{space}{scalar}")),
-    }
-}
-
-fn nested(start: &str, value: &Value, indent: usize, lines: &mut Vec<String>) {
-    let is_block = matches!(value, Value::Object(fields) if !fields.is_empty())
-        || matches!(value, Value::Array(items) if !items.is_empty());
-    if is_block {
+        Value::Array(items) => items.iter().map(|item| ("-".to_owned(), item)).collect(),
+        _ => Vec::new(),
+    };
+    if inner.is_empty() {
+        lines.push(join(&[start, &value.to_string()]));
+    } else if !start.is_empty() {
         lines.push(start.to_owned());
-        yaml(value, indent, lines);
-    } else {
-        lines.push(format!("{start} {value}"));
+    }
+    let space = " ".repeat(indent);
+    for (start, value) in inner {
+        yaml(&format!("{space}{start}"), value, indent + 2, lines);
     }
 }
 

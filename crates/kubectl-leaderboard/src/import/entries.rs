@@ -83,7 +83,7 @@ pub(super) fn answers(text: &str) -> Result<Entries, usize> {
 }
 
 /// Where an entry is, by its ARN.
-#[derive(Clone, Debug, PartialEq)]
+#[derive(Debug, PartialEq)]
 pub(super) struct Place {
     pub(super) region: String,
     /// The role that docs/migrate.md makes for the Pods.
@@ -248,7 +248,7 @@ impl<'a> Fields<'a> {
     }
 
     /// Reports what is missing and what is left.
-    fn end(self) {
+    fn end(self) -> Place {
         let entry = self.entry;
         if !self.missing.is_empty() {
             let missing = self.missing.join(", ");
@@ -258,6 +258,7 @@ impl<'a> Fields<'a> {
         let left = self.left.keys();
         let dropped = left.map(|key| format!("{entry}: {key} ({})", why_dropped(key)));
         self.found.dropped.extend(dropped);
+        self.place
     }
 }
 
@@ -279,14 +280,10 @@ fn why_dropped(key: &str) -> &'static str {
 /// Reads the entries. All that is wrong is named at once.
 pub(super) fn parse(entries: &Entries) -> Result<Pipeline, Vec<String>> {
     let mut found = Found::default();
-    for entry in [EVALAI, TRACKS]
-        .into_iter()
-        .filter(|entry| !entries.contains_key(*entry))
-    {
-        found.problems.push(format!(
-            "there is no answer for the entry {entry}; print that entry too"
-        ));
-    }
+    let required = [EVALAI, TRACKS].into_iter();
+    let absent = required.filter(|entry| !entries.contains_key(*entry));
+    let absent = absent.map(|entry| format!("there is no answer for the entry {entry}; print that entry too"));
+    found.problems.extend(absent);
     let (token_region, api_server) = entries
         .get(EVALAI)
         .and_then(|entry| evalai(entry, &mut found))
@@ -336,9 +333,7 @@ fn evalai(entry: &Entry, found: &mut Found) -> Option<(String, String)> {
         fields.unusable("api_server", "is not the root of a server, such as https://eval.ai");
     }
     fields.left.remove(TOKEN_KEY);
-    let region = fields.place.region.clone();
-    fields.end();
-    Some((region, server))
+    Some((fields.end().region, server))
 }
 
 fn is_root(server: &str) -> bool {
@@ -370,11 +365,9 @@ fn board(original: &'static Original, entry: &Entry, tracks: Vec<Track>, found: 
         );
         fields.found.problems.push(problem);
     }
-    let place = fields.place.clone();
-    fields.end();
     Some(Board {
         original,
-        place,
+        place: fields.end(),
         simulator_image,
         contents_image,
         bucket,
