@@ -101,11 +101,9 @@ impl Tail {
 
     /// The text with a first line that names the container, the attempt and the key of the whole log.
     pub fn for_hosts(&self) -> String {
-        format!(
-            "{}{}",
-            heading(&self.container, self.attempt, self.key.as_deref()),
-            self.text
-        )
+        let all = self.key.as_ref().map(|key| format!("; all of it is in {key}"));
+        let (container, attempt, all) = (&self.container, self.attempt, all.unwrap_or_default());
+        format!("The end of {container}'s log in attempt {attempt}{all}.\n{}", self.text)
     }
 
     /// The text with a first line that names no file which only hosts can read.
@@ -183,26 +181,18 @@ async fn look(client: &Client, archive: &Archive, namespace: &str, question: &Fa
 }
 
 fn found(attempt: Attempt, place: &LogPlace, bytes: &[u8]) -> Option<Tail> {
-    let container = place.container.clone();
-    let key = match &place.at {
-        LogAt::Bucket { key } => Some(key.clone()),
-        LogAt::Node { .. } => None,
-    };
-    let heading = heading(&container, attempt, key.as_deref());
-    let text = tail(TAIL_CHARS.saturating_sub(heading.chars().count()), bytes)?;
-    Some(Tail {
-        container,
+    let mut found = Tail {
+        container: place.container.clone(),
         attempt,
-        key,
-        text,
-    })
-}
-
-fn heading(container: &str, attempt: Attempt, key: Option<&str>) -> String {
-    match key {
-        Some(key) => format!("The end of {container}'s log in attempt {attempt}; all of it is in {key}.\n"),
-        None => format!("The end of {container}'s log in attempt {attempt}.\n"),
-    }
+        key: match &place.at {
+            LogAt::Bucket { key } => Some(key.clone()),
+            LogAt::Node { .. } => None,
+        },
+        text: String::new(),
+    };
+    let heading = found.for_hosts().chars().count();
+    found.text = tail(TAIL_CHARS.saturating_sub(heading), bytes)?;
+    Some(found)
 }
 
 /// The log of a container, from its node. None if the node has none.
