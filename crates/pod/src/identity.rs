@@ -4,10 +4,12 @@
 //! Called by `workspace` and `logcopy` at their start. Knows no keys of objects.
 
 use std::path::PathBuf;
+use std::sync::Arc;
 use std::time::SystemTime;
 
 use aws_credential_types::Credentials;
-use aws_credential_types::provider::{ProvideCredentials, SharedCredentialsProvider, error::CredentialsError, future};
+use aws_credential_types::credential_fn::provide_credentials_fn;
+use aws_credential_types::provider::{SharedCredentialsProvider, error::CredentialsError};
 
 use super::places::Setting;
 use leaderboard_api::effective::key_prefix;
@@ -25,14 +27,15 @@ pub fn for_run(base: Aws, setting: &Setting) -> Aws {
         return base;
     };
     let storage = &setting.run.plan.storage.s3;
-    let provider = WebIdentity {
+    let identity = Arc::new(WebIdentity {
         // Never the bucket's endpoint: that one is S3's alone.
         sts: base.sts(storage.region.as_deref()),
         policy: session_policy(&setting.run, partition(role_arn)),
         role_arn: role_arn.clone(),
         session: session_name(&setting.run),
         token: setting.places.token.clone(),
-    };
+    });
+    let provider = provide_credentials_fn(move || Arc::clone(&identity).assume());
     let config = base.config(None).into_builder();
     Aws::from_config(
         config
@@ -42,7 +45,6 @@ pub fn for_run(base: Aws, setting: &Setting) -> Aws {
 }
 
 /// Asks STS whenever the SDK's cache finds its credentials about to expire.
-#[derive(Debug)]
 struct WebIdentity {
     sts: aws_sdk_sts::Client,
     policy: String,
@@ -52,7 +54,7 @@ struct WebIdentity {
 }
 
 impl WebIdentity {
-    async fn assume(&self) -> Result<Credentials, CredentialsError> {
+    async fn assume(self: Arc<Self>) -> Result<Credentials, CredentialsError> {
         // The kubelet renews the token, so it is read anew each time.
         let token = tokio::fs::read_to_string(&self.token).await;
         let token = token.map_err(CredentialsError::provider_error)?;
@@ -69,15 +71,6 @@ impl WebIdentity {
             Some(expiry),
             "PodWebIdentity",
         ))
-    }
-}
-
-impl ProvideCredentials for WebIdentity {
-    fn provide_credentials<'a>(&'a self) -> future::ProvideCredentials<'a>
-    where
-        Self: 'a,
-    {
-        future::ProvideCredentials::new(self.assume())
     }
 }
 

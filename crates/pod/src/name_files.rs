@@ -7,16 +7,20 @@
 use std::fs;
 use std::io;
 use std::os::unix::fs::PermissionsExt;
-use std::path::{Path, PathBuf};
+use std::path::Path;
 
 use super::places::Places;
+use super::workspace::WorkspaceError;
 use leaderboard_contract::run::NAME_FILES;
 
 /// Copies all of them, also when they are there already: a Pod whose node was restarted has another address.
-pub(super) fn copy(places: &Places) -> Result<(), (PathBuf, io::Error)> {
+pub(super) fn copy(places: &Places) -> Result<(), WorkspaceError> {
     for path in NAME_FILES.map(|path| path.trim_start_matches('/')) {
         let target = places.tools.join(path);
-        copy_one(&places.root.join(path), &target).map_err(|error| (target, error))?;
+        copy_one(&places.root.join(path), &target).map_err(|error| {
+            let path = target.display().to_string();
+            WorkspaceError::NameFile { path, error }
+        })?;
     }
     Ok(())
 }

@@ -156,10 +156,7 @@ async fn measure(setting: &Setting) -> Result<Option<Finding>, WorkspaceError> {
 pub async fn prepare(setting: &Setting, archive: &Archive) -> Result<(), WorkspaceError> {
     of_plan(&setting.run.plan).check(&setting.run)?;
     copy_runner(&setting.places)?;
-    name_files::copy(&setting.places).map_err(|(path, error)| WorkspaceError::NameFile {
-        path: path.display().to_string(),
-        error,
-    })?;
+    name_files::copy(&setting.places)?;
     let tree = folders(setting)?;
     if is_prepared(&tree, &setting.pod_uid) {
         // The node was restarted under the Pod: the volume is newer than what is stored, and the fence may be another's.

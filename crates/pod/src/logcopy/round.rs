@@ -79,7 +79,6 @@ pub(super) struct Rounds {
     folders: Option<Arc<Watch>>,
     epoch: Instant,
     last: Instant,
-    round: u64,
     reported: Option<Report>,
     report_etag: Option<String>,
     owner_etag: Option<String>,
@@ -116,7 +115,6 @@ impl Rounds {
             folders: Watch::new(is_news).ok().map(Arc::new),
             epoch: Instant::now(),
             last: Instant::now(),
-            round: 0,
             reported: None,
             report_etag: None,
             owner_etag: None,
@@ -383,7 +381,7 @@ impl Rounds {
             &found.gathered,
             self.ending.as_ref(),
         );
-        report.round = self.round;
+        report.round = self.reported.as_ref().map_or(0, |reported| reported.round);
         report.agents_fill_disk = found.agents_fill_disk;
         report.logs.clone_from(&self.logs.borrow());
         if self.reported.as_ref() == Some(&report) {
@@ -392,7 +390,6 @@ impl Rounds {
         report.round = report.round.saturating_add(1);
         let (bytes, known) = (to_bytes(&report).into(), self.report_etag.as_deref());
         self.report_etag = self.archive.replace(REPORT_KEY, bytes, known).await?;
-        self.round = report.round;
         self.reported = Some(report);
         Ok(())
     }
