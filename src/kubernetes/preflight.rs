@@ -1,6 +1,6 @@
 //! Questions to the API server about itself: whether it serves our kinds, and whether it grants rights.
 //!
-//! Controller and bridge wait for the kinds at their start, because the definitions may be applied after the operator. `helm test` asks for both.
+//! The controller waits for the kinds at its start, because the definitions may be applied after the operator. `helm test` asks for both.
 
 use std::time::Duration;
 
@@ -26,17 +26,17 @@ const AT_ONCE: usize = 8;
 
 /// What the process has to be allowed, in words. Without a namespace it is a right in every one, or to a kind that has none.
 pub fn described(right: &ResourceAttributes) -> String {
-    let part = |before: &str, text: &Option<String>| match text.as_deref() {
-        None | Some("") => String::new(),
-        Some(text) => format!("{before}{text}"),
+    let part = |before: &str, text: Option<&String>| match text {
+        Some(text) if !text.is_empty() => format!("{before}{text}"),
+        _ => String::new(),
     };
     let parts = [
-        part("", &right.verb),
-        part(" ", &right.resource),
-        part("/", &right.subresource),
-        part(" of ", &right.group),
-        part(" ", &right.name),
-        part(" in namespace ", &right.namespace),
+        part("", right.verb.as_ref()),
+        part(" ", right.resource.as_ref()),
+        part("/", right.subresource.as_ref()),
+        part(" of ", right.group.as_ref()),
+        part(" ", right.name.as_ref()),
+        part(" in namespace ", right.namespace.as_ref()),
     ];
     let everywhere = if right.namespace.is_none() {
         " in all namespaces"
