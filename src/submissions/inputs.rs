@@ -15,23 +15,8 @@ use leaderboard_evalai::{Hub, InputError, InputStream};
 use leaderboard_policy::ask::Failure;
 use leaderboard_policy::questions::{Absence, Fetched, INPUT_LIMIT, Input};
 
-/// Why a file was not read.
-#[derive(Debug, PartialEq)]
-enum Unread {
-    Missing(Absence),
-    Failed(Failure),
-}
-
-impl From<InputError> for Unread {
-    fn from(error: InputError) -> Self {
-        match error {
-            InputError::Gone(status) => Self::Missing(Absence::Status(status)),
-            InputError::NoFile => Self::Missing(Absence::NoFile),
-            InputError::Refused(why) => Self::Failed(Failure { is_refused: true, why }),
-            InputError::Silent(why) => Self::Failed(Failure::silent(why)),
-        }
-    }
-}
+/// Why a file was not read; None: the time for it was over.
+type Unread = Option<InputError>;
 
 /// Copies it, and logs the outcome.
 pub async fn copy((aws, hub): (Aws, Hub), asked: Asked<Input>) -> Result<Fetched, Failure> {
@@ -50,7 +35,7 @@ async fn fetch(aws: &Aws, hub: &Hub, asked: &Asked<Input>) -> Result<Fetched, Fa
     };
     let stream = match hub.open_input(&address).await {
         Ok(stream) => until(stream, end),
-        Err(error) => return unread(error.into(), asked),
+        Err(error) => return unread(Some(error), asked),
     };
     let question = &asked.question;
     let archive = Archive::of_run(aws, &question.storage, &question.run_id);
@@ -68,8 +53,8 @@ fn until(stream: InputStream, end: Instant) -> BoxStream<'static, Result<Bytes, 
     let chunks = stream::unfold(stream, move |mut stream| async move {
         let next = match timeout_at(end, stream.next()).await {
             // Chunks that are always there are late, too, where the bucket takes them slowly.
-            Ok(next) if Instant::now() < end => next.map(|chunk| chunk.map_err(Unread::from)),
-            Ok(_) | Err(_) => Some(Err(Unread::Missing(Absence::Late))),
+            Ok(next) if Instant::now() < end => next.map(|chunk| chunk.map_err(Some)),
+            Ok(_) | Err(_) => Some(Err(None)),
         };
         next.map(|chunk| (chunk, stream))
     });
@@ -79,8 +64,11 @@ fn until(stream: InputStream, end: Instant) -> BoxStream<'static, Result<Bytes, 
 /// The answer about a file that was not read. The times that it was missing are counted from answer to answer.
 fn unread(why: Unread, asked: &Asked<Input>) -> Result<Fetched, Failure> {
     let why = match why {
-        Unread::Missing(why) => why,
-        Unread::Failed(failure) => return Err(failure),
+        Some(InputError::Gone(status)) => Absence::Status(status),
+        Some(InputError::NoFile) => Absence::NoFile,
+        None => Absence::Late,
+        Some(InputError::Refused(why)) => return Err(Failure { is_refused: true, why }),
+        Some(InputError::Silent(why)) => return Err(Failure::silent(why)),
     };
     let last = asked.last.as_ref().filter(|last| last.question == asked.question);
     let before = match last.map(|last| last.result.as_ref()) {
