@@ -1,8 +1,6 @@
 //! Plan of a run: format, slices, strictness. Owns the types the callers fill in and the check that they make
 //! sense together; knows nothing of checkpoints.
 
-use serde::{Deserialize, Serialize};
-
 use crate::Refusal;
 use crate::json::{FileLimits, KeyOrder};
 
@@ -18,7 +16,7 @@ const LEAST: FileLimits = FileLimits {
 };
 
 /// The checkpoint format: Leaderboard 1.0, or 2.0 and everything after it.
-#[derive(Clone, Copy, Debug, PartialEq, Eq, Hash, Serialize, Deserialize)]
+#[derive(Clone, Copy, Debug, PartialEq, Eq, Hash)]
 pub enum Format {
     /// Leaderboard 1.0.
     V1,
@@ -37,7 +35,7 @@ impl Format {
 }
 
 /// How much of a strange checkpoint is put up with.
-#[derive(Clone, Copy, Debug, PartialEq, Eq, Hash, Serialize, Deserialize)]
+#[derive(Clone, Copy, Debug, PartialEq, Eq, Hash)]
 pub enum Strictness {
     /// A person's own files: free status texts, unknown infraction sources, NaN.
     Offline,
@@ -47,7 +45,7 @@ pub enum Strictness {
 }
 
 /// Treatment of scores that do not follow from a record's infractions.
-#[derive(Clone, Copy, Debug, PartialEq, Eq, Hash, Serialize, Deserialize)]
+#[derive(Clone, Copy, Debug, PartialEq, Eq, Hash)]
 pub enum Verify {
     /// Nothing is recomputed.
     Disabled,
@@ -58,7 +56,7 @@ pub enum Verify {
 }
 
 /// The routes of one pair, as inclusive positions: `{first: 5, last: 9}` are five routes.
-#[derive(Clone, Copy, Debug, PartialEq, Eq, Hash, Serialize, Deserialize)]
+#[derive(Clone, Copy, Debug, PartialEq, Eq, Hash)]
 pub struct Slice {
     /// First route id.
     pub first: u32,
@@ -80,7 +78,7 @@ impl Slice {
 }
 
 /// Plan of a run.
-#[derive(Clone, Debug, PartialEq, Eq, Serialize, Deserialize)]
+#[derive(Clone, Debug, PartialEq, Eq)]
 pub struct Plan {
     /// The checkpoint format of the workers.
     pub format: Format,

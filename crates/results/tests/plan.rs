@@ -4,7 +4,7 @@
 mod common;
 
 use common::{Drive, assert_refusals, file, finished, merged, pod, read};
-use leaderboard_results::{Format, Merged, Outcome, Plan, Refusal, Slice, Strictness, Verify, render};
+use leaderboard_results::{Format, Merged, Outcome, Plan, Refusal, Slice, Strictness, render};
 use serde_json::{Value, json};
 
 const V1: Format = Format::V1;
@@ -274,15 +274,4 @@ fn an_unpublishable_metric_is_refused() {
     drive.infractions = vec![("red_light", vec!["Agent ran a red light".to_owned()])];
     let refusal = merged(&plan, &[Some(finished(V1, &[drive]))]).unwrap_err();
     assert_refusals("metrics", &[("a rate that overflows".to_owned(), refusal)]);
-}
-
-#[test]
-fn plans_travel_as_json() {
-    let plan = Plan {
-        verify: Verify::Refuse,
-        ..pod(V1, 5, &[(0, 4), (5, 9)])
-    };
-    let text = serde_json::to_string(&plan).unwrap();
-    assert!(text.contains("\"format\":\"V1\"") && text.contains("\"strictness\":\"Pod\""));
-    assert_eq!(serde_json::from_str::<Plan>(&text).unwrap(), plan);
 }
