@@ -71,19 +71,11 @@ impl Hub {
         Some(Viewer { views, _place: place })
     }
 
-    /// Makes views while somebody looks, until the stop.
-    pub(super) async fn run(self, source: Arc<dyn Source>, stop: Stop) {
+    /// Makes views while somebody looks.
+    pub(super) async fn run(self, source: Arc<dyn Source>) {
         loop {
-            tokio::select! {
-                biased;
-                () = stop.wait() => return,
-                () = self.0.come.notified() => {}
-            }
-            tokio::select! {
-                biased;
-                () = stop.wait() => return,
-                () = self.show(source.as_ref()) => {}
-            }
+            self.0.come.notified().await;
+            self.show(source.as_ref()).await;
         }
     }
 
@@ -127,15 +119,12 @@ fn event(view: &[u8]) -> Bytes {
 impl Viewer {
     /// Each view that is new when it is read, and a sign of life between them; ends by the stop.
     pub(super) fn events(self, stop: Stop) -> impl Stream<Item = Bytes> + Send {
-        stream::unfold((self, stop), |(mut viewer, stop)| async move {
-            let event = tokio::select! {
-                biased;
-                () = stop.wait() => None,
-                view = viewer.next() => view,
-                () = sleep(KEEP_ALIVE) => Some(Bytes::from_static(ALIVE)),
-            };
-            event.map(|event| (event, (viewer, stop)))
-        })
+        let events = stream::unfold(self, |mut viewer| async move {
+            let view = timeout(KEEP_ALIVE, viewer.next()).await;
+            let event = view.unwrap_or(Some(Bytes::from_static(ALIVE)));
+            event.map(|event| (event, viewer))
+        });
+        events.take_until(async move { stop.wait().await })
     }
 
     async fn next(&mut self) -> Option<Bytes> {
@@ -202,7 +191,7 @@ mod tests {
     fn hub() -> (Hub, Counter, watch::Sender<bool>, Stop) {
         let (hub, source) = (Hub::new(), Counter::default());
         let (sender, stop) = Stop::new();
-        tokio::spawn(hub.clone().run(Arc::new(source.clone()), stop.clone()));
+        tokio::spawn(hub.clone().run(Arc::new(source.clone())));
         (hub, source, sender, stop)
     }
 

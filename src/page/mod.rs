@@ -104,8 +104,8 @@ impl Page {
             clock: telemetry.clock.clone(),
         });
         let hub = Hub::new();
-        let work = hub.clone().run(Arc::clone(&source), telemetry.stop.clone());
-        telemetry.tasks.stay("page's view", work);
+        let work = hub.clone().run(Arc::clone(&source));
+        telemetry.tasks.until_stop("page's view", work);
         let router = routes::router(hub, source, telemetry.stop.clone());
         let stop = telemetry.stop.clone();
         let listener = Bounded::new(self.listener);

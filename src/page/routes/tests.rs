@@ -46,7 +46,7 @@ async fn page(bytes: usize) -> (SocketAddr, watch::Sender<bool>) {
     let (sender, stop) = Stop::new();
     let hub = Hub::new();
     let source = Arc::new(Still(bytes));
-    tokio::spawn(hub.clone().run(source.clone(), stop.clone()));
+    tokio::spawn(hub.clone().run(source.clone()));
     let listener = TcpListener::bind("127.0.0.1:0").await.unwrap();
     let address = listener.local_addr().unwrap();
     let router = router(hub, source, stop);
