@@ -213,12 +213,6 @@ impl Submissions {
     }
 }
 
-impl Default for Metrics {
-    fn default() -> Self {
-        Self::new(Program::Controller)
-    }
-}
-
 impl Metrics {
     /// The meter that counts the calls of this process's clients.
     pub fn meter(self: &Arc<Self>) -> Meter {

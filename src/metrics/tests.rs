@@ -234,7 +234,10 @@ fn who_does_not_lead_shows_nothing_that_only_the_leader_counts() {
     let text = metrics.text().unwrap();
     assert!(gauges(&text).len() >= 18, "{text}");
     metrics.set_leading(None);
-    for text in [metrics.text().unwrap(), Metrics::default().text().unwrap()] {
+    for text in [
+        metrics.text().unwrap(),
+        Metrics::new(Program::Controller).text().unwrap(),
+    ] {
         assert_eq!(gauges(&text), ["is_leader"], "{text}");
         assert!(text.contains("leaderboard_is_leader 0\n"), "{text}");
     }

@@ -8,7 +8,7 @@ use super::super::backoff::BackoffMap;
 use super::super::reconciles::Queues;
 use super::*;
 use crate::fixtures::{self, Cluster, surroundings};
-use crate::metrics::Metrics;
+use crate::metrics::{Metrics, Program};
 use leaderboard_api::Attempt;
 use leaderboard_base::shutdown::Stop;
 
@@ -50,7 +50,7 @@ fn submission(board: &str, conditions: &[(&str, &str, &str, u32)]) -> Submission
 
 /// The samples of a gauge as `/metrics` has them: what stands after its name.
 fn lines(samples: &Samples, gauge: &str) -> Vec<String> {
-    let metrics = Metrics::default();
+    let metrics = Metrics::new(Program::Controller);
     metrics.set_leading(Some(1));
     metrics.show(samples.clone());
     let start = format!("leaderboard_{gauge}{{");

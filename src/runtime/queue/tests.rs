@@ -7,7 +7,7 @@ use tokio::sync::{mpsc, watch};
 use tokio::task::JoinHandle;
 
 use super::*;
-use crate::metrics::Metrics;
+use crate::metrics::{Metrics, Program};
 
 const LIMITS: Limits = Limits {
     reconciles: 16,
@@ -35,7 +35,7 @@ struct Running {
 /// A queue whose reconciles take as long as `takes` returns for their key. The reconciles of new objects create a Job.
 fn start(takes: impl Fn(&Key) -> Duration + Send + Sync + 'static) -> Running {
     let waits = Class::ALL.map(|class| {
-        Metrics::default()
+        Metrics::new(Program::Controller)
             .work
             .reconcile_wait
             .of(["Submission", class.as_str()])

@@ -12,6 +12,7 @@ use opentelemetry_proto::tonic::collector::trace::v1::ExportTraceServiceRequest;
 use prost::Message;
 
 use super::*;
+use crate::metrics::Program;
 use leaderboard_base::shutdown::Stop;
 use leaderboard_base::trace_id::TraceId as Trace;
 
@@ -48,7 +49,7 @@ fn span(id: u64) -> Span {
 fn started(url: &str) -> (Traces, Sending, Arc<Metrics>) {
     // It fails only where a provider is installed already.
     let _ = rustls::crypto::ring::default_provider().install_default();
-    let metrics = Arc::new(Metrics::default());
+    let metrics = Arc::new(Metrics::new(Program::Controller));
     let (_stop, signal) = Stop::new();
     let (traces, sending) = start(Some(url), &metrics, &Tasks::new(signal)).unwrap();
     (traces, sending, metrics)
