@@ -59,23 +59,17 @@ impl Preflight {
         loop {
             let missing = self.missing(&client, &http).await;
             if missing.is_empty() {
-                println!(
-                    "the kinds are served, the rights are granted, and ready: {}",
-                    self.asked()
-                );
+                let ready = match self.services.join(", ") {
+                    none if none.is_empty() => "not asked".to_owned(),
+                    names => names,
+                };
+                println!("the kinds are served, the rights are granted, and ready: {ready}");
                 return Ok(());
             }
             if Instant::now() >= until {
                 return Err(missing.join("; ").into());
             }
             sleep(PAUSE).await;
-        }
-    }
-
-    fn asked(&self) -> String {
-        match self.services.join(", ") {
-            none if none.is_empty() => "not asked".to_owned(),
-            names => names,
         }
     }
 
