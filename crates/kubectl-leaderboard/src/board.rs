@@ -31,14 +31,8 @@ impl<'a> Observed<'a> {
     }
 }
 
-/// Something that is wrong with a Leaderboard.
-#[derive(Debug, PartialEq, Eq)]
-pub(super) struct Problem {
-    /// A sentence.
-    pub text: String,
-    /// The reason whose next step fixes it.
-    pub reason: Option<Reason>,
-}
+/// A sentence about what is wrong with a Leaderboard, and the reason whose next step fixes it.
+pub(super) type Problem = (String, Option<Reason>);
 
 /// All that is wrong with the Leaderboard of this name.
 pub(super) fn problems(name: &str, observed: Observed<'_>) -> Vec<Problem> {
@@ -46,21 +40,21 @@ pub(super) fn problems(name: &str, observed: Observed<'_>) -> Vec<Problem> {
         Observed::Found(leaderboard) => leaderboard,
         Observed::Missing => {
             let text = format!("There is no Leaderboard {name} in this namespace: nothing new starts.");
-            return vec![problem(text, Some(Reason::LeaderboardNotFound))];
+            return vec![(text, Some(Reason::LeaderboardNotFound))];
         }
         Observed::Forbidden => {
             let text = format!("You have no right to read Leaderboard {name}; it may be paused or not Ready.");
-            return vec![problem(text, None)];
+            return vec![(text, None)];
         }
     };
     let mut found = Vec::new();
     if leaderboard.metadata.deletion_timestamp.is_some() {
         let text = format!("Leaderboard {name} is being deleted and waits for its submissions.");
-        found.push(problem(text, Some(Reason::InUse)));
+        found.push((text, Some(Reason::InUse)));
     }
     if leaderboard.spec.paused {
         let text = format!("Leaderboard {name} is paused: nothing new starts, and running submissions continue.");
-        found.push(problem(text, Some(Reason::Paused)));
+        found.push((text, Some(Reason::Paused)));
     }
     found.extend(not_ready(name, leaderboard));
     found
@@ -68,8 +62,8 @@ pub(super) fn problems(name: &str, observed: Observed<'_>) -> Vec<Problem> {
 
 /// Writes a paragraph for each thing that is wrong with the Leaderboard of this name.
 pub(super) fn show_problems(page: &mut Page, name: &str, observed: Observed<'_>) {
-    for problem in problems(name, observed) {
-        page.paragraph(&problem.text);
+    for (text, _) in problems(name, observed) {
+        page.paragraph(&text);
     }
 }
 
@@ -80,7 +74,7 @@ fn not_ready(name: &str, leaderboard: &Leaderboard) -> Option<Problem> {
         let text = format!(
             "The operator has not processed Leaderboard {name} yet. If that lasts, check that the operator runs."
         );
-        return Some(problem(text, None));
+        return Some((text, None));
     };
     let what = match ready.status.as_str() {
         "True" => return None,
@@ -93,9 +87,5 @@ fn not_ready(name: &str, leaderboard: &Leaderboard) -> Option<Problem> {
         ready.reason,
         sentence(&ready.message)
     );
-    Some(problem(text, ready.reason.known()))
-}
-
-fn problem(text: String, reason: Option<Reason>) -> Problem {
-    Problem { text, reason }
+    Some((text, ready.reason.known()))
 }

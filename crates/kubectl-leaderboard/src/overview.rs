@@ -133,7 +133,7 @@ fn of_leaderboards(place: Place<'_>, submissions: &[Submission], leaderboards: O
     observed.extend(live.map(|s| (board_of(s), Observed::Missing)));
     observed.extend(leaderboards.iter().map(|l| (place.name_of(l), Observed::Found(l))));
     let problems = observed.iter().flat_map(|(name, board)| board::problems(name, *board));
-    problems.map(|problem| problem.text).collect()
+    problems.map(|(text, _)| text).collect()
 }
 
 /// What is wrong with a submission; empty if nothing is.

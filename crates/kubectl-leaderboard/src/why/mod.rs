@@ -46,7 +46,7 @@ pub fn value(submission: &Submission, leaderboard: Observed<'_>) -> Value {
         "message": status.message,
         "failure": status.failure,
         "waiting": status.waiting,
-        "leaderboardProblems": problems.iter().map(|problem| problem.text.as_str()).collect::<Vec<_>>(),
+        "leaderboardProblems": problems.into_iter().map(|(text, _)| text).collect::<Vec<_>>(),
         "nextSteps": next_steps(submission, leaderboard),
     })
 }

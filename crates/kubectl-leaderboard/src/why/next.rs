@@ -28,7 +28,7 @@ pub(super) fn next_steps(submission: &Submission, leaderboard: Observed<'_>) -> 
     } else {
         board::problems(&submission.spec.leaderboard_name, leaderboard)
     };
-    reasons.extend(problems.iter().filter_map(|problem| problem.reason));
+    reasons.extend(problems.iter().filter_map(|(_, reason)| *reason));
     let worker = status.failure.as_ref().and_then(|failure| failure.worker);
     let mut steps: Vec<String> = Vec::new();
     let next = |reason| next_step(status.failure.as_deref(), reason);
