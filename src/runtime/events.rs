@@ -19,7 +19,7 @@ use super::queue::{Class, Key, Queue, urgency};
 use super::watches::Watches;
 use crate::kubernetes::objects::{Job, Pod};
 use crate::kubernetes::{Store, WatchEvent};
-use crate::runtime::objects::{Wake, board_of, key_of};
+use crate::runtime::objects::{Wake, board_of, key_of, uid};
 use crate::runtime::stores::Stores;
 use crate::slots;
 use leaderboard_api::{Leaderboard, Submission, conditions, names};
@@ -102,7 +102,7 @@ fn of_submission(
     move |event| {
         let (object, queues) = (event.object.as_ref(), &shared.queues);
         let (board, slots) = (board_of(object), &shared.context.slots);
-        if event.is_gone || counted.moved(object, &slots::mark(object)) {
+        if event.is_gone || counted.moved(uid(object), &slots::mark(object)) {
             slots.changed(&board);
         }
         // One that is being deleted waits for its last submission; of the others the walk of the gauges compares the counts.
@@ -111,15 +111,15 @@ fn of_submission(
             queues.leaderboards.add(&board, Class::Refresh);
         }
         if event.is_gone {
-            marks.forget(object);
-            counted.forget(object);
+            marks.forget(uid(object));
+            counted.forget(uid(object));
             slots.leaves(object);
             queues.submissions.forget(&Key::from(&ObjectRef::from_obj(object)));
             shared.forget(&key_of(object));
             return None;
         }
         shared.context.memory.is_shown(object);
-        let is_news = marks.moved(object, &own_fields(object, names::FINALIZER_SUBMISSION));
+        let is_news = marks.moved(uid(object), &own_fields(object, names::FINALIZER_SUBMISSION));
         is_news.then(|| (ObjectRef::from_obj(object), urgency::of_submission(object)))
     }
 }
@@ -145,15 +145,15 @@ fn of_leaderboard(
         let reference = ObjectRef::from_obj(object);
         slots.changed(&reference);
         if event.is_gone {
-            marks.forget(object);
-            standings.forget(object);
+            marks.forget(uid(object));
+            standings.forget(uid(object));
             shared.queues.leaderboards.forget(&Key::from(&reference));
             shared.forget(&key_of(object));
             slots.wake(&reference);
             return None;
         }
-        let stands_otherwise = standings.moved(object, &standing(object));
-        let is_news = marks.moved(object, &own_fields(object, names::FINALIZER_LEADERBOARD));
+        let stands_otherwise = standings.moved(uid(object), &standing(object));
+        let is_news = marks.moved(uid(object), &own_fields(object, names::FINALIZER_LEADERBOARD));
         if is_news || stands_otherwise {
             slots.wake(&reference);
         }
@@ -222,31 +222,27 @@ fn own_fields(object: &impl ResourceExt, own_finalizer: &str) -> String {
 struct Marks(HashMap<String, u64>);
 
 impl Marks {
-    fn moved(&mut self, object: &impl ResourceExt, mark: &str) -> bool {
-        self.moved_uid(object.uid().unwrap_or_default(), mark)
-    }
-
-    fn moved_uid(&mut self, uid: String, mark: &str) -> bool {
+    fn moved(&mut self, uid: &str, mark: &str) -> bool {
         let mut hasher = DefaultHasher::new();
         hasher.write(mark.as_bytes());
         let mark = hasher.finish();
-        self.0.insert(uid, mark) != Some(mark)
+        self.0.insert(uid.to_owned(), mark) != Some(mark)
     }
 
     /// True for the end and the deletion of a Job: it was made by us, and all else that happens shows in its Pod.
     fn job_has_news(&mut self, job: &Job, is_gone: bool) -> bool {
         let (uid, deleted) = (&*job.metadata.uid, &job.metadata.deletion_timestamp);
         if is_gone {
-            self.0.remove(uid);
+            self.forget(uid);
             return true;
         }
         let conditions = &job.status.conditions;
-        let has_moved = self.moved_uid(uid.to_owned(), &format!("{deleted:?} {conditions:?}"));
+        let has_moved = self.moved(uid, &format!("{deleted:?} {conditions:?}"));
         has_moved && (!conditions.is_empty() || deleted.is_some())
     }
 
-    fn forget(&mut self, object: &impl ResourceExt) {
-        self.0.remove(&object.uid().unwrap_or_default());
+    fn forget(&mut self, uid: &str) {
+        self.0.remove(uid);
     }
 }
 
@@ -295,7 +291,7 @@ mod tests {
         let mut marks = Marks::default();
         let mut is_news = |change: Value| {
             let object = changed(&change);
-            marks.moved(&object, &own_fields(&object, ours))
+            marks.moved(uid(&object), &own_fields(&object, ours))
         };
         for (what, change, expected) in [
             ("it is new", json!({}), true),
