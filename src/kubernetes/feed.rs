@@ -113,16 +113,6 @@ impl<K: Lookup> Lane<K> {
     }
 }
 
-#[cfg(test)]
-impl<K: Lookup> WatchEvents<K> {
-    /// Events that a test makes.
-    pub(crate) fn by_hand() -> (impl Fn(K, bool), Self) {
-        let feed = Feed::new();
-        let events = feed.subscribe(Vec::new);
-        (move |object, is_gone| feed.push(&Arc::new(object), is_gone), events)
-    }
-}
-
 impl<K> Stream for WatchEvents<K> {
     type Item = WatchEvent<K>;
 
@@ -146,6 +136,15 @@ mod tests {
     use futures::{FutureExt, StreamExt};
     use k8s_openapi::api::core::v1::ConfigMap;
     use kube::ResourceExt;
+
+    impl<K: Lookup> WatchEvents<K> {
+        /// Events that a test makes.
+        pub(crate) fn by_hand() -> (impl Fn(K, bool), Self) {
+            let feed = Feed::new();
+            let events = feed.subscribe(Vec::new);
+            (move |object, is_gone| feed.push(&Arc::new(object), is_gone), events)
+        }
+    }
 
     fn object(name: &str, uid: &str, version: &str) -> Arc<ConfigMap> {
         let mut object = ConfigMap::default();
