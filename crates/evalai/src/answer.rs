@@ -288,18 +288,11 @@ fn element(body: &str, tag: &str) -> Option<String> {
 }
 
 fn without_tags(text: &str) -> String {
-    let mut out = String::new();
-    let mut inside = false;
-    for char in text.chars() {
-        match char {
-            '<' => inside = true,
-            '>' if inside => {
-                inside = false;
-                out.push(' ');
-            }
-            _ if !inside => out.push(char),
-            _ => {}
-        }
+    let mut pieces = text.split('<');
+    let mut out = pieces.next().unwrap_or_default().to_owned();
+    for (_, text) in pieces.filter_map(|piece| piece.split_once('>')) {
+        out.push(' ');
+        out.push_str(text);
     }
     out
 }

@@ -181,9 +181,6 @@ fn log(ticket: &Ticket, answer: &Answer<()>, took: Duration) {
     let _lines = subject.map(|subject| subject.log.span().entered());
     let milliseconds = u64::try_from(took.as_millis()).unwrap_or(u64::MAX);
     match answer {
-        Answer::Done(()) if ticket.request.is_write() => {
-            tracing::debug!(request, milliseconds, "EvalAI has stored the update");
-        }
         Answer::Done(()) => tracing::debug!(request, milliseconds, "EvalAI has answered"),
         Answer::Unanswered(Silence { sent: true, why }) if ticket.request.is_write() => {
             tracing::warn!(
