@@ -39,7 +39,7 @@ impl Ask for Fence {
     }
 }
 
-/// Writes it.
+/// Writes the mark.
 pub async fn write(aws: Aws, asked: Asked<Fence>) -> Result<(), Failure> {
     let Fence { mark, files, .. } = &asked.question;
     let archive = files.archive(&aws);

@@ -18,7 +18,7 @@ use leaderboard_policy::questions::{Absence, Fetched, INPUT_LIMIT, Input};
 /// Why a file was not read; None: the time for it was over.
 type Unread = Option<InputError>;
 
-/// Copies it, and logs the outcome.
+/// Copies the file, and logs the outcome.
 pub async fn copy((aws, hub): (Aws, Hub), asked: Asked<Input>) -> Result<Fetched, Failure> {
     let fetched = fetch(&aws, &hub, &asked).await;
     match &fetched {

@@ -110,7 +110,7 @@ impl Ask for Report {
     }
 }
 
-/// Reads it, unless the bucket holds the one that is known.
+/// Reads the report, unless the bucket still holds the one that is known.
 pub async fn read(aws: Aws, asked: Asked<Report>) -> Result<Option<Stored>, Failure> {
     let last = asked.last.as_ref().and_then(|last| last.result.as_ref().as_ref().ok());
     let known = last.and_then(Option::as_ref);

@@ -11,7 +11,7 @@ use leaderboard_policy::questions::{ForeignRun, Row};
 /// Words of the old pipeline's row for a run that has not ended.
 const UNDER_WAY: [&str; 2] = ["SUBMITTED", "RUNNING"];
 
-/// Reads it.
+/// Reads the row.
 pub async fn read(tables: Arc<Tables>, asked: Asked<Row>) -> Result<Option<ForeignRun>, Failure> {
     let row = &asked.question;
     match tables.read(&row.table, &row.team, row.run_id.as_str()).await {
