@@ -9,7 +9,7 @@ use std::time::Duration;
 use futures::future::{join, join_all};
 use kube::runtime::events::{Event, EventType};
 use kube::{Api, Resource};
-use tokio::sync::{OnceCell, watch};
+use tokio::sync::OnceCell;
 use tokio::time::Instant;
 use tracing::Instrument;
 
@@ -23,6 +23,7 @@ use crate::metrics::Metrics;
 use leaderboard_api::text::one_line;
 use leaderboard_api::{Leaderboard, Reason};
 use leaderboard_base::backoff::Backoff;
+use leaderboard_base::shutdown::Stop;
 use leaderboard_policy::intake::message;
 use leaderboard_policy::intake::route::{self, DeadReason, Envelope, Later, MessageOutcome, Outcome, Rules};
 
@@ -46,7 +47,7 @@ pub struct Poller<S> {
     queue: String,
     source: S,
     shared: Arc<Shared>,
-    stop: watch::Receiver<bool>,
+    stop: Stop,
     /// Mean time that a message takes.
     each: Duration,
     ages: Ages,
@@ -63,8 +64,8 @@ struct Readers {
 }
 
 impl<S: Source> Poller<S> {
-    /// A poller of a queue that runs until `stop` becomes true.
-    pub fn new(queue: String, source: S, shared: Arc<Shared>, stop: watch::Receiver<bool>) -> Self {
+    /// A poller of a queue that runs until `stop`.
+    pub fn new(queue: String, source: S, shared: Arc<Shared>, stop: Stop) -> Self {
         Self {
             queue,
             source,
@@ -79,7 +80,7 @@ impl<S: Source> Poller<S> {
     /// Reads the queue until the stop, and finishes what is in hand.
     pub async fn run(mut self) {
         let mut failures: u32 = 0;
-        while !self.is_over() {
+        while !self.stop.is_set() {
             let Err(problem) = self.round().await else {
                 failures = 0;
                 continue;
@@ -92,17 +93,12 @@ impl<S: Source> Poller<S> {
                 retry_seconds = pause.as_secs_f64(),
                 "the queue is not read"
             );
-            if !self.is_over() {
+            if !self.stop.is_set() {
                 self.shared.problems.set(&self.queue, Some(problem));
             }
-            let _ = tokio::time::timeout(pause, self.stop.wait_for(|stop| *stop)).await;
+            let _ = tokio::time::timeout(pause, self.stop.wait()).await;
         }
         self.metrics().set_oldest_message(&self.queue, None);
-    }
-
-    /// It was stopped, or what stops it is gone.
-    fn is_over(&self) -> bool {
-        *self.stop.borrow() || self.stop.has_changed().is_err()
     }
 
     fn now_ms(&self) -> i64 {
@@ -140,14 +136,13 @@ impl<S: Source> Poller<S> {
     }
 
     async fn receive(&mut self) -> Result<Vec<Received>, String> {
-        let mut stop = self.stop.clone();
         let received = tokio::select! {
             biased;
             // A message that was handed out would wait until its time is over.
             received = self.source.receive(self.each, &self.shared.telemetry.clock) => received?,
-            _ = stop.wait_for(|stop| *stop) => return Ok(Vec::new()),
+            () = self.stop.wait() => return Ok(Vec::new()),
         };
-        if !self.is_over() {
+        if !self.stop.is_set() {
             self.shared.problems.set(&self.queue, None);
         }
         Ok(received)

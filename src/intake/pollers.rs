@@ -13,6 +13,7 @@ use super::poller::Poller;
 use super::shared::Shared;
 use super::source::Source;
 use leaderboard_api::Leaderboard;
+use leaderboard_base::shutdown::Stop;
 
 /// How long messages in hand may take to be finished when the program stops.
 const DRAIN: Duration = Duration::from_secs(20);
@@ -81,7 +82,7 @@ impl<W: Clone + PartialEq> Pollers<W> {
 
     fn start(&mut self, queue: &str, way: &W, source: impl Source) {
         tracing::info!(queue, "reading the queue");
-        let (stop, stopped) = watch::channel(false);
+        let (stop, stopped) = Stop::new();
         let poller = Poller::new(queue.to_owned(), source, self.shared.clone(), stopped);
         // It may end before the process does: its queue may be taken out of the Leaderboards.
         let tasks = &self.shared.telemetry.tasks;
