@@ -91,34 +91,29 @@ impl Queue {
         let for_write = lane.busy.take() == Some(Busy::ReadForWrite);
         let row = match answer {
             Answer::Done(row) if row.id == subject.pk => row,
-            Answer::Refused(Refusal {
-                about: About::Missing,
-                message,
-                ..
-            }) => {
+            Answer::Done(_) => return self.went_wrong(subject, "EvalAI answered with another submission".into(), now),
+            // Both are no failure of this submission's.
+            Answer::Throttled(_) => return,
+            Answer::Refused(refusal) if refusal.about == About::Token => return,
+            Answer::Refused(refusal) if refusal.about == About::Missing => {
                 let since = *lane.missing_since.get_or_insert(requested);
                 let again = since + self.timing.missing;
                 if requested < again {
-                    return self.missed(subject, &message, again, now);
+                    let why = format!("{}; it is asked for again before that counts", refusal.message);
+                    return self.change(subject, |sub| {
+                        sub.read_failed(why, now);
+                        sub.retry_at = again;
+                    });
                 }
                 Row::missing(subject.pk)
             }
-            Answer::Done(_) => return self.went_wrong(subject, "EvalAI answered with another submission".into(), now),
-            other => return self.read_failed(subject, &other, now),
+            other => return self.went_wrong(subject, other.error().unwrap_or_default(), now),
         };
         if lane.unsure && requested >= lane.hold_until {
             lane.unsure = false;
         }
         lane.checked = (for_write && !lane.unsure).then_some(now.at);
         self.spread(&Arc::new(row), requested, now, Sub::read_done);
-    }
-
-    /// EvalAI does not have it, which is to be confirmed.
-    fn missed(&mut self, subject: &SubmissionRef, why: &str, again: Duration, now: &Now) {
-        self.change(subject, |sub| {
-            sub.read_failed(format!("{why}; it is asked for again before that counts"), now);
-            sub.retry_at = again;
-        });
     }
 
     /// Gives a row to every object of that submission.
@@ -155,15 +150,6 @@ impl Queue {
                 }
             });
         });
-    }
-
-    fn read_failed(&mut self, subject: &SubmissionRef, answer: &Answer<Row>, now: &Now) {
-        let everybodys = matches!(answer, Answer::Throttled(_))
-            || matches!(answer, Answer::Refused(refusal) if refusal.about == About::Token);
-        match answer.error() {
-            Some(why) if !everybodys => self.went_wrong(subject, why, now),
-            _ => {}
-        }
     }
 
     fn went_wrong(&mut self, subject: &SubmissionRef, why: String, now: &Now) {
