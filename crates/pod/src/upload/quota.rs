@@ -3,13 +3,13 @@
 //! An agent costs itself nothing when it fills its folder, also with sparse or empty files. So its own files get a part of the
 //! limits only, and the logs by which a run is judged keep room that nothing else can use.
 
-use std::collections::BTreeSet;
+use std::collections::BTreeMap;
 
 use super::Decision;
 use crate::daily::Spent;
 use leaderboard_aws::archive::PART;
 use leaderboard_contract::keys::{
-    AGENTS, COLLECTED, EVALAI, EVALUATORS, INPUT, REFUSED, RESULT_FILE, SIMULATORS, known_logs,
+    AGENTS, COLLECTED, EVALAI, EVALUATORS, INPUT, MERGED, REFUSED, SIMULATORS, known_logs, results_path,
 };
 use leaderboard_contract::run::STATUS_FOLDER;
 use leaderboard_protocol::files::{Host, Pair};
@@ -74,14 +74,22 @@ pub struct Quota {
     pub log_a_day: Spent,
     /// Allowance of the agents' own files together for a day, and of the other files of the host's containers.
     pub files_a_day: Spent,
-    logs: BTreeSet<String>,
-    host: Host,
+    /// Bytes that each known log keeps for itself: together a quarter of the limit.
+    log_share: u64,
+    /// Keys of the known logs and of the workers' results.
+    known: BTreeMap<String, Kind>,
 }
 
 impl Quota {
     /// For a run of so many pairs that may store so many bytes.
     pub fn new(bytes: u64, pairs: usize, host: Host) -> Self {
         let at_least = |bytes: u64, gibibytes: u64| bytes.max(gibibytes << 30);
+        let logs: Vec<String> = known_logs(pairs, host).collect();
+        let log_share = (bytes / 4).checked_div(logs.len() as u64).unwrap_or(0);
+        // Beside an evaluator an agent's file of that name is its own.
+        let merged = (host == Host::Simulator).then(|| MERGED.to_owned());
+        let results = Pair::first(pairs).map(|pair| results_path(host, pair)).chain(merged);
+        let logs = logs.into_iter().map(|key| (key, Kind::Log));
         Self {
             bytes,
             // A growing log costs four requests a minute.
@@ -93,15 +101,15 @@ impl Quota {
                 requests: 50_000,
                 bytes: at_least(bytes.saturating_mul(4), 16),
             },
-            logs: known_logs(pairs, host).collect(),
-            host,
+            log_share,
+            known: logs.chain(results.map(|key| (key, Kind::Result))).collect(),
         }
     }
 
     /// Kind of a key.
     pub fn kind(&self, key: &str) -> Kind {
-        if self.logs.contains(key) {
-            return Kind::Log;
+        if let Some(kind) = self.known.get(key) {
+            return *kind;
         }
         if key.starts_with(INPUT) || key == COLLECTED {
             return Kind::Input;
@@ -109,10 +117,7 @@ impl Quota {
         let is_result = key.starts_with(EVALAI)
             || key
                 .strip_prefix(STATUS_FOLDER)
-                .is_some_and(|rest| rest.starts_with('/'))
-            // Beside an evaluator an agent has none, and any file of that name is its own.
-            || (self.host == Host::Simulator && is_checkpoint(key))
-            || is_evaluators_result(key);
+                .is_some_and(|rest| rest.starts_with('/'));
         let is_hosts = [SIMULATORS, EVALUATORS, "logcopy/"]
             .iter()
             .any(|folder| key.starts_with(folder));
@@ -149,12 +154,6 @@ impl Quota {
         ledger
     }
 
-    /// Bytes that each known log keeps for itself: together a quarter of the limit.
-    fn log_share(&self) -> u64 {
-        let logs = u64::try_from(self.logs.len()).unwrap_or(u64::MAX);
-        (self.bytes / 4).checked_div(logs).unwrap_or(0)
-    }
-
     /// Bytes for everything but the known logs' shares.
     fn common(&self) -> u64 {
         self.bytes.saturating_sub(self.bytes / 4)
@@ -164,28 +163,11 @@ impl Quota {
     fn weight(&self, kind: Kind, size: u64) -> u64 {
         let counted = size.max(LEAST);
         match kind {
-            Kind::Log => counted.saturating_sub(self.log_share()),
+            Kind::Log => counted.saturating_sub(self.log_share),
             Kind::Input => 0,
             Kind::Result | Kind::Host | Kind::Agent => counted,
         }
     }
-}
-
-/// The merged file, or the checkpoint of a pair.
-fn is_checkpoint(key: &str) -> bool {
-    let inner = key
-        .strip_prefix(AGENTS)
-        .and_then(|rest| rest.strip_suffix("agent_results.json"));
-    inner.is_some_and(|inner| {
-        let number = inner.strip_prefix("agent").and_then(|rest| rest.strip_suffix('/'));
-        inner.is_empty() || number.is_some_and(|number| number.parse::<u16>().is_ok())
-    })
-}
-
-/// The result of a worker's evaluator.
-fn is_evaluators_result(key: &str) -> bool {
-    let worker = key.strip_prefix(EVALUATORS).and_then(|rest| rest.split_once('/'));
-    worker.is_some_and(|(worker, file)| file == RESULT_FILE && worker.parse::<Pair>().is_ok())
 }
 
 /// True if a stranger's container writes it.
@@ -223,7 +205,7 @@ impl Ledger<'_> {
             (common, Limit::Bytes(quota.common()))
         };
         if kind == Kind::Log {
-            return Ok(size.min(quota.log_share().saturating_add(room)));
+            return Ok(size.min(quota.log_share.saturating_add(room)));
         }
         if weight > room {
             return Err(limit);
