@@ -101,6 +101,11 @@ const fn metric(name: &'static str, column: &'static str, label: &'static str, s
     }
 }
 
+/// A metric whose label is its name.
+const fn same(name: &'static str, column: &'static str, source: Source) -> Metric {
+    metric(name, column, name, source)
+}
+
 /// In the order of EvalAI's files; V1 has the first twelve.
 const METRICS: [Metric; 15] = {
     use Source::{Infraction as I, Score as S};
@@ -147,44 +152,19 @@ const METRICS: [Metric; 15] = {
             "Red lights infractions",
             I("red_light"),
         ),
-        metric(
-            "Stop sign infractions",
-            "stop_sign_infractions",
-            "Stop sign infractions",
-            I("stop_infraction"),
-        ),
-        metric(
-            "Off-road infractions",
-            "off_road_infractions",
-            "Off-road infractions",
-            I(OFF_ROAD),
-        ),
-        metric(
-            "Route deviations",
-            "route_deviations",
-            "Route deviations",
-            I("route_dev"),
-        ),
-        metric("Route timeouts", "route_timeouts", "Route timeouts", I("route_timeout")),
-        metric("Agent blocked", "agent_blocked", "Agent blocked", I("vehicle_blocked")),
+        same("Stop sign infractions", "stop_sign_infractions", I("stop_infraction")),
+        same("Off-road infractions", "off_road_infractions", I(OFF_ROAD)),
+        same("Route deviations", "route_deviations", I("route_dev")),
+        same("Route timeouts", "route_timeouts", I("route_timeout")),
+        same("Agent blocked", "agent_blocked", I("vehicle_blocked")),
         metric(
             "Yield emergency vehicle infractions",
             "yield_emergency_vehicle_infractions",
             "Yield emergency vehicles infractions",
             I("yield_emergency_vehicle_infractions"),
         ),
-        metric(
-            "Scenario timeouts",
-            "scenario_timeouts",
-            "Scenario timeouts",
-            I("scenario_timeouts"),
-        ),
-        metric(
-            "Min speed infractions",
-            "min_speed_infractions",
-            "Min speed infractions",
-            I(MIN_SPEED),
-        ),
+        same("Scenario timeouts", "scenario_timeouts", I("scenario_timeouts")),
+        same("Min speed infractions", "min_speed_infractions", I(MIN_SPEED)),
     ]
 };
 

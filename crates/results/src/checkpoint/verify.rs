@@ -36,7 +36,7 @@ pub(super) fn check(format: Format, record: &Record) -> Result<(), RecordProblem
 fn check_penalty(format: Format, record: &Record, penalty: f64) -> Result<(), RecordProblem> {
     let events = Events { record };
     let (allowed, rounding) = match format {
-        Format::V1 => (events.product(&V1_FACTORS, 0.0), 1e-9),
+        Format::V1 => (events.product(V2_FACTORS.split_at(5).0, 0.0), 1e-9),
         // 2.0 and 2.1 write the same format, each with a formula of its own.
         Format::V2 => {
             let (old, new) = (events.product(&V2_FACTORS, V2_SPEED), events.harmonic());
@@ -58,16 +58,7 @@ fn is_beyond(distance: f64, limit: f64) -> bool {
     distance > limit || distance.is_nan()
 }
 
-/// Factors by which each infraction multiplies the penalty.
-const V1_FACTORS: [(&str, f64); 5] = [
-    ("collisions_pedestrian", 0.5),
-    ("collisions_vehicle", 0.6),
-    ("collisions_layout", 0.65),
-    ("red_light", 0.7),
-    ("stop_infraction", 0.8),
-];
-
-/// Factors of 2.0.
+/// Factors by which each infraction multiplies the penalty in 2.0; 1.0 has the first five.
 const V2_FACTORS: [(&str, f64); 7] = [
     ("collisions_pedestrian", 0.5),
     ("collisions_vehicle", 0.6),
