@@ -8,7 +8,7 @@ mod dead_letter;
 pub mod queue;
 mod sqs;
 
-use std::sync::{Arc, Mutex};
+use std::sync::Arc;
 
 use kube::runtime::watcher::Config;
 
@@ -34,15 +34,6 @@ fn shared(clients: Clients, scope: Scope, telemetry: Observability) -> Shared {
     }
 }
 
-fn pulse(shared: &Shared) -> Pulse {
-    Pulse {
-        client: shared.client.clone(),
-        namespaces: shared.scope.namespaces.clone(),
-        liveness: shared.telemetry.liveness.clone(),
-        last: Mutex::default(),
-    }
-}
-
 /// Runs the bridge until the stop of `telemetry`; then finishes what is in hand, within 20 s. It serves the Leaderboards of
 /// this scope.
 ///
@@ -56,7 +47,7 @@ pub async fn run(clients: Clients, aws: Aws, scope: Scope, telemetry: Observabil
         telemetry.metrics.shared.messages.of([outcome]);
     }
     let aws = aws.counted_by(telemetry.metrics.meter());
-    let pulse = Arc::new(pulse(&shared));
+    let pulse = Arc::new(Pulse::of(Arc::clone(&shared)));
     let open = |url: &str, way: &Connection| SqsQueue {
         url: url.to_owned(),
         sqs: aws.sqs(way.region.as_deref(), way.endpoint.as_deref()),

@@ -5,14 +5,13 @@ use std::sync::{Arc, Mutex};
 use std::time::Duration;
 
 use aws_sdk_sqs::Client as Sqs;
-use kube::Client;
 use kube::api::ListParams;
 use tokio::time::Instant;
 
 use super::queue::{Reader, batch_size};
+use crate::intake::shared::Shared;
 use crate::intake::source::{Received, SetAside, Source, named};
-use crate::kubernetes::{Namespaces, call_within};
-use crate::observability::liveness::Liveness;
+use crate::kubernetes::call_within;
 use leaderboard_api::{Leaderboard, Reason};
 use leaderboard_base::clock::Clock;
 use leaderboard_base::lock::lock;
@@ -47,19 +46,23 @@ pub(super) fn desired(leaderboards: &[Arc<Leaderboard>]) -> BTreeMap<String, Con
 
 /// Shows whether the API server answers: a message that is received in vain is a step towards its dead letter.
 pub(super) struct Pulse {
-    pub client: Client,
-    pub namespaces: Namespaces,
-    pub liveness: Liveness,
-    pub last: Mutex<Option<Instant>>,
+    shared: Arc<Shared>,
+    last: Mutex<Option<Instant>>,
 }
 
 impl Pulse {
+    pub fn of(shared: Arc<Shared>) -> Self {
+        let last = Mutex::default();
+        Self { shared, last }
+    }
+
     pub async fn check(&self) -> Result<(), String> {
         let last = *lock(&self.last);
         if last.is_some_and(|at| at.elapsed() < PULSE_AGE) {
             return Ok(());
         }
-        let apis = self.namespaces.apis::<Leaderboard>(&self.client);
+        let shared = &self.shared;
+        let apis = shared.scope.namespaces.apis::<Leaderboard>(&shared.client);
         let first = ListParams::default().limit(1);
         let asked = apis
             .iter()
@@ -68,7 +71,7 @@ impl Pulse {
         listed.map_err(|error| error.cause())?;
         *lock(&self.last) = Some(Instant::now());
         // A watch that stays broken meanwhile is a reason to restart.
-        self.liveness.answered();
+        shared.telemetry.liveness.answered();
         Ok(())
     }
 }

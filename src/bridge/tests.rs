@@ -72,7 +72,8 @@ fn is_list(request: &Request<Body>) -> bool {
 fn a_pulse() -> (Pulse, Server, watch::Sender<bool>) {
     let (clients, handle) = client();
     let (telemetry, stop) = telemetry();
-    (pulse(&shared(clients, everything(), telemetry)), handle, stop)
+    let shared = Arc::new(shared(clients, everything(), telemetry));
+    (Pulse::of(shared), handle, stop)
 }
 
 #[tokio::test(start_paused = true)]
@@ -168,7 +169,7 @@ async fn a_broken_watch_of_leaderboards_fails_liveness_while_the_api_server_answ
         Vec::<String>::new(),
         "nothing else has answered"
     );
-    assert_eq!(pulse(&shared).check().await, Ok(()));
+    assert_eq!(Pulse::of(Arc::new(shared)).check().await, Ok(()));
     let problems = telemetry.liveness.problems().join("");
     assert!(problems.contains("the watch of Leaderboard"), "{problems:?}");
 }
