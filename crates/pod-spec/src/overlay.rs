@@ -120,7 +120,8 @@ fn addresses(addressed: &str, container: &str) -> bool {
                 .is_some_and(|number| number.starts_with('-')))
 }
 
-fn without_nulls(value: &Value) -> Value {
+/// The value without the fields that are null.
+pub(super) fn without_nulls(value: &Value) -> Value {
     match value {
         Value::Object(object) => {
             let kept = object.iter().filter(|(_, value)| !value.is_null());

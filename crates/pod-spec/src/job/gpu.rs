@@ -5,10 +5,7 @@
 //! and the last one counts: a container that requests a GPU of its own must not have the variable, or it would hide what the plugin
 //! gave.
 
-use std::collections::BTreeMap;
-
-use k8s_openapi::api::core::v1::{EnvVar, PodResourceClaim, ResourceClaim, ResourceRequirements};
-use k8s_openapi::apimachinery::pkg::api::resource::Quantity;
+use k8s_openapi::api::core::v1::{EnvVar, ResourceRequirements};
 use serde_json::{Value, json};
 
 use super::failed_nodes::{HOSTNAME, REQUIRED};
@@ -57,42 +54,34 @@ pub(super) fn resources(
     source: GpuSource<'_>,
     agents: Agents,
     member: Member,
-    hosts: Option<ResourceRequirements>,
-) -> Option<ResourceRequirements> {
-    let is_requested = |mut resources: ResourceRequirements, resource: &str| {
-        let limits = resources.limits.get_or_insert_with(BTreeMap::new);
-        limits.insert(resource.to_owned(), Quantity("1".into()));
-        Some(resources)
-    };
+    hosts: Option<&ResourceRequirements>,
+) -> Value {
+    let mut resources = json!(hosts);
     match source {
-        GpuSource::None => hosts,
-        GpuSource::NodeIndex(_) if agents == Agents::Beside && member.side == Side::Agent => hosts,
+        GpuSource::None => {}
+        GpuSource::NodeIndex(_) if agents == Agents::Beside && member.side == Side::Agent => {}
         GpuSource::PerContainer(resource) | GpuSource::NodeIndex(resource) => {
-            is_requested(hosts.unwrap_or_default(), resource)
+            resources["limits"][resource] = "1".into();
         }
         GpuSource::Claim(_) => {
-            let mut resources = hosts.unwrap_or_default();
-            resources.claims.get_or_insert_with(Vec::new).push(ResourceClaim {
-                name: claim_name(member.pair),
-                request: None,
-            });
-            Some(resources)
+            let claim = json!({"name": claim_name(member.pair)});
+            match resources["claims"].as_array_mut() {
+                Some(claims) => claims.push(claim),
+                None => resources["claims"] = json!([claim]),
+            }
         }
     }
+    resources
 }
 
 /// One claim for each worker that shares the work, for its two containers.
-pub(super) fn claims(input: &JobInput<'_>) -> Option<Vec<PodResourceClaim>> {
+pub(super) fn claims(input: &JobInput<'_>) -> Option<Vec<Value>> {
     let GpuSource::Claim(claim) = source(input.spec()) else {
         return None;
     };
     let leaderboard = input.leaderboard.metadata.name.as_deref().unwrap_or_default();
     let template = template_name(leaderboard, claim);
-    let of_worker = |worker| PodResourceClaim {
-        name: claim_name(worker),
-        resource_claim_name: None,
-        resource_claim_template_name: Some(template.clone()),
-    };
+    let of_worker = |worker| json!({"name": claim_name(worker), "resourceClaimTemplateName": template});
     Some(Pair::first(input.plan.sharing()).map(of_worker).collect())
 }
 

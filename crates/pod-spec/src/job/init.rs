@@ -2,9 +2,8 @@
 //!
 //! Only `workspace` and `logcopy` ever get an identity towards AWS.
 
-use k8s_openapi::api::core::v1::{
-    Container, EnvVar, EnvVarSource, ObjectFieldSelector, SecretKeySelector, SecurityContext,
-};
+use k8s_openapi::api::core::v1::EnvVar;
+use serde_json::{Value, json};
 
 use super::security::{confined, context, resources};
 use super::{JobInput, is_resumed, own_uid, run_document, variable, volumes};
@@ -16,23 +15,23 @@ use leaderboard_evaluation::workload::literal;
 
 /// Copying prints little; what floods must not fill the disk. In bytes.
 const CONTENTS_LOG_LIMIT: u64 = 16 << 20;
+/// Resources of a container that copies, and of the one that stores.
+const SMALL: [&str; 3] = ["50m", "64Mi", "512Mi"];
+const LARGE: [&str; 3] = ["100m", "128Mi", "1Gi"];
 
 /// Copies the private contents into their volumes, where the kind of evaluation has some.
-pub(super) fn contents(input: &JobInput<'_>) -> Option<Container> {
-    let (contents, hosts) = (
-        input.kind().contents(&input.asked())?,
-        input.spec().given(None, Part::Contents)?,
-    );
-    Some(Container {
-        name: names::CONTAINER_CONTENTS.into(),
-        image: Some(contents.image),
-        command: Some(kept(contents.command)),
-        env: Some(contents_env(input, hosts.env)),
-        resources: hosts.resources,
-        security_context: Some(context(hosts.security)),
-        volume_mounts: Some(volumes::of_contents(input)),
-        ..Container::default()
-    })
+pub(super) fn contents(input: &JobInput<'_>) -> Option<Value> {
+    let contents = input.kind().contents(&input.asked())?;
+    let hosts = input.spec().given(None, Part::Contents)?;
+    Some(json!({
+        "name": names::CONTAINER_CONTENTS,
+        "image": contents.image,
+        "command": kept(contents.command),
+        "env": contents_env(input, hosts.env),
+        "resources": hosts.resources,
+        "securityContext": context(hosts.security),
+        "volumeMounts": volumes::of_contents(input),
+    }))
 }
 
 /// Adds the runner, which writes the output of `contents` to a file too. `logcopy` sends that file to CloudWatch.
@@ -63,74 +62,60 @@ fn contents_env(input: &JobInput<'_>, hosts: &[EnvVar]) -> Vec<EnvVar> {
 }
 
 /// Copy the dataset and the labels out of their images, which need no shell.
-pub(super) fn data(input: &JobInput<'_>) -> Vec<Container> {
+pub(super) fn data(input: &JobInput<'_>) -> Vec<Value> {
     let all = input.kind().data(input.spec()).into_iter();
     let containers = all.filter_map(|data| {
         let image = data.source.image()?;
-        Some(Container {
-            name: data.volume.name.into(),
-            image: Some(image.reference.clone()),
-            command: Some(vec![
-                format!("{TOOLS}/{RUNNER}"),
-                "copy".into(),
-                format!("--from={}", literal(&image.path)),
-                format!("--to={}", data.volume.written),
-            ]),
-            resources: Some(resources(["50m", "64Mi"], "512Mi")),
-            security_context: Some(confined()),
-            volume_mounts: Some(volumes::of_data(data.volume)),
-            ..Container::default()
-        })
+        let from = format!("--from={}", literal(&image.path));
+        Some(json!({
+            "name": data.volume.name,
+            "image": image.reference,
+            "command": [format!("{TOOLS}/{RUNNER}"), "copy", from, format!("--to={}", data.volume.written)],
+            "resources": resources(SMALL),
+            "securityContext": confined(),
+            "volumeMounts": volumes::of_data(data.volume),
+        }))
     });
     containers.collect()
 }
 
 /// Prepares the volumes and restores what an earlier attempt stored.
-pub(super) fn workspace(input: &JobInput<'_>) -> Container {
-    Container {
-        volume_mounts: Some(volumes::of_workspace(input)),
-        resources: Some(resources(["50m", "64Mi"], "512Mi")),
-        ..own(input, names::CONTAINER_WORKSPACE)
-    }
+pub(super) fn workspace(input: &JobInput<'_>) -> Value {
+    let (env, mounts) = (own_env(input), volumes::of_workspace(input));
+    own(input, names::CONTAINER_WORKSPACE, &env, &mounts, SMALL)
 }
 
 /// Merges, uploads and reports beside the workers.
-pub(super) fn logcopy(input: &JobInput<'_>) -> Container {
-    Container {
-        restart_policy: Some("Always".into()),
-        volume_mounts: Some(volumes::of_logcopy(input)),
-        resources: Some(resources(["100m", "128Mi"], "1Gi")),
-        ..own(input, names::CONTAINER_LOGCOPY)
-    }
+pub(super) fn logcopy(input: &JobInput<'_>) -> Value {
+    let (env, mounts) = (own_env(input), volumes::of_logcopy(input));
+    let mut logcopy = own(input, names::CONTAINER_LOGCOPY, &env, &mounts, LARGE);
+    logcopy["restartPolicy"] = "Always".into();
+    logcopy
 }
 
 /// Copies what an agent has left, for the evaluators. It reads a stranger's files, so that it has no identity.
-pub(super) fn collect(input: &JobInput<'_>) -> Container {
-    Container {
-        env: Some(vec![run_variable(input)]),
-        volume_mounts: Some(volumes::of_collect()),
-        resources: Some(resources(["50m", "64Mi"], "512Mi")),
-        ..own(input, names::CONTAINER_COLLECT)
-    }
+pub(super) fn collect(input: &JobInput<'_>) -> Value {
+    let (env, mounts) = ([json!(run_variable(input))], volumes::of_collect());
+    own(input, names::CONTAINER_COLLECT, &env, &mounts, SMALL)
 }
 
-fn own(input: &JobInput<'_>, name: &str) -> Container {
+fn own(input: &JobInput<'_>, name: &str, env: &[Value], mounts: &[Value], size: [&str; 3]) -> Value {
     let uid = own_uid::of(input);
-    Container {
-        name: name.into(),
-        image: Some(input.own.image.clone()),
-        image_pull_policy: input.own.pull_policy.clone(),
-        command: Some(vec!["leaderboard-operator".into(), name.into()]),
-        env: Some(own_env(input)),
-        security_context: Some(SecurityContext {
-            read_only_root_filesystem: Some(true),
-            run_as_non_root: Some(true),
-            run_as_user: Some(uid),
-            run_as_group: Some(uid),
-            ..confined()
-        }),
-        ..Container::default()
-    }
+    let mut context = confined();
+    context["readOnlyRootFilesystem"] = true.into();
+    context["runAsNonRoot"] = true.into();
+    context["runAsUser"] = uid.into();
+    context["runAsGroup"] = uid.into();
+    json!({
+        "name": name,
+        "image": input.own.image,
+        "imagePullPolicy": input.own.pull_policy,
+        "command": ["leaderboard-operator", name],
+        "env": env,
+        "resources": resources(size),
+        "securityContext": context,
+        "volumeMounts": mounts,
+    })
 }
 
 fn run_variable(input: &JobInput<'_>) -> EnvVar {
@@ -138,51 +123,32 @@ fn run_variable(input: &JobInput<'_>) -> EnvVar {
     variable(ENV_RUN, &run)
 }
 
-fn own_env(input: &JobInput<'_>) -> Vec<EnvVar> {
-    let mut env = vec![
-        run_variable(input),
-        EnvVar {
-            name: ENV_POD_UID.into(),
-            value_from: Some(EnvVarSource {
-                field_ref: Some(ObjectFieldSelector {
-                    field_path: "metadata.uid".into(),
-                    api_version: None,
-                }),
-                ..EnvVarSource::default()
-            }),
-            value: None,
-        },
-        // The node's own role is no identity of ours: what answers us at the metadata address answers the agents too.
-        variable("AWS_EC2_METADATA_DISABLED", "true"),
-    ];
+fn own_env(input: &JobInput<'_>) -> Vec<Value> {
+    let identity = input.spec().pod_identity.as_ref();
     let region = input.own.region.as_ref().or(input.plan.storage.s3.region.as_ref());
-    env.extend(region.map(|region| variable("AWS_REGION", region)));
     let checksums = input.own.checksums.as_deref();
-    env.extend(checksums.map(|when| variable(ENV_CHECKSUMS, when)));
-    if let Some(identity) = &input.spec().pod_identity {
-        env.extend(identity.role_arn.as_deref().map(|role| variable(ENV_ROLE_ARN, role)));
-        env.extend(identity.secret_name.iter().flat_map(|secret| {
-            [
-                from_secret(secret, "AWS_ACCESS_KEY_ID", false),
-                from_secret(secret, "AWS_SECRET_ACCESS_KEY", false),
-                from_secret(secret, "AWS_SESSION_TOKEN", true),
-            ]
-        }));
-    }
-    env
-}
-
-fn from_secret(secret: &str, key: &str, optional: bool) -> EnvVar {
-    EnvVar {
-        name: key.into(),
-        value_from: Some(EnvVarSource {
-            secret_key_ref: Some(SecretKeySelector {
-                name: secret.into(),
-                key: key.into(),
-                optional: optional.then_some(true),
-            }),
-            ..EnvVarSource::default()
-        }),
-        value: None,
-    }
+    let role = identity.and_then(|identity| identity.role_arn.as_deref());
+    let settings = [
+        // The node's own role is no identity of ours: what answers us at the metadata address answers the agents too.
+        Some(variable("AWS_EC2_METADATA_DISABLED", "true")),
+        region.map(|region| variable("AWS_REGION", region)),
+        checksums.map(|when| variable(ENV_CHECKSUMS, when)),
+        role.map(|role| variable(ENV_ROLE_ARN, role)),
+    ];
+    let secret = identity.and_then(|identity| identity.secret_name.as_deref());
+    let keys = [
+        ("AWS_ACCESS_KEY_ID", None),
+        ("AWS_SECRET_ACCESS_KEY", None),
+        ("AWS_SESSION_TOKEN", Some(true)),
+    ];
+    let from_secret = secret.into_iter().flat_map(|secret| {
+        keys.map(|(key, optional)| {
+            let reference = json!({"name": secret, "key": key, "optional": optional});
+            json!({"name": key, "valueFrom": {"secretKeyRef": reference}})
+        })
+    });
+    let uid = json!({"name": ENV_POD_UID, "valueFrom": {"fieldRef": {"fieldPath": "metadata.uid"}}});
+    let settings = settings.into_iter().flatten().map(|variable| json!(variable));
+    let own = [json!(run_variable(input)), uid].into_iter();
+    own.chain(settings).chain(from_secret).collect()
 }

@@ -34,11 +34,11 @@ use std::time::Duration;
 
 pub use gpu::unclear;
 use jiff::Timestamp;
-use k8s_openapi::api::batch::v1::{Job, JobSpec};
-use k8s_openapi::api::core::v1::{EnvVar, PodSpec, PodTemplateSpec, Toleration};
+use k8s_openapi::api::batch::v1::Job;
+use k8s_openapi::api::core::v1::EnvVar;
 use k8s_openapi::apimachinery::pkg::apis::meta::v1::ObjectMeta;
 use kube::core::{DynamicObject, TypeMeta};
-use serde_json::Value;
+use serde_json::{Value, json};
 
 use crate::gpu_claims::source;
 use crate::layout::ANNOTATION_SKIP_CONTAINERS;
@@ -133,9 +133,8 @@ impl JobInput<'_> {
 /// The Job as it is created: ours, with the Leaderboard's `podOverrides` laid over its template. As JSON, since newer Pod fields
 /// survive there.
 pub fn build_object(input: &JobInput<'_>) -> DynamicObject {
-    // Maps with text as keys and finite numbers always become JSON.
     let workloads = members::workloads(input);
-    let mut spec = serde_json::to_value(ours(input, &workloads)).unwrap_or_default();
+    let mut spec = ours(input, &workloads);
     let template = &mut spec["template"];
     pod_overlay::lay(template, input.spec());
     settle(template, input, &workloads);
@@ -197,17 +196,16 @@ fn isolation(leaderboard: &Leaderboard, now: Timestamp) -> Option<Isolation> {
     })
 }
 
-fn ours(input: &JobInput<'_>, workloads: &[Workload]) -> JobSpec {
-    JobSpec {
-        completions: Some(1),
-        parallelism: Some(1),
-        backoff_limit: Some(backoff_limit(input)),
+fn ours(input: &JobInput<'_>, workloads: &[Workload]) -> Value {
+    pod_overlay::without_nulls(&json!({
+        "completions": 1,
+        "parallelism": 1,
+        "backoffLimit": backoff_limit(input),
         // The default starts the next Pod while the old one still writes.
-        pod_replacement_policy: Some("Failed".into()),
-        ttl_seconds_after_finished: Some(input.spec().job_seconds()),
-        template: template(input, workloads),
-        ..JobSpec::default()
-    }
+        "podReplacementPolicy": "Failed",
+        "ttlSecondsAfterFinished": input.spec().job_seconds(),
+        "template": template(input, workloads),
+    }))
 }
 
 fn metadata(input: &JobInput<'_>) -> ObjectMeta {
@@ -270,27 +268,26 @@ fn active_deadline(input: &JobInput<'_>) -> Option<i64> {
     Some(seconds.min(i32::MAX.into()))
 }
 
-fn template(input: &JobInput<'_>, workloads: &[Workload]) -> PodTemplateSpec {
-    PodTemplateSpec {
-        metadata: Some(ObjectMeta {
-            labels: Some(labels(input)),
+fn template(input: &JobInput<'_>, workloads: &[Workload]) -> Value {
+    json!({
+        "metadata": {
+            "labels": labels(input),
             // Moving a run to another node costs hours of simulation.
-            annotations: Some(BTreeMap::from([
-                ("cluster-autoscaler.kubernetes.io/safe-to-evict".into(), "false".into()),
-                ("karpenter.sh/do-not-disrupt".into(), "true".into()),
-                (names::ANNOTATION_GENERATION.into(), generation(input).to_string()),
-            ])),
-            ..ObjectMeta::default()
-        }),
-        spec: Some(pod(input, workloads)),
-    }
+            "annotations": {
+                "cluster-autoscaler.kubernetes.io/safe-to-evict": "false",
+                "karpenter.sh/do-not-disrupt": "true",
+                (names::ANNOTATION_GENERATION): generation(input).to_string(),
+            },
+        },
+        "spec": pod(input, workloads),
+    })
 }
 
 fn generation(input: &JobInput<'_>) -> i64 {
     input.leaderboard.metadata.generation.unwrap_or_default()
 }
 
-fn pod(input: &JobInput<'_>, workloads: &[Workload]) -> PodSpec {
+fn pod(input: &JobInput<'_>, workloads: &[Workload]) -> Value {
     let identity = input.spec().pod_identity.as_ref();
     // `workspace` is first, since it makes the folders and the runner that the others have.
     let init = [Some(init::workspace(input)), init::contents(input)]
@@ -300,24 +297,23 @@ fn pod(input: &JobInput<'_>, workloads: &[Workload]) -> PodSpec {
     // The kubelet's own order keeps an agent that runs first from what follows it.
     let first = workers::first(input, workloads).into_iter();
     let first = first.flat_map(|agent| [agent, init::collect(input)]);
-    PodSpec {
-        restart_policy: Some("OnFailure".into()),
-        init_containers: Some(init.chain(first).collect()),
-        containers: workers::all(input, workloads),
-        volumes: Some(volumes::all(input, workloads)),
-        active_deadline_seconds: active_deadline(input),
-        termination_grace_period_seconds: Some(GRACE_SECONDS),
-        service_account_name: identity.and_then(|identity| identity.service_account_name.clone()),
-        automount_service_account_token: Some(false),
-        enable_service_links: Some(false),
-        share_process_namespace: Some(false),
-        priority_class_name: input.track().and_then(|track| track.priority_class_name.clone()),
-        runtime_class_name: input.spec().runtime_class_name.clone(),
-        resource_claims: gpu::claims(input),
-        node_selector: Some(node_selector(input)),
-        tolerations: Some(tolerations(input)),
-        ..PodSpec::default()
-    }
+    json!({
+        "restartPolicy": "OnFailure",
+        "initContainers": init.chain(first).collect::<Vec<_>>(),
+        "containers": workers::all(input, workloads),
+        "volumes": volumes::all(input, workloads),
+        "activeDeadlineSeconds": active_deadline(input),
+        "terminationGracePeriodSeconds": GRACE_SECONDS,
+        "serviceAccountName": identity.and_then(|identity| identity.service_account_name.as_ref()),
+        "automountServiceAccountToken": false,
+        "enableServiceLinks": false,
+        "shareProcessNamespace": false,
+        "priorityClassName": input.track().and_then(|track| track.priority_class_name.as_ref()),
+        "runtimeClassName": input.spec().runtime_class_name,
+        "resourceClaims": gpu::claims(input),
+        "nodeSelector": node_selector(input),
+        "tolerations": tolerations(input),
+    })
 }
 
 /// Images of participants, and mostly of hosts, are for one kind of machine. A track can choose another.
@@ -332,16 +328,15 @@ fn node_selector(input: &JobInput<'_>) -> BTreeMap<String, String> {
     nodes
 }
 
-fn tolerations(input: &JobInput<'_>) -> Vec<Toleration> {
-    let lost_node = ["not-ready", "unreachable"].map(|what| Toleration {
-        key: Some(format!("node.kubernetes.io/{what}")),
-        operator: Some("Exists".into()),
-        effect: Some("NoExecute".into()),
-        toleration_seconds: Some(LOST_NODE_SECONDS),
-        ..Toleration::default()
+fn tolerations(input: &JobInput<'_>) -> Vec<Value> {
+    let lost_node = ["not-ready", "unreachable"].map(|what| {
+        json!({
+            "key": format!("node.kubernetes.io/{what}"), "operator": "Exists", "effect": "NoExecute",
+            "tolerationSeconds": LOST_NODE_SECONDS,
+        })
     });
-    let track = input.track().map(|track| track.tolerations.clone()).unwrap_or_default();
-    lost_node.into_iter().chain(track).collect()
+    let of_track = input.track().into_iter().flat_map(|track| &track.tolerations);
+    lost_node.into_iter().chain(of_track.map(|one| json!(one))).collect()
 }
 
 /// Fills in the fields that depend on the host's: where the host sets none, and in the containers of the overlay too.

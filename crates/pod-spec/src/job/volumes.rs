@@ -1,11 +1,6 @@
 //! The Pod's volumes, and who mounts which of them where. Pure; called by the builders of the containers.
 
-use k8s_openapi::api::core::v1::{
-    DownwardAPIVolumeFile, DownwardAPIVolumeSource, EmptyDirVolumeSource, HostPathVolumeSource, ObjectFieldSelector,
-    PersistentVolumeClaimVolumeSource, ProjectedVolumeSource, ServiceAccountTokenProjection, Volume, VolumeMount,
-    VolumeProjection,
-};
-use k8s_openapi::apimachinery::pkg::api::resource::Quantity;
+use serde_json::{Value, json};
 
 use super::{JobInput, members};
 use crate::layout::{
@@ -27,7 +22,7 @@ const LOGS_MARGIN: u64 = 1 << 30;
 const CONTENTS_BYTES: u64 = 10 << 30;
 
 /// Every volume of the Pod.
-pub(super) fn all(input: &JobInput<'_>, workloads: &[Workload]) -> Vec<Volume> {
+pub(super) fn all(input: &JobInput<'_>, workloads: &[Workload]) -> Vec<Value> {
     let (kind, spec) = (input.kind(), input.spec());
     let contents = kind
         .reserved(spec)
@@ -36,8 +31,8 @@ pub(super) fn all(input: &JobInput<'_>, workloads: &[Workload]) -> Vec<Volume> {
         .map(|volume| empty(volume.name, None));
     let data = kind.data(spec).into_iter().map(|data| with_data(&data));
     let own = [
-        empty(LOGS_VOLUME, Some(Quantity(logs_limit(input).to_string()))),
-        empty(TOOLS_VOLUME, Some(Quantity("64Mi".into()))),
+        empty(LOGS_VOLUME, Some(&logs_limit(input).to_string())),
+        empty(TOOLS_VOLUME, Some("64Mi")),
         podinfo(),
     ];
     let identity = spec.has_role().then(identity);
@@ -50,52 +45,35 @@ pub(super) fn all(input: &JobInput<'_>, workloads: &[Workload]) -> Vec<Volume> {
 }
 
 /// A volume that an init container fills, or a claim of the host's.
-fn with_data(data: &Data<'_>) -> Volume {
-    let claim = match data.source {
-        DataSource::Image(_) => return empty(data.volume.name, None),
-        DataSource::PersistentVolumeClaim(claim) => claim,
-    };
-    Volume {
-        name: data.volume.name.into(),
-        persistent_volume_claim: Some(PersistentVolumeClaimVolumeSource {
-            claim_name: claim.claim_name.clone(),
-            read_only: Some(true),
-        }),
-        ..Volume::default()
+fn with_data(data: &Data<'_>) -> Value {
+    let name = data.volume.name;
+    match data.source {
+        DataSource::Image(_) => empty(name, None),
+        DataSource::PersistentVolumeClaim(claim) => {
+            json!({"name": name, "persistentVolumeClaim": {"claimName": claim.claim_name, "readOnly": true}})
+        }
     }
 }
 
 /// Folders of the node that a worker's containers mount, which are the same for all workers.
-fn of_node(workloads: &[Workload]) -> Vec<Volume> {
+fn of_node(workloads: &[Workload]) -> Vec<Value> {
     let roles = workloads
         .iter()
         .take(1)
         .flat_map(|workload| [Some(&workload.host), workload.agent.as_ref()]);
     let mounts = roles.flatten().flat_map(|role| &role.mounts);
     let volumes = mounts.filter_map(|mount| match mount {
-        Mount::OfNode { volume, path } => Some(Volume {
-            name: (*volume).into(),
-            host_path: Some(HostPathVolumeSource {
-                path: (*path).into(),
-                type_: Some("Directory".into()),
-            }),
-            ..Volume::default()
-        }),
+        Mount::OfNode { volume, path } => {
+            Some(json!({"name": volume, "hostPath": {"path": path, "type": "Directory"}}))
+        }
         Mount::Own { .. } | Mount::Read { .. } | Mount::Contents(_) => None,
     });
     volumes.collect()
 }
 
 /// The shared memory of one container, which no other one sees. `size` is in bytes.
-fn memory(member: Member, size: u64) -> Volume {
-    Volume {
-        name: format!("{SHM_VOLUME}{member}"),
-        empty_dir: Some(EmptyDirVolumeSource {
-            size_limit: Some(Quantity(size.to_string())),
-            medium: Some("Memory".into()),
-        }),
-        ..Volume::default()
-    }
+fn memory(member: Member, size: u64) -> Value {
+    json!({"name": format!("{SHM_VOLUME}{member}"), "emptyDir": {"sizeLimit": size.to_string(), "medium": "Memory"}})
 }
 
 /// Most bytes of the `logs` volume.
@@ -120,69 +98,34 @@ pub(super) fn disk_limit(input: &JobInput<'_>) -> u64 {
     logs_limit(input).saturating_add(filled.saturating_mul(CONTENTS_BYTES))
 }
 
-fn empty(name: &str, size_limit: Option<Quantity>) -> Volume {
-    Volume {
-        name: name.into(),
-        empty_dir: Some(EmptyDirVolumeSource {
-            size_limit,
-            medium: None,
-        }),
-        ..Volume::default()
-    }
+fn empty(name: &str, size_limit: Option<&str>) -> Value {
+    json!({"name": name, "emptyDir": {"sizeLimit": size_limit}})
 }
 
-fn podinfo() -> Volume {
-    let file = DownwardAPIVolumeFile {
-        path: STOP_FILE.into(),
-        field_ref: Some(ObjectFieldSelector {
-            field_path: format!("metadata.annotations['{}']", names::ANNOTATION_STOP),
-            api_version: None,
-        }),
-        ..DownwardAPIVolumeFile::default()
-    };
-    Volume {
-        name: PODINFO_VOLUME.into(),
-        downward_api: Some(DownwardAPIVolumeSource {
-            items: Some(vec![file]),
-            default_mode: None,
-        }),
-        ..Volume::default()
-    }
+fn podinfo() -> Value {
+    let field = format!("metadata.annotations['{}']", names::ANNOTATION_STOP);
+    let file = json!({"path": STOP_FILE, "fieldRef": {"fieldPath": field}});
+    json!({"name": PODINFO_VOLUME, "downwardAPI": {"items": [file]}})
 }
 
-fn identity() -> Volume {
-    let token = ServiceAccountTokenProjection {
-        audience: Some(AUDIENCE.into()),
-        expiration_seconds: Some(TOKEN_SECONDS),
-        path: IDENTITY_TOKEN_FILE.into(),
-    };
-    let source = VolumeProjection {
-        service_account_token: Some(token),
-        ..VolumeProjection::default()
-    };
-    Volume {
-        name: IDENTITY_VOLUME.into(),
-        projected: Some(ProjectedVolumeSource {
-            sources: Some(vec![source]),
-            default_mode: None,
-        }),
-        ..Volume::default()
-    }
+fn identity() -> Value {
+    let token = json!({"audience": AUDIENCE, "expirationSeconds": TOKEN_SECONDS, "path": IDENTITY_TOKEN_FILE});
+    json!({"name": IDENTITY_VOLUME, "projected": {"sources": [{"serviceAccountToken": token}]}})
 }
 
 /// Where `contents` writes, and the runner that keeps what it prints.
-pub(super) fn of_contents(input: &JobInput<'_>) -> Vec<VolumeMount> {
+pub(super) fn of_contents(input: &JobInput<'_>) -> Vec<Value> {
     let reserved = input.kind().reserved(input.spec());
     let written = reserved.volumes.iter().map(|volume| mount(volume.name, volume.written));
     let own = [
         read_only(mount(TOOLS_VOLUME, TOOLS)),
-        mount_part(LOGS_VOLUME, "contents".into(), CONTENTS_LOG_FOLDER),
+        mount_part(LOGS_VOLUME, "contents", CONTENTS_LOG_FOLDER),
     ];
     written.chain(own).collect()
 }
 
 /// Mounts of a container that copies data out of its image: the volume, and the runner that copies.
-pub(super) fn of_data(volume: ContentsVolume) -> Vec<VolumeMount> {
+pub(super) fn of_data(volume: ContentsVolume) -> Vec<Value> {
     vec![
         read_only(mount(TOOLS_VOLUME, TOOLS)),
         mount(volume.name, volume.written),
@@ -190,24 +133,24 @@ pub(super) fn of_data(volume: ContentsVolume) -> Vec<VolumeMount> {
 }
 
 /// Mounts of `workspace`, which prepares the volumes.
-pub(super) fn of_workspace(input: &JobInput<'_>) -> Vec<VolumeMount> {
+pub(super) fn of_workspace(input: &JobInput<'_>) -> Vec<Value> {
     let own = [mount(LOGS_VOLUME, LOGS), mount(TOOLS_VOLUME, TOOLS)];
     own.into_iter().chain(token(input)).collect()
 }
 
 /// Mounts of `logcopy`: the logs to write, the stop request to read.
-pub(super) fn of_logcopy(input: &JobInput<'_>) -> Vec<VolumeMount> {
+pub(super) fn of_logcopy(input: &JobInput<'_>) -> Vec<Value> {
     let own = [mount(LOGS_VOLUME, LOGS), read_only(mount(PODINFO_VOLUME, PODINFO))];
     own.into_iter().chain(token(input)).collect()
 }
 
 /// Mounts of `collect`, which needs no identity.
-pub(super) fn of_collect() -> Vec<VolumeMount> {
+pub(super) fn of_collect() -> Vec<Value> {
     vec![mount(LOGS_VOLUME, LOGS)]
 }
 
 /// Mounts of a worker's container: the runner, the status files, its own volumes, and its shared memory.
-pub(super) fn of_member(member: Member, role: &Role) -> Vec<VolumeMount> {
+pub(super) fn of_member(member: Member, role: &Role) -> Vec<Value> {
     let is_of_node = |mount: &&Mount| matches!(mount, Mount::OfNode { .. });
     let (of_node, of_pod): (Vec<&Mount>, Vec<&Mount>) = role.mounts.iter().partition(is_of_node);
     let shared = role.shm.map(|_| mount(&format!("{SHM_VOLUME}{member}"), SHM));
@@ -220,59 +163,50 @@ pub(super) fn of_member(member: Member, role: &Role) -> Vec<VolumeMount> {
         .collect()
 }
 
-fn mounted(wanted: &Mount) -> VolumeMount {
+fn mounted(wanted: &Mount) -> Value {
     match wanted {
-        Mount::Own { folder, path } => mount_part(LOGS_VOLUME, folder.clone(), path),
-        Mount::Read { folder, path } => read_only(mount_part(LOGS_VOLUME, (*folder).to_owned(), path)),
+        Mount::Own { folder, path } => mount_part(LOGS_VOLUME, folder, path),
+        Mount::Read { folder, path } => read_only(mount_part(LOGS_VOLUME, folder, path)),
         Mount::Contents(volume) => read_only(mount(volume.name, volume.read)),
         Mount::OfNode { volume, path } => read_only(mount(volume, path)),
     }
 }
 
 /// The Pod's own ones are one file for all containers, and root could write to them.
-fn name_files() -> [VolumeMount; 3] {
-    NAME_FILES.map(|path| read_only(mount_part(TOOLS_VOLUME, path.trim_start_matches('/').to_owned(), path)))
+fn name_files() -> [Value; 3] {
+    NAME_FILES.map(|path| read_only(mount_part(TOOLS_VOLUME, path.trim_start_matches('/'), path)))
 }
 
 /// The runner; all status files to read, the container's own to write. The kubelet makes a sub-folder when it comes to
 /// its mount, so the outer one stands first.
-fn runner_and_status(container: &str) -> [VolumeMount; 3] {
+fn runner_and_status(container: &str) -> [Value; 3] {
     [
         read_only(mount(TOOLS_VOLUME, TOOLS)),
-        read_only(mount_part(LOGS_VOLUME, STATUS_FOLDER.into(), STATUS)),
+        read_only(mount_part(LOGS_VOLUME, STATUS_FOLDER, STATUS)),
         mount_part(
             LOGS_VOLUME,
-            format!("{STATUS_FOLDER}/{container}"),
+            &format!("{STATUS_FOLDER}/{container}"),
             &format!("{STATUS}/{container}"),
         ),
     ]
 }
 
-fn token(input: &JobInput<'_>) -> Option<VolumeMount> {
+fn token(input: &JobInput<'_>) -> Option<Value> {
     input
         .spec()
         .has_role()
         .then(|| read_only(mount(IDENTITY_VOLUME, IDENTITY)))
 }
 
-fn mount(volume: &str, path: &str) -> VolumeMount {
-    VolumeMount {
-        name: volume.into(),
-        mount_path: path.into(),
-        ..VolumeMount::default()
-    }
+fn mount(volume: &str, path: &str) -> Value {
+    json!({"name": volume, "mountPath": path})
 }
 
-fn mount_part(volume: &str, sub_path: String, path: &str) -> VolumeMount {
-    VolumeMount {
-        sub_path: Some(sub_path),
-        ..mount(volume, path)
-    }
+fn mount_part(volume: &str, sub_path: &str, path: &str) -> Value {
+    json!({"name": volume, "mountPath": path, "subPath": sub_path})
 }
 
-fn read_only(mount: VolumeMount) -> VolumeMount {
-    VolumeMount {
-        read_only: Some(true),
-        ..mount
-    }
+fn read_only(mut mount: Value) -> Value {
+    mount["readOnly"] = true.into();
+    mount
 }

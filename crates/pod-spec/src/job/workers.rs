@@ -1,7 +1,7 @@
 //! The containers of the workers: strangers' images behind our runner. Pure.
 
-use k8s_openapi::api::core::v1::{Container, EnvVar};
-use serde_json::Value;
+use k8s_openapi::api::core::v1::EnvVar;
+use serde_json::{Value, json};
 
 use super::members::{is_first, members, role};
 use super::security::context;
@@ -13,7 +13,7 @@ use leaderboard_evaluation::workload::{Role, Workload};
 use leaderboard_protocol::files::{Member, Side};
 
 /// The containers that run side by side.
-pub(super) fn all(input: &JobInput<'_>, workloads: &[Workload]) -> Vec<Container> {
+pub(super) fn all(input: &JobInput<'_>, workloads: &[Workload]) -> Vec<Value> {
     members(input.plan)
         .filter(|member| !is_first(input.plan, *member))
         .filter_map(|member| container(input, member, role(workloads, member)?))
@@ -21,13 +21,13 @@ pub(super) fn all(input: &JobInput<'_>, workloads: &[Workload]) -> Vec<Container
 }
 
 /// The agent that ends before they start, if there is one.
-pub(super) fn first(input: &JobInput<'_>, workloads: &[Workload]) -> Option<Container> {
+pub(super) fn first(input: &JobInput<'_>, workloads: &[Workload]) -> Option<Value> {
     let member = members(input.plan).find(|member| is_first(input.plan, *member))?;
     container(input, member, role(workloads, member)?)
 }
 
-fn container(input: &JobInput<'_>, member: Member, role: &Role) -> Option<Container> {
-    let (agents, name) = (input.plan.agents(), member.to_string());
+fn container(input: &JobInput<'_>, member: Member, role: &Role) -> Option<Value> {
+    let agents = input.plan.agents();
     let gpus = gpu::source_of(input.spec(), input.plan, member);
     let hosts = input.spec().given(input.track(), part(member.side))?;
     let env = role.env.iter().map(|(name, value)| variable(name, value));
@@ -37,18 +37,17 @@ fn container(input: &JobInput<'_>, member: Member, role: &Role) -> Option<Contai
         .iter()
         .cloned()
         .chain(gpu::flags(gpus, agents, member.side, role.draws));
-    Some(Container {
-        image: Some(role.image.clone()),
+    Some(json!({
+        "name": member.to_string(),
+        "image": role.image,
         // Kubernetes asks for `latest` anew before each container: a worker, or a restart, could get another image.
-        image_pull_policy: (member.side == Side::Agent).then(|| "IfNotPresent".into()),
-        command: Some(behind_runner(member, flags, &role.command)),
-        env: Some(merged(env, hosts.env, &input.kind().reserved(input.spec()).env)),
-        resources: gpu::resources(gpus, agents, member, hosts.resources),
-        security_context: Some(context(hosts.security)),
-        volume_mounts: Some(volumes::of_member(member, role)),
-        name,
-        ..Container::default()
-    })
+        "imagePullPolicy": (member.side == Side::Agent).then_some("IfNotPresent"),
+        "command": behind_runner(member, flags, &role.command),
+        "env": merged(env, hosts.env, &input.kind().reserved(input.spec()).env),
+        "resources": gpu::resources(gpus, agents, member, hosts.resources.as_ref()),
+        "securityContext": context(hosts.security),
+        "volumeMounts": volumes::of_member(member, role),
+    }))
 }
 
 pub(super) fn part(side: Side) -> Part {
