@@ -8,13 +8,13 @@ use std::time::Duration;
 use bytes::Bytes;
 use futures::stream::{self, BoxStream, StreamExt, TryStreamExt};
 use http::header::{CONTENT_LENGTH, CONTENT_TYPE, LOCATION};
-use http::{Request, Response, StatusCode};
+use http::{Request, Response};
 use tokio::time::{Instant, timeout};
 use url::Url;
 
 use super::answer::{About, Answer, Refusal, Silence};
 use super::row::{FileUrl, image};
-use super::transport::{Body, Failure, Timeouts, Transport, body, late, send, unsendable};
+use super::transport::{Body, Failure, Timeouts, Transport, body, header, late, send, unsendable};
 use super::types::{ImageAnswer, Key};
 
 /// Largest file that is read for the image that it names, in bytes.
@@ -121,25 +121,16 @@ fn get(url: &Url) -> Result<Request<Bytes>, InputError> {
 
 /// Where a redirect leads; None: this is the answer.
 fn next(url: &Url, response: &Response<Body>) -> Option<Result<Url, InputError>> {
-    let redirects = [
-        StatusCode::MOVED_PERMANENTLY,
-        StatusCode::FOUND,
-        StatusCode::SEE_OTHER,
-        StatusCode::TEMPORARY_REDIRECT,
-        StatusCode::PERMANENT_REDIRECT,
-    ];
-    if !redirects.contains(&response.status()) {
+    if !matches!(response.status().as_u16(), 301..=303 | 307 | 308) {
         return None;
     }
-    let location = response.headers().get(LOCATION)?.to_str().ok();
-    let next = location.and_then(|location| url.join(location).ok());
-    Some(next.ok_or_else(|| unfound("the uploaded file is redirected to no URL")))
+    let next = url.join(header(response, LOCATION)?);
+    Some(next.map_err(|_| unfound("the uploaded file is redirected to no URL")))
 }
 
 /// True if a page of HTML stands in the place of a file with another name: a login page, or the start page of a web application.
 fn is_page(url: &FileUrl, response: &Response<Body>) -> bool {
-    let kind = response.headers().get(CONTENT_TYPE);
-    let kind = kind.and_then(|kind| kind.to_str().ok()).unwrap_or_default();
+    let kind = header(response, CONTENT_TYPE).unwrap_or_default();
     let path = Url::parse(url.as_str()).map(|url| url.path().to_ascii_lowercase());
     let names_page = path.is_ok_and(|path| [".htm", ".html"].iter().any(|end| path.ends_with(end)));
     kind.to_ascii_lowercase().starts_with("text/html") && !names_page
@@ -147,8 +138,7 @@ fn is_page(url: &FileUrl, response: &Response<Body>) -> bool {
 
 /// The chunks of a body, which has to be as long as its header says.
 fn chunks(response: Response<Body>, longest: Duration) -> InputStream {
-    let length = response.headers().get(CONTENT_LENGTH);
-    let length: Option<u64> = length.and_then(|length| length.to_str().ok()?.parse().ok());
+    let length: Option<u64> = header(&response, CONTENT_LENGTH).and_then(|length| length.parse().ok());
     let begun = (response.into_body(), 0_u64);
     let chunks = stream::try_unfold(begun, move |(mut body, read)| async move {
         let next = timeout(longest, body.try_next()).await;

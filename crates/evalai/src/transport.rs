@@ -8,7 +8,7 @@ use std::time::Duration;
 use bytes::Bytes;
 use futures::future::BoxFuture;
 use futures::stream::{BoxStream, TryStreamExt};
-use http::header::RETRY_AFTER;
+use http::header::{HeaderName, RETRY_AFTER};
 use http::{Request, Response};
 use tokio::time::{Instant, timeout_at};
 
@@ -109,11 +109,7 @@ pub(super) async fn send(
 async fn read(response: Response<Body>, end: Instant, largest: usize, need: Need) -> Answer<(u16, Vec<u8>)> {
     let status = response.status();
     let code = status.as_u16();
-    let retry_after = response
-        .headers()
-        .get(RETRY_AFTER)
-        .and_then(|value| value.to_str().ok())
-        .map(str::to_owned);
+    let retry_after = header(&response, RETRY_AFTER).map(str::to_owned);
     let body = timeout_at(end, body(response.into_body(), largest)).await;
     let body = match body.unwrap_or_else(|_| Err(late("error decoding response body"))) {
         Ok(Some(body)) => body,
@@ -122,6 +118,11 @@ async fn read(response: Response<Body>, end: Instant, largest: usize, need: Need
         Err(silence) => return Answer::Unanswered(silence),
     };
     classify(code, retry_after.as_deref(), &body).map(|()| (code, body))
+}
+
+/// The text of a header.
+pub(super) fn header(response: &Response<Body>, name: HeaderName) -> Option<&str> {
+    response.headers().get(name)?.to_str().ok()
 }
 
 /// All that comes; none if that is more than `largest` bytes.
