@@ -48,62 +48,20 @@ impl Ending {
         (sorted, sensors): (&[&Record], &[Text]),
         is_final: bool,
     ) -> Self {
-        if !is_final {
+        let (entry_status, outcome) = match plan.format {
+            _ if !is_final => (STARTED, Outcome::Running),
+            Format::V1 => v1(sorted, plan.as_original),
+            Format::V2 => v2(sorted),
+        };
+        if is_final && plan.format == Format::V2 && sensors.is_empty() {
+            let has_named = |worker: &&Checkpoint| worker.counts_without_sensors();
+            let counts = !plan.as_original && workers.iter().flatten().all(has_named);
             return Self {
-                entry_status: STARTED,
+                entry_status: INVALID,
                 eligible: false,
-                outcome: Outcome::Running,
+                outcome: if counts { outcome } else { Outcome::Invalid },
             };
         }
-        match plan.format {
-            Format::V1 => Self::v1(sorted, plan.as_original),
-            Format::V2 if sensors.is_empty() => {
-                let has_named = |worker: &&Checkpoint| worker.counts_without_sensors();
-                let counts = !plan.as_original && workers.iter().flatten().all(has_named);
-                Self {
-                    entry_status: INVALID,
-                    eligible: false,
-                    outcome: if counts {
-                        Self::v2(sorted).outcome
-                    } else {
-                        Outcome::Invalid
-                    },
-                }
-            }
-            Format::V2 => Self::v2(sorted),
-        }
-    }
-
-    /// The original lets results count although a simulator crashed or the sensors were invalid; its evaluator does not, but
-    /// its merge forgets it.
-    fn v1(sorted: &[&Record], as_original: bool) -> Self {
-        let has_agent_errors = sorted.iter().any(|record| record.status.contains("Agent"));
-        let told = telling(sorted).filter(|_| !as_original);
-        let outcome = told.unwrap_or(Outcome::Finished);
-        Self {
-            entry_status: if has_agent_errors {
-                "Finished with agent errors"
-            } else {
-                FINISHED
-            },
-            eligible: outcome == Outcome::Finished,
-            outcome,
-        }
-    }
-
-    fn v2(sorted: &[&Record]) -> Self {
-        let is_invalid = sorted.iter().any(|record| record.status == STARTED);
-        let outcome = if is_invalid {
-            Outcome::Invalid
-        } else {
-            telling(sorted).unwrap_or(Outcome::Finished)
-        };
-        let entry_status = match outcome {
-            Outcome::Invalid => INVALID,
-            Outcome::Crashed => CRASHED,
-            Outcome::Rejected => REJECTED,
-            Outcome::Running | Outcome::Finished => FINISHED,
-        };
         Self {
             entry_status,
             eligible: outcome == Outcome::Finished,
@@ -112,13 +70,33 @@ impl Ending {
     }
 }
 
+/// The original lets results count although a simulator crashed or the sensors were invalid; its evaluator does not, but
+/// its merge forgets it.
+fn v1(sorted: &[&Record], as_original: bool) -> (&'static str, Outcome) {
+    let has_agent_errors = sorted.iter().any(|record| record.status.contains("Agent"));
+    let entry_status = if has_agent_errors {
+        "Finished with agent errors"
+    } else {
+        FINISHED
+    };
+    let told = telling(sorted).filter(|_| !as_original);
+    (entry_status, told.map_or(Outcome::Finished, |(_, outcome)| outcome))
+}
+
+fn v2(sorted: &[&Record]) -> (&'static str, Outcome) {
+    if sorted.iter().any(|record| record.status == STARTED) {
+        return (INVALID, Outcome::Invalid);
+    }
+    telling(sorted).unwrap_or((FINISHED, Outcome::Finished))
+}
+
 /// The last route whose status names a crash or wrong sensors decides, as in the original.
-fn telling(sorted: &[&Record]) -> Option<Outcome> {
+fn telling(sorted: &[&Record]) -> Option<(&'static str, Outcome)> {
     sorted.iter().rev().find_map(|record| {
         if record.names_crash() {
-            Some(Outcome::Crashed)
-        } else {
-            record.status.contains(SENSORS_INVALID).then_some(Outcome::Rejected)
+            return Some((CRASHED, Outcome::Crashed));
         }
+        let is_rejected = record.status.contains(SENSORS_INVALID);
+        is_rejected.then_some((REJECTED, Outcome::Rejected))
     })
 }

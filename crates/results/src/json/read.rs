@@ -265,22 +265,17 @@ impl<'a> Reader<'a> {
         if negative && self.take(b"Infinity") {
             return Ok(Value::Float(f64::NEG_INFINITY));
         }
-        if !self.take(b"0") && self.digits() == 0 {
-            return Err(ReadError::NotJson);
+        if !self.take(b"0") {
+            self.digits()?;
         }
-        let mut is_float = false;
-        if self.take(b".") {
-            is_float = true;
-            if self.digits() == 0 {
-                return Err(ReadError::NotJson);
-            }
+        let mut is_float = self.take(b".");
+        if is_float {
+            self.digits()?;
         }
         if self.take(b"e") || self.take(b"E") {
             is_float = true;
             let _sign = self.take(b"+") || self.take(b"-");
-            if self.digits() == 0 {
-                return Err(ReadError::NotJson);
-            }
+            self.digits()?;
         }
         if self.at.saturating_sub(from) > MAX_NUMBER {
             return Err(ReadError::Limit(Limit::Number));
@@ -296,12 +291,17 @@ impl<'a> Reader<'a> {
         Ok(text.parse().map_or_else(|_| Value::BigInt(text.into()), Value::Int))
     }
 
-    fn digits(&mut self) -> usize {
+    /// One digit or more.
+    fn digits(&mut self) -> Read<()> {
         let from = self.at;
         while self.peek().is_some_and(|byte| byte.is_ascii_digit()) {
             self.step(1);
         }
-        self.at.saturating_sub(from)
+        if self.at == from {
+            Err(ReadError::NotJson)
+        } else {
+            Ok(())
+        }
     }
 }
 
