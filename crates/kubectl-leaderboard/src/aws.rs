@@ -8,6 +8,7 @@ use leaderboard_api::S3Bucket;
 use tokio::io::AsyncReadExt as _;
 use tokio::process::Command;
 
+use crate::error::complaint;
 use crate::lines::{Lines, PIECE};
 use crate::text::clean;
 
@@ -95,7 +96,7 @@ pub async fn run(arguments: &[String], mut show: impl FnMut(&str)) -> Result<(),
             }
         }
     };
-    let complaint = async {
+    let printed = async {
         let mut text = Vec::new();
         if let Some(errors) = errors {
             // An unreadable complaint is left out: the exit status shows the failure.
@@ -103,16 +104,13 @@ pub async fn run(arguments: &[String], mut show: impl FnMut(&str)) -> Result<(),
         }
         text
     };
-    let (shown, complaint) = tokio::join!(lines, complaint);
+    let (shown, printed) = tokio::join!(lines, printed);
     shown?;
     let status = child.wait().await.map_err(failed)?;
     if status.success() {
         return Ok(());
     }
-    let complaint = String::from_utf8_lossy(&complaint);
-    let last = complaint.lines().rfind(|line| !line.trim().is_empty());
-    let why = last.map_or_else(|| status.to_string(), clean);
-    Err(Unread::Failed(why.trim_end_matches('.').to_owned()))
+    Err(Unread::Failed(complaint(&printed, status)))
 }
 
 #[cfg(test)]

@@ -4,6 +4,7 @@
 
 use std::error::Error as StdError;
 use std::iter::successors;
+use std::process::ExitStatus;
 
 use kube::client::AuthError;
 use kube::config::KubeconfigError;
@@ -184,18 +185,21 @@ pub(super) fn phrase(text: &str) -> String {
     clean(text).trim_end_matches('.').to_owned()
 }
 
+/// What a program that has failed printed last, else how it ended.
+pub(super) fn complaint(stderr: &[u8], status: ExitStatus) -> String {
+    let stderr = String::from_utf8_lossy(stderr);
+    let last = stderr.lines().rfind(|line| !line.trim().is_empty());
+    phrase(&last.map_or_else(|| status.to_string(), str::to_owned))
+}
+
 /// The error of the program that a kubeconfig names for credentials. kube's own text would show all its output, and with it
 /// perhaps a token.
 fn credentials(error: &(dyn StdError + 'static)) -> Option<String> {
     let found = causes(error).find_map(|cause| cause.downcast_ref::<AuthError>())?;
     Some(match found {
         AuthError::AuthExecRun { out, .. } => {
-            let stderr = String::from_utf8_lossy(&out.stderr);
-            let last = stderr.lines().rfind(|line| !line.trim().is_empty());
-            let why = last.map_or_else(|| out.status.to_string(), str::to_owned);
-            phrase(&format!(
-                "the program that the kubeconfig names for credentials failed: {why}"
-            ))
+            let why = complaint(&out.stderr, out.status);
+            format!("the program that the kubeconfig names for credentials failed: {why}")
         }
         // Its text may show what the program printed.
         AuthError::AuthExecParse(_) => {
