@@ -6,7 +6,7 @@ use std::process::ExitCode;
 use kube::ResourceExt;
 
 use crate::change::{self, Request};
-use crate::cluster::{Cluster, Fetched, Scope};
+use crate::cluster::{Cluster, Fetched, Filter, Scope};
 use crate::commands::{changes, frame, next, nothing};
 use crate::error::{self, Error};
 use crate::output::{self, code, note, print};
@@ -19,7 +19,7 @@ const TRIES: usize = 4;
 /// `resume`.
 pub async fn resume(cluster: &Cluster, wanted: &resume::Resume) -> Result<ExitCode, Error> {
     if !wanted.names.is_empty() {
-        if !wanted.filter.is_empty() {
+        if wanted.filter != Filter::default() {
             let text =
                 "--leaderboard, --track and --team choose among all. Use them with --all or -l, and without names";
             return Err(Error::Unfit(text.to_owned()));

@@ -69,7 +69,7 @@ pub struct Scope {
 const STATES: [&str; 6] = ["Pending", "Running", "Resumed", "Finished", "Failed", "Cancelled"];
 
 /// Limits a list of submissions to a Leaderboard, a track and a team.
-#[derive(Args, Clone, Debug, Default)]
+#[derive(Args, Clone, Debug, Default, PartialEq)]
 pub struct Filter {
     /// Only this Leaderboard.
     #[arg(long, value_name = "NAME")]
@@ -83,11 +83,6 @@ pub struct Filter {
 }
 
 impl Filter {
-    /// True if no flag limits the list.
-    pub fn is_empty(&self) -> bool {
-        self.leaderboard.is_none() && self.track.is_none() && self.team.is_none()
-    }
-
     fn takes(&self, one: &Submission) -> bool {
         let is =
             |wanted: &Option<String>, known: Option<&str>| wanted.as_deref().is_none_or(|wanted| known == Some(wanted));
