@@ -84,11 +84,7 @@ pub async fn run(arguments: &[String], mut show: impl FnMut(&str)) -> Result<(),
         let (mut lines, mut piece) = (Lines::default(), vec![0; PIECE]);
         loop {
             let read = out.read(&mut piece).await.map_err(failed)?;
-            let ended = match read {
-                0 => lines.end().into_iter().collect(),
-                read => lines.take(piece.get(..read).unwrap_or_default()),
-            };
-            for line in &ended {
+            for line in &lines.take(piece.get(..read).unwrap_or_default()) {
                 show(line);
             }
             if read == 0 {

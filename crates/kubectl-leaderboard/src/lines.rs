@@ -21,8 +21,11 @@ pub struct Lines {
 }
 
 impl Lines {
-    /// The lines that end in this piece.
+    /// The lines that end in this piece. An empty one is the end of the log, and of its last line.
     pub fn take(&mut self, piece: &[u8]) -> Vec<String> {
+        if piece.is_empty() {
+            return self.end().into_iter().collect();
+        }
         let mut ended = Vec::new();
         for part in piece.split_inclusive(|byte| *byte == b'\n') {
             self.is_begun = true;
@@ -38,7 +41,7 @@ impl Lines {
     }
 
     /// The last line, if no line break has ended it.
-    pub fn end(&mut self) -> Option<String> {
+    fn end(&mut self) -> Option<String> {
         let Self { line, is_cut, is_begun } = std::mem::take(self);
         // A log is bytes: one that is no UTF-8 is shown all the same.
         let text = String::from_utf8_lossy(&line);
@@ -60,13 +63,9 @@ pub fn of(reader: impl AsyncRead + Send + 'static) -> impl Stream<Item = io::Res
             return Ok::<_, io::Error>(None);
         };
         let mut piece = vec![0; PIECE];
-        match reader.read(&mut piece).await? {
-            0 => Ok(Some((lines.end().into_iter().collect(), None))),
-            read => {
-                let ended = lines.take(piece.get(..read).unwrap_or_default());
-                Ok(Some((ended, Some((reader, lines)))))
-            }
-        }
+        let read = reader.read(&mut piece).await?;
+        let ended = lines.take(piece.get(..read).unwrap_or_default());
+        Ok(Some((ended, (read > 0).then_some((reader, lines)))))
     });
     pieces
         .map_ok(|lines: Vec<String>| stream::iter(lines.into_iter().map(Ok)))
