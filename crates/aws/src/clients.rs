@@ -7,6 +7,7 @@ use std::ffi::OsString;
 use std::time::Duration;
 
 use aws_config::retry::RetryConfig;
+use aws_config::timeout::TimeoutConfig;
 use aws_config::{AppName, BehaviorVersion, Region, SdkConfig};
 use aws_sdk_s3::config::{RequestChecksumCalculation, ResponseChecksumValidation};
 use aws_smithy_http_client::tls::Provider;
@@ -55,6 +56,15 @@ macro_rules! own {
     }};
 }
 
+/// The times that one try may take, and a call with its retries.
+pub(crate) fn timeouts(attempt: Duration, operation: Duration) -> TimeoutConfig {
+    TimeoutConfig::builder()
+        .connect_timeout(Duration::from_secs(5))
+        .operation_attempt_timeout(attempt)
+        .operation_timeout(operation)
+        .build()
+}
+
 /// Loaded once for a process.
 #[derive(Clone, Debug)]
 pub struct Aws {
@@ -66,14 +76,9 @@ impl Aws {
     /// Reads region and credentials from where AWS's SDKs look for them. Each request names the program, which CloudTrail then shows.
     pub async fn load(program: &str) -> Self {
         let https = aws_smithy_http_client::Builder::new().tls_provider(Provider::Rustls(CryptoMode::Ring));
-        let timeouts = aws_config::timeout::TimeoutConfig::builder()
-            .connect_timeout(Duration::from_secs(5))
-            .operation_attempt_timeout(ATTEMPT_TIMEOUT)
-            .operation_timeout(OPERATION_TIMEOUT)
-            .build();
         let mut loader = aws_config::defaults(BehaviorVersion::latest())
             .http_client(https.build_https())
-            .timeout_config(timeouts);
+            .timeout_config(timeouts(ATTEMPT_TIMEOUT, OPERATION_TIMEOUT));
         if let Ok(name) = AppName::new(format!("{OPERATOR}-{program}")) {
             loader = loader.app_name(name);
         }
@@ -128,11 +133,7 @@ impl Aws {
 
     /// A client of SQS. Long polls outlive the usual limit of one try.
     pub fn sqs(&self, region: Option<&str>, endpoint: Option<&str>) -> aws_sdk_sqs::Client {
-        let timeouts = aws_config::timeout::TimeoutConfig::builder()
-            .connect_timeout(Duration::from_secs(5))
-            .operation_attempt_timeout(Duration::from_secs(35))
-            .operation_timeout(OPERATION_TIMEOUT)
-            .build();
+        let timeouts = timeouts(Duration::from_secs(35), OPERATION_TIMEOUT);
         let config = own!(aws_sdk_sqs, self.config(region), endpoint).timeout_config(timeouts);
         aws_sdk_sqs::Client::from_conf(config.build())
     }

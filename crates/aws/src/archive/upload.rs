@@ -15,6 +15,7 @@ use percent_encoding::{AsciiSet, NON_ALPHANUMERIC, utf8_percent_encode};
 
 use super::parts::{self, Part};
 use super::{Archive, ArchiveError, Cause, Kept};
+use crate::clients::timeouts;
 use crate::metered::Metered;
 
 const OP: &str = "storing";
@@ -174,12 +175,7 @@ impl Archive {
 
 /// Copying and joining large objects takes S3 longer than an ordinary answer.
 fn patient() -> aws_sdk_s3::config::Builder {
-    let timeouts = aws_config::timeout::TimeoutConfig::builder()
-        .connect_timeout(Duration::from_secs(5))
-        .operation_attempt_timeout(LONG_TRY)
-        .operation_timeout(LONG_TRY * 2)
-        .build();
-    aws_sdk_s3::config::Builder::new().timeout_config(timeouts)
+    aws_sdk_s3::config::Builder::new().timeout_config(timeouts(LONG_TRY, LONG_TRY * 2))
 }
 
 /// Reads a part of a file, on a thread that may block.
