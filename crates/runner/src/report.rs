@@ -52,7 +52,7 @@ pub(crate) fn verdict(end: &End<'_>) -> Verdict {
         Some(Status::Killed(signal)) => (None, signal),
         None => (None, None),
     };
-    let mut why = reason(end);
+    let (what, mut why) = described(end);
     if end.out_of_memory {
         why.push_str("; the kernel killed a process of this container for lack of memory");
     }
@@ -64,62 +64,52 @@ pub(crate) fn verdict(end: &End<'_>) -> Verdict {
         exit_code,
         signal,
         out_of_memory: end.out_of_memory,
-        ..Verdict::new(what(end), end.round, why)
+        ..Verdict::new(what, end.round, why)
     }
 }
 
-const fn what(end: &End<'_>) -> What {
-    match end.cause {
-        Cause::Terminated => What::Stopped,
-        Cause::AlreadyDone | Cause::PeerDone | Cause::HasResult => What::Finished,
-        Cause::PeerCrashed => What::PeerCrashed,
-        Cause::Cancelled => What::Cancelled,
-        Cause::Idle => What::Idle,
-        Cause::NotReady => What::NotReady,
-        Cause::NoResult => What::NoResult,
-        Cause::ServerSilent => What::ServerSilent,
-        Cause::PortTaken => What::PortTaken,
-        Cause::NoGpu | Cause::AgentHasNoGpu => What::NoGpu,
-        Cause::GraphicsDriverMissing => What::GraphicsDriverMissing,
-        Cause::CannotStart(_) | Cause::Mute => What::CannotStart,
-        Cause::NodeRefused => What::NodeRefused,
-        Cause::NoProcess => What::NoProcess,
-        Cause::ChildEnded => match end.status {
-            Some(Status::Exited(_)) => What::Exited,
-            _ => What::Killed,
-        },
-    }
-}
-
-fn reason(end: &End<'_>) -> String {
+/// Name of an end, and its sentence.
+fn described(end: &End<'_>) -> (What, String) {
     let (own, peer) = (noun(end.part), peer(end.part));
+    let detail = || end.detail.unwrap_or("the command could not be started").to_owned();
     match end.cause {
-        Cause::Terminated => "the container was ended from outside".to_owned(),
-        Cause::AlreadyDone => "the worker was done before this container began".to_owned(),
-        Cause::HasResult => "the evaluation has come to its end".to_owned(),
-        Cause::NoResult if end.alone => "the evaluator had no complete result in time".to_owned(),
-        Cause::NoResult => "the agent is done, and the evaluator had no complete result in time".to_owned(),
-        Cause::PeerDone => format!("the {peer} is done, so the {own} was stopped"),
-        Cause::PeerCrashed => format!("the {peer} crashed, so the {own} was stopped"),
-        Cause::Cancelled => "the submission was stopped".to_owned(),
-        Cause::Idle => "the agent printed nothing for too long and was stopped".to_owned(),
-        Cause::NotReady if end.part.is_host() => format!("the {own} did not answer on its port in time"),
-        Cause::NotReady => format!("the {peer} was not ready in time"),
-        Cause::ServerSilent => "the agent crashed, and the server does not answer any more".to_owned(),
-        Cause::AgentHasNoGpu => {
-            "the agent's container sees no GPU (no /dev/nvidia0 or any other number), and its Leaderboard gives it one; it was not begun"
-                .to_owned()
+        Cause::Terminated => (What::Stopped, "the container was ended from outside".to_owned()),
+        Cause::AlreadyDone => (
+            What::Finished,
+            "the worker was done before this container began".to_owned(),
+        ),
+        Cause::HasResult => (What::Finished, "the evaluation has come to its end".to_owned()),
+        Cause::PeerDone => (What::Finished, format!("the {peer} is done, so the {own} was stopped")),
+        Cause::NoResult => {
+            let done = if end.alone { "" } else { "the agent is done, and " };
+            (What::NoResult, format!("{done}the evaluator had no complete result in time"))
         }
-        Cause::PortTaken
-        | Cause::CannotStart(_)
-        | Cause::NodeRefused
-        | Cause::NoProcess
-        | Cause::Mute
-        | Cause::NoGpu
-        | Cause::GraphicsDriverMissing => end.detail.unwrap_or("the command could not be started").to_owned(),
+        Cause::PeerCrashed => (What::PeerCrashed, format!("the {peer} crashed, so the {own} was stopped")),
+        Cause::Cancelled => (What::Cancelled, "the submission was stopped".to_owned()),
+        Cause::Idle => (What::Idle, "the agent printed nothing for too long and was stopped".to_owned()),
+        Cause::NotReady if end.part.is_host() => {
+            (What::NotReady, format!("the {own} did not answer on its port in time"))
+        }
+        Cause::NotReady => (What::NotReady, format!("the {peer} was not ready in time")),
+        Cause::ServerSilent => (
+            What::ServerSilent,
+            "the agent crashed, and the server does not answer any more".to_owned(),
+        ),
+        Cause::AgentHasNoGpu => (
+            What::NoGpu,
+            "the agent's container sees no GPU (no /dev/nvidia0 or any other number), and its Leaderboard gives it one; it was not begun"
+                .to_owned(),
+        ),
+        Cause::PortTaken => (What::PortTaken, detail()),
+        Cause::CannotStart(_) | Cause::Mute => (What::CannotStart, detail()),
+        Cause::NodeRefused => (What::NodeRefused, detail()),
+        Cause::NoProcess => (What::NoProcess, detail()),
+        Cause::NoGpu => (What::NoGpu, detail()),
+        Cause::GraphicsDriverMissing => (What::GraphicsDriverMissing, detail()),
         Cause::ChildEnded => {
-            let how = how_it_ended(end.status);
-            end.detail.map_or_else(|| how.clone(), |detail| format!("{how}; {detail}"))
+            let (what, how) = how_it_ended(end.status);
+            let more = end.detail.map(|detail| format!("; {detail}"));
+            (what, how + &more.unwrap_or_default())
         }
     }
 }
@@ -142,11 +132,11 @@ const fn peer(part: Part) -> &'static str {
     }
 }
 
-fn how_it_ended(status: Option<Status>) -> String {
+fn how_it_ended(status: Option<Status>) -> (What, String) {
     match status {
-        Some(Status::Exited(code)) => format!("the command exited with code {code}"),
-        Some(Status::Killed(Some(signal))) => format!("the command died of signal {signal}"),
-        Some(Status::Killed(None)) | None => "the command ended in an unknown way".to_owned(),
+        Some(Status::Exited(code)) => (What::Exited, format!("the command exited with code {code}")),
+        Some(Status::Killed(Some(signal))) => (What::Killed, format!("the command died of signal {signal}")),
+        Some(Status::Killed(None)) | None => (What::Killed, "the command ended in an unknown way".to_owned()),
     }
 }
 
