@@ -1,7 +1,8 @@
 //! The Pod of a host's own evaluators: what it stores, reports and takes up.
 
+use leaderboard_api::EvaluationMode;
 use leaderboard_contract::report::{Outcome, RefusedResults};
-use leaderboard_evaluation::fixtures::{container_run, put_result, result};
+use leaderboard_evaluation::fixtures::{container_run, merging_run, put_result, result};
 
 use super::*;
 
@@ -127,9 +128,14 @@ async fn only_where_results_were_refused_a_new_attempt_goes_on_without_the_final
         is_final: false,
         ..by_participant.clone()
     };
+    let by_merger = Report {
+        unusable: Some(RefusedResults::new(Some(3), "torn")),
+        ..ended.clone()
+    };
     for (what, attempt, report, is_kept) in [
         ("unusable", 2, &ended, false),
         ("refused", 2, &by_participant, false),
+        ("the command that merges", 2, &by_merger, true),
         ("another Job of the attempt", 1, &ended, true),
         ("a stop", 2, &stopped, true),
         ("a lost node", 2, &lost, true),
@@ -146,6 +152,7 @@ async fn only_where_results_were_refused_a_new_attempt_goes_on_without_the_final
         }
         let mut next = before.replaced("pod-2").await;
         next.setting.run.attempt = Attempt(attempt);
+        next.setting.run.plan.evaluation = merging_run(EvaluationMode::Interactive).plan.evaluation;
         next.prepare().await.unwrap();
         let path = "evaluators/1/result.json";
         assert_eq!(next.path(path).exists(), is_kept, "{what}");

@@ -94,9 +94,12 @@ pub(super) async fn remove(archive: &Archive, objects: Vec<Listed>) -> Result<()
 /// beside a final one, so a corrected one would judge nothing.
 async fn remove_refused(run: &Run, archive: &Archive) -> Result<(), ArchiveError> {
     let is_refused = |report: Report| {
-        let by_results = report.refused.is_some() || report.unusable.is_some();
+        let fault = report.refused.as_ref().or(report.unusable.as_ref());
+        let worker = fault.and_then(|fault| usize::try_from(fault.worker?).ok());
+        // The results that a command merges are not its fault.
+        let is_mergers = worker.is_some() && worker == run.plan.merger();
         let is_own = report.belongs_to(&run.uid, run.attempt);
-        by_results && report.is_final && report.stopped.is_none() && !is_own
+        fault.is_some() && report.is_final && report.stopped.is_none() && !is_mergers && !is_own
     };
     if run.plan.container().is_none() || !last_report(archive).await?.is_some_and(is_refused) {
         return Ok(());
