@@ -147,19 +147,16 @@ fn choose(objects: Vec<Listed>, quota: &Quota, pairs: usize, sharing: usize) -> 
         });
     let all = objects.len();
     let shadowed = shadowed(&objects);
-    let mut keep = |objects: &mut Vec<Listed>, is_kept: &mut dyn FnMut(&Listed) -> bool| {
-        others.extend(objects.extract_if(.., |object| !is_kept(object)));
-    };
-    keep(&mut objects, &mut |object| {
-        object.key.contains('/') && is_plain(&object.key) && !shadowed.contains(&object.key)
-    });
+    others.extend(objects.extract_if(.., |object| {
+        !object.key.contains('/') || !is_plain(&object.key) || shadowed.contains(&object.key)
+    }));
     objects.sort_by(|a, b| (quota.kind(&a.key), a.size, &a.key).cmp(&(quota.kind(&b.key), b.size, &b.key)));
     let mut left = quota.bytes;
-    keep(&mut objects, &mut |object| {
+    others.extend(objects.extract_if(.., |object| {
         let after = left.checked_sub(object.size.max(LEAST));
         left = after.unwrap_or(left);
-        after.is_some()
-    });
+        after.is_none()
+    }));
     Chosen {
         left_out: all.saturating_sub(objects.len()),
         objects,
