@@ -24,11 +24,6 @@ impl<'a> Observed<'a> {
             Self::Missing | Self::Forbidden => None,
         }
     }
-
-    /// True if the Leaderboard is known and paused, so that nothing new starts.
-    pub(super) fn is_paused(self) -> bool {
-        self.leaderboard().is_some_and(|l| l.spec.paused)
-    }
 }
 
 /// A sentence about what is wrong with a Leaderboard, and the reason whose next step fixes it.

@@ -143,14 +143,17 @@ impl Explanation<'_> {
             self.page.row("Next try", &text);
         }
         let Some(waiting) = &self.status.waiting else { return };
+        let board = self.leaderboard.leaderboard();
         let eta = match facts::eta(waiting) {
             Some(eta) => format!("starts in about {eta}"),
-            None if self.leaderboard.is_paused() => "no estimate while the Leaderboard is paused".to_owned(),
+            None if board.is_some_and(|board| board.spec.paused) => {
+                "no estimate while the Leaderboard is paused".to_owned()
+            }
             None => "no estimate until runs of this track have ended".to_owned(),
         };
         let mut text = format!("position {}; {eta}.", waiting.position);
-        if let Some(leaderboard) = self.leaderboard.leaderboard() {
-            let limits = leaderboard.spec.concurrency;
+        if let Some(board) = board {
+            let limits = board.spec.concurrency;
             let total = limits.total.map(|n| format!("concurrency.total is {n}"));
             let team = limits.per_team.map(|n| format!("concurrency.perTeam is {n}"));
             let facts: Vec<String> = [total, team].into_iter().flatten().collect();
