@@ -281,10 +281,7 @@ impl Cluster {
         K: kube::Resource<Scope = kube::core::NamespaceResourceScope> + Clone + DeserializeOwned + std::fmt::Debug,
         K::DynamicType: Default,
     {
-        let params = PatchParams {
-            field_manager: Some(MANAGER.to_owned()),
-            ..PatchParams::default()
-        };
+        let params = PatchParams::apply(MANAGER);
         let api = self.api::<K>();
         self.in_time(api.patch(name, &params, &Patch::Merge(patch))).await
     }
