@@ -27,8 +27,9 @@ pub fn check(schema: &Value, value: &mut Value, path: &str, faults: &mut Vec<Fau
     if value.is_null() && schema["nullable"] == true {
         return;
     }
-    if !has_type(schema, value) {
-        found.push(format!("{path} must be {}, and is {}", type_of(schema), shown(value)));
+    let (type_, has_type) = type_of(schema);
+    if !has_type(value) {
+        found.push(format!("{path} must be {type_}, and is {}", shown(value)));
     } else if let Some(list) = schema["enum"].as_array().filter(|list| !list.contains(value)) {
         let known: Vec<String> = list.iter().map(shown).collect();
         found.push(format!("{path} is {}. It must be {}", shown(value), known.join(" or ")));
@@ -57,31 +58,24 @@ pub fn check(schema: &Value, value: &mut Value, path: &str, faults: &mut Vec<Fau
     faults.extend(found.into_iter().map(|text| Fault::at(path, text)));
 }
 
-fn has_type(schema: &Value, value: &Value) -> bool {
+/// The type that a schema asks for, in words, and whether a value has it.
+fn type_of(schema: &Value) -> (&'static str, fn(&Value) -> bool) {
     if schema["x-kubernetes-int-or-string"] == true {
-        return value.is_string() || value.is_i64() || value.is_u64();
+        return ("a whole number or a text", |value| value.is_string() || is_whole(value));
     }
     match schema["type"].as_str() {
-        Some("object") => value.is_object(),
-        Some("array") => value.is_array(),
-        Some("string") => value.is_string(),
-        Some("boolean") => value.is_boolean(),
-        Some("integer") => value.is_i64() || value.is_u64(),
-        Some("number") => value.is_number(),
-        _ => true,
+        Some("object") => ("a mapping", Value::is_object),
+        Some("array") => ("a list", Value::is_array),
+        Some("string") => ("a text", Value::is_string),
+        Some("boolean") => ("true or false", Value::is_boolean),
+        Some("integer") => ("a whole number", is_whole),
+        Some("number") => ("a number", Value::is_number),
+        _ => ("anything", |_| true),
     }
 }
 
-fn type_of(schema: &Value) -> &str {
-    match schema["type"].as_str() {
-        Some("object") => "a mapping",
-        Some("array") => "a list",
-        Some("string") => "a text",
-        Some("boolean") => "true or false",
-        Some("integer") => "a whole number",
-        Some(_) => "a number",
-        None => "a whole number or a text",
-    }
+fn is_whole(value: &Value) -> bool {
+    value.is_i64() || value.is_u64()
 }
 
 /// A value in few words.
