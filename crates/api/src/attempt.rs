@@ -2,15 +2,15 @@
 //!
 //! Pure.
 
-use std::borrow::Cow;
 use std::fmt;
 
-use schemars::{JsonSchema, Schema, SchemaGenerator};
+use schemars::JsonSchema;
 use serde::{Deserialize, Serialize};
 
 /// Number of an attempt. It counts within one object; the number in a row of the table counts those of earlier objects as well.
-#[derive(Serialize, Deserialize, Clone, Copy, Debug, PartialEq, Eq, PartialOrd, Ord, Hash)]
+#[derive(Serialize, Deserialize, JsonSchema, Clone, Copy, Debug, PartialEq, Eq, PartialOrd, Ord, Hash)]
 #[serde(transparent)]
+#[schemars(inline)]
 pub struct Attempt(pub i64);
 
 impl Attempt {
@@ -35,19 +35,5 @@ impl Default for Attempt {
 impl fmt::Display for Attempt {
     fn fmt(&self, out: &mut fmt::Formatter<'_>) -> fmt::Result {
         self.0.fmt(out)
-    }
-}
-
-impl JsonSchema for Attempt {
-    fn schema_name() -> Cow<'static, str> {
-        "Attempt".into()
-    }
-
-    fn inline_schema() -> bool {
-        true
-    }
-
-    fn json_schema(generator: &mut SchemaGenerator) -> Schema {
-        i64::json_schema(generator)
     }
 }

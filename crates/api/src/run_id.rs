@@ -2,11 +2,10 @@
 //!
 //! Parsed where it is read, so that no text with a slash, a blank or a dot in front becomes a key, a path or a policy.
 
-use std::borrow::Cow;
 use std::fmt;
 use std::str::FromStr;
 
-use schemars::{JsonSchema, Schema, SchemaGenerator, json_schema};
+use schemars::JsonSchema;
 use serde::{Deserialize, Serialize};
 
 use crate::Submission;
@@ -15,8 +14,9 @@ use crate::Submission;
 const LONGEST: usize = 128;
 
 /// Id of a run: letters, digits, dots, hyphens and underscores, with no dot in front.
-#[derive(Serialize, Deserialize, Clone, Debug, PartialEq, Eq, Hash)]
+#[derive(Serialize, Deserialize, JsonSchema, Clone, Debug, PartialEq, Eq, Hash)]
 #[serde(try_from = "String", into = "String")]
+#[schemars(with = "String", inline)]
 pub struct RunId(String);
 
 /// A text that is no [`RunId`].
@@ -64,20 +64,6 @@ impl From<RunId> for String {
 impl fmt::Display for RunId {
     fn fmt(&self, out: &mut fmt::Formatter<'_>) -> fmt::Result {
         out.write_str(&self.0)
-    }
-}
-
-impl JsonSchema for RunId {
-    fn schema_name() -> Cow<'static, str> {
-        "RunId".into()
-    }
-
-    fn inline_schema() -> bool {
-        true
-    }
-
-    fn json_schema(_: &mut SchemaGenerator) -> Schema {
-        json_schema!({ "type": "string" })
     }
 }
 

@@ -2,17 +2,18 @@
 //!
 //! Read as a `str` and compared with one. Pure.
 
-use std::borrow::{Borrow, Cow};
+use std::borrow::Borrow;
 use std::fmt;
 use std::ops::Deref;
 use std::sync::Arc;
 
-use schemars::{JsonSchema, Schema, SchemaGenerator};
+use schemars::JsonSchema;
 use serde::de::{Deserialize, Deserializer, Error, Visitor};
 use serde::{Serialize, Serializer};
 
 /// A text whose copies share it.
-#[derive(Clone, Default, PartialEq, Eq, Hash, PartialOrd, Ord)]
+#[derive(JsonSchema, Clone, Default, PartialEq, Eq, Hash, PartialOrd, Ord)]
+#[schemars(with = "String", inline)]
 pub struct SharedText(Arc<str>);
 
 impl SharedText {
@@ -145,19 +146,5 @@ impl<'de> Deserialize<'de> for SharedText {
             }
         }
         deserializer.deserialize_str(OfText)
-    }
-}
-
-impl JsonSchema for SharedText {
-    fn inline_schema() -> bool {
-        String::inline_schema()
-    }
-
-    fn schema_name() -> Cow<'static, str> {
-        String::schema_name()
-    }
-
-    fn json_schema(generator: &mut SchemaGenerator) -> Schema {
-        String::json_schema(generator)
     }
 }

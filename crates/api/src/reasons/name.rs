@@ -3,7 +3,7 @@
 use std::borrow::Cow;
 use std::fmt;
 
-use schemars::{JsonSchema, Schema, SchemaGenerator};
+use schemars::JsonSchema;
 use serde::de::{Deserialize, Deserializer};
 use serde::{Serialize, Serializer};
 
@@ -11,7 +11,8 @@ use super::Reason;
 use crate::SharedText;
 
 /// One of the table, or the name of another version's, which is kept as it is and equals none.
-#[derive(Clone, PartialEq, Eq)]
+#[derive(JsonSchema, Clone, PartialEq, Eq)]
+#[schemars(with = "String", inline, extend("maxLength" = 64))]
 pub enum ReasonName {
     Known(Reason),
     Other(SharedText),
@@ -91,20 +92,6 @@ impl<'de> Deserialize<'de> for ReasonName {
     fn deserialize<D: Deserializer<'de>>(deserializer: D) -> Result<Self, D::Error> {
         let name = Cow::<'de, str>::deserialize(deserializer)?;
         Ok(Self::from(&*name))
-    }
-}
-
-impl JsonSchema for ReasonName {
-    fn inline_schema() -> bool {
-        true
-    }
-
-    fn schema_name() -> Cow<'static, str> {
-        "ReasonName".into()
-    }
-
-    fn json_schema(_: &mut SchemaGenerator) -> Schema {
-        schemars::json_schema!({"type": "string", "maxLength": 64})
     }
 }
 
