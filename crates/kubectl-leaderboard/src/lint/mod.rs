@@ -20,7 +20,6 @@ use leaderboard_api::text::sentence;
 use leaderboard_api::{GROUP, Leaderboard, Submission, VERSION, evaluator_result};
 use serde_json::{Value, json};
 
-use self::manifest::Node;
 use self::schema::Fault;
 use crate::error::Error;
 use crate::import::text_of;
@@ -37,16 +36,12 @@ pub struct Lint {
     files: Vec<PathBuf>,
 }
 
-/// A fault with its line.
-#[derive(Debug, PartialEq, Eq)]
-pub(super) struct Finding {
-    pub(super) line: u64,
-    pub(super) text: String,
-}
+/// The line of a fault, and a sentence about it.
+type Finding = (u64, String);
 
 /// Numbers of objects.
 #[derive(Debug, Default, PartialEq, Eq)]
-pub(super) struct Checked {
+struct Checked {
     valid: usize,
     faulty: usize,
     /// Objects of other groups, which are not checked.
@@ -73,10 +68,10 @@ pub fn lint(wanted: &Lint) -> Result<ExitCode, Error> {
 }
 
 /// Lines about one file: each fault, and a sentence about all objects.
-pub(super) fn lines(file: &str, findings: &[Finding], checked: &Checked) -> Vec<String> {
+fn lines(file: &str, findings: &[Finding], checked: &Checked) -> Vec<String> {
     let mut lines: Vec<String> = findings
         .iter()
-        .map(|one| format!("{file}:{}: {}", one.line, one.text))
+        .map(|(line, text)| format!("{file}:{line}: {text}"))
         .collect();
     let objects = |number| counted(number, "object");
     let mut parts = Vec::new();
@@ -99,13 +94,13 @@ pub(super) fn lines(file: &str, findings: &[Finding], checked: &Checked) -> Vec<
 }
 
 /// The schemas of both kinds, and what evaluates their rules.
-pub(super) struct Kinds {
+struct Kinds {
     schemas: [(&'static str, Value); 2],
     rules: Validator,
 }
 
 impl Kinds {
-    pub(super) fn new() -> Result<Self, Error> {
+    fn new() -> Result<Self, Error> {
         let schema = |derived| {
             let mut definition = served(derived).map_err(|error| Error::Malformed(error.to_string()))?;
             Ok::<_, Error>(definition["spec"]["versions"][0]["schema"]["openAPIV3Schema"].take())
@@ -120,22 +115,18 @@ impl Kinds {
     }
 
     /// All faults of a file in the order of their lines.
-    pub(super) fn findings(&self, text: &str) -> (Vec<Finding>, Checked) {
+    fn findings(&self, text: &str) -> (Vec<Finding>, Checked) {
         let mut checked = Checked::default();
         if is_result(text) {
             let fault = evaluator_result::parse(text.as_bytes()).err();
             (checked.valid, checked.faulty) = (fault.is_none().into(), fault.is_some().into());
-            let findings = fault.map(|fault| Finding {
-                line: 1,
-                text: format!("this is no result of an evaluator: {fault}"),
-            });
+            let findings = fault.map(|fault| (1, format!("this is no result of an evaluator: {fault}")));
             return (findings.into_iter().collect(), checked);
         }
         let nodes = match manifest::parse(text) {
             Ok(nodes) => nodes,
             Err((line, why)) => {
-                let text = format!("this is no YAML: {why}");
-                return (vec![Finding { line, text }], checked);
+                return (vec![(line, format!("this is no YAML: {why}"))], checked);
             }
         };
         let mut findings = Vec::new();
@@ -149,9 +140,10 @@ impl Kinds {
             } else {
                 checked.faulty += 1;
             }
-            findings.extend(faults.into_iter().map(|fault| finding(&node, &fault)));
+            let located = |fault: Fault| (node.line_of(&fault.path), sentence(&fault.text));
+            findings.extend(faults.into_iter().map(located));
         }
-        findings.sort_by_key(|finding| finding.line);
+        findings.sort_by_key(|(line, _)| *line);
         (findings, checked)
     }
 
@@ -209,13 +201,6 @@ fn is_result(text: &str) -> bool {
     let parsed: Value = serde_json::from_str(text).unwrap_or_default();
     let has = |field: &str| !parsed[field].is_null();
     !has("kind") && ["schema", "done", "splits"].into_iter().any(has)
-}
-
-fn finding(node: &Node, fault: &Fault) -> Finding {
-    Finding {
-        line: node.line_of(&fault.path),
-        text: sentence(&fault.text),
-    }
 }
 
 /// Metadata with a name: the API server makes one of its start before it looks at the rules.

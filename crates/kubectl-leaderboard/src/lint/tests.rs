@@ -201,7 +201,7 @@ fn a_leaderboard_of_each_mode_is_judged_by_schema_and_rules() {
         (of("Files", "", agent), Some("mode is \"Files\"")),
     ] {
         let (findings, _) = kinds.findings(&text);
-        let found: Vec<&str> = findings.iter().map(|finding| finding.text.as_str()).collect();
+        let found: Vec<&str> = findings.iter().map(|(_, text)| text.as_str()).collect();
         match expected {
             None => assert_eq!(found, Vec::<&str>::new(), "{text}"),
             Some(expected) => assert!(found.iter().any(|found| found.contains(expected)), "{found:?}\n{text}"),
