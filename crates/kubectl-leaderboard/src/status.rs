@@ -69,9 +69,7 @@ fn scores(status: &SubmissionStatus) -> String {
 
 /// Where its results are, its challenge, and what to call next.
 fn links(page: &mut Page, submission: &Submission, status: &SubmissionStatus, leaderboard: Observed<'_>) {
-    if let Some(results) = &status.results_url {
-        page.whole("Results", results);
-    }
+    page.whole("Results", status.results_url.as_deref().unwrap_or_default());
     let server = leaderboard.leaderboard().and_then(|board| board.spec.evalai.as_ref());
     if let Some((server, evalai)) = server.zip(submission.spec.evalai) {
         let server = server.api_server.trim_end_matches('/');

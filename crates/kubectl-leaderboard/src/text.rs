@@ -52,9 +52,9 @@ impl Page {
         self.labelled(label, wrap(text, self.width.saturating_sub(INDENT)));
     }
 
-    /// A label and what is to be copied, so it is not broken.
+    /// A label and what is to be copied, so it is not broken. No text, no row.
     pub(super) fn whole(&mut self, label: &str, text: &str) {
-        self.labelled(label, vec![clean(text)]);
+        self.labelled(label, Some(clean(text)).filter(|text| !text.is_empty()));
     }
 
     /// The lines.
@@ -62,7 +62,7 @@ impl Page {
         self.lines
     }
 
-    fn labelled(&mut self, label: &str, lines: Vec<String>) {
+    fn labelled(&mut self, label: &str, lines: impl IntoIterator<Item = String>) {
         let mut label = if label.is_empty() {
             String::new()
         } else {

@@ -206,9 +206,8 @@ impl Explanation<'_> {
             let node = status.node_name.as_ref().map(|node| format!("on node {node}"));
             self.page.row("Job", &join(&[job, &node.unwrap_or_default()]));
         }
-        if let Some(results) = &status.results_url {
-            self.page.whole("Results", results);
-        }
+        let results = status.results_url.as_deref().unwrap_or_default();
+        self.page.whole("Results", results);
     }
 
     /// Which other systems have the result, and whether the scores can be trusted.
