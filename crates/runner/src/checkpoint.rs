@@ -109,6 +109,16 @@ pub(crate) fn open(path: &Path) -> Result<File, Unreadable> {
     }
 }
 
+/// A new file in the place of whatever is there. `create_new` follows no link.
+pub(crate) fn create(path: &Path) -> io::Result<File> {
+    match fs::remove_file(path) {
+        Err(error) if error.kind() != ErrorKind::NotFound => return Err(error),
+        _ => {}
+    }
+    let mut options = OpenOptions::new();
+    options.read(true).write(true).create_new(true).mode(0o644).open(path)
+}
+
 /// Python writes `NaN` and `Infinity` where a number is none, and reads them; JSON has neither. No number counts here, so that each is
 /// read as a 0 of the same length.
 pub(crate) struct PythonJson<R> {

@@ -7,9 +7,9 @@
 //! Called by `run`. Both files are the agent's to change, so nothing is followed, and what is copied is bounded. It is no
 //! judgement: an agent that keeps a wrong copy harms its own results.
 
-use std::fs::{self, File, OpenOptions, Permissions};
+use std::fs::{self, File, Permissions};
 use std::io::{self, Read, Seek};
-use std::os::unix::fs::{MetadataExt, OpenOptionsExt, PermissionsExt};
+use std::os::unix::fs::{MetadataExt, PermissionsExt};
 use std::path::{Path, PathBuf};
 use std::time::{Duration, Instant};
 
@@ -187,17 +187,7 @@ fn whole(mut file: File) -> Result<File, Unreadable> {
 fn replace(target: &Path, source: File) -> Result<(), Failure> {
     let name = target.file_name().unwrap_or_default().to_string_lossy().into_owned();
     let temporary = target.with_file_name(format!(".{name}.tmp"));
-    match fs::remove_file(&temporary) {
-        Err(error) if error.kind() != io::ErrorKind::NotFound => return Err(error.into()),
-        _ => {}
-    }
-    // A new file: `create_new` follows no link.
-    let mut copy = OpenOptions::new()
-        .read(true)
-        .write(true)
-        .create_new(true)
-        .mode(0o644)
-        .open(&temporary)?;
+    let mut copy = checkpoint::create(&temporary)?;
     let copied = io::copy(&mut source.take(MAX_BYTES), &mut copy)
         .and_then(|_| copy.rewind())
         .map_err(Failure::from)

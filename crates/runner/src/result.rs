@@ -4,9 +4,9 @@
 //! Called by `run`, while the evaluator runs and once all its processes have ended. What the result holds is `logcopy`'s matter.
 
 use std::fmt;
-use std::fs::{self, File, OpenOptions, Permissions};
+use std::fs::{self, File, Permissions};
 use std::io::{self, BufReader, Read, Write};
-use std::os::unix::fs::{MetadataExt, OpenOptionsExt, PermissionsExt};
+use std::os::unix::fs::{MetadataExt, PermissionsExt};
 use std::path::{Path, PathBuf};
 
 use serde::Deserialize;
@@ -131,17 +131,7 @@ fn parse(file: File) -> Result<Document, Unreadable> {
 /// Puts a refusal in the place of the result. `logcopy` reads no exit code.
 pub(crate) fn refuse(path: &Path) -> io::Result<()> {
     let temporary = path.with_extension("json.refused");
-    match fs::remove_file(&temporary) {
-        Err(error) if error.kind() != io::ErrorKind::NotFound => return Err(error),
-        _ => {}
-    }
-    // A new file: `create_new` follows no link.
-    let created = OpenOptions::new()
-        .write(true)
-        .create_new(true)
-        .mode(0o644)
-        .open(&temporary);
-    created.and_then(|mut file| file.write_all(REFUSAL.as_bytes()))?;
+    checkpoint::create(&temporary)?.write_all(REFUSAL.as_bytes())?;
     fs::rename(&temporary, path)
 }
 
