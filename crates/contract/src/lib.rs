@@ -20,5 +20,5 @@ pub mod keys;
 pub mod report;
 pub mod run;
 #[cfg(test)]
-mod schema;
+mod schema_tests;
 pub mod verdict;
