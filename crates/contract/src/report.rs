@@ -138,13 +138,7 @@ pub enum Outcome {
 
 impl fmt::Display for Outcome {
     fn fmt(&self, out: &mut fmt::Formatter<'_>) -> fmt::Result {
-        out.write_str(match self {
-            Self::Running => "Running",
-            Self::Finished => "Finished",
-            Self::Crashed => "Crashed",
-            Self::Rejected => "Rejected",
-            Self::Invalid => "Invalid",
-        })
+        write!(out, "{self:?}")
     }
 }
 
