@@ -24,19 +24,11 @@ pub fn notes(tracks: &[TrackPods]) -> Vec<String> {
 }
 
 fn secrets(tracks: &[TrackPods]) -> Option<String> {
-    let found: BTreeSet<String> = tracks
-        .iter()
-        .flat_map(|pods| of_agents(&pods.template["spec"]))
-        .collect();
-    let named = match found.len() {
-        0 => return None,
-        1 => "Secret",
-        _ => "Secrets",
-    };
+    let found = tracks.iter().flat_map(|pods| of_agents(&pods.template["spec"]));
+    let secrets = counted("Secret", found.collect::<BTreeSet<_>>().into_iter())?;
     Some(format!(
-        "Agents can read {named} {}: what a participant's program can read, it can print and send; remove the reference from \
-         agent.env or podOverrides.",
-        listed(found)
+        "Agents can read {secrets}: what a participant's program can read, it can print and send; remove the reference from agent.env or \
+         podOverrides."
     ))
 }
 
@@ -71,35 +63,22 @@ fn unbounded(tracks: &[TrackPods]) -> Option<String> {
     let has_none = |pods: &&TrackPods| {
         agents(&pods.template["spec"]).any(|agent| agent["resources"]["limits"]["memory"].is_null())
     };
-    let names: Vec<String> = tracks.iter().filter(has_none).map(|pods| pods.track.clone()).collect();
-    let tracks = match names.len() {
-        0 => return None,
-        1 => "track",
-        _ => "tracks",
-    };
+    let named = tracks.iter().filter(has_none).map(|pods| pods.track.clone());
+    let tracks = counted("track", named)?;
     Some(format!(
-        "Unbounded: agents of the {tracks} {} have no memory limit, so that one agent can use up its node's memory and end what \
-         else runs there; set agent.resources.limits.memory.",
-        listed(names)
+        "Unbounded: agents of the {tracks} have no memory limit, so that one agent can use up its node's memory and end what else runs \
+         there; set agent.resources.limits.memory."
     ))
 }
 
 /// Several ROS agents in one Pod meet on its network.
 fn ros(tracks: &[TrackPods]) -> Option<String> {
-    let found: Vec<String> = tracks
-        .iter()
-        .filter(|pods| agents(&pods.template["spec"]).nth(1).is_some() && names_ros(pods))
-        .map(|pods| pods.track.clone())
-        .collect();
-    let tracks = match found.len() {
-        0 => return None,
-        1 => "track",
-        _ => "tracks",
-    };
+    let meet = |pods: &&TrackPods| agents(&pods.template["spec"]).nth(1).is_some() && names_ros(pods);
+    let named = tracks.iter().filter(meet).map(|pods| pods.track.clone());
+    let tracks = counted("track", named)?;
     Some(format!(
-        "ROS: all workers of a Pod share its network, so the agents of the {tracks} {} meet on one ROS1 master (11311), one rosbridge \
-         (9090) and ROS2's default domain; give each track of ROS agents one worker.",
-        listed(found)
+        "ROS: all workers of a Pod share its network, so the agents of the {tracks} meet on one ROS1 master (11311), one rosbridge \
+         (9090) and ROS2's default domain; give each track of ROS agents one worker."
     ))
 }
 
@@ -135,7 +114,7 @@ pub fn unnamed(tracks: &[TrackPods], hosts: Result<Vec<String>, String>) -> Opti
         format!(
             "Unnamed: network.dns is None, and no entry of podOverrides.spec.hostAliases gives the address of {}; no result can be stored \
              without it.",
-            listed(missing)
+            missing.into_iter().collect::<Vec<_>>().join(", ")
         )
     })
 }
@@ -165,8 +144,11 @@ fn name(value: &Value) -> Option<String> {
     value.as_str().map(ToOwned::to_owned)
 }
 
-fn listed(names: impl IntoIterator<Item = String>) -> String {
-    names.into_iter().collect::<Vec<_>>().join(", ")
+/// The names behind the word for one of them or several.
+fn counted(one: &str, names: impl Iterator<Item = String>) -> Option<String> {
+    let names: Vec<String> = names.collect();
+    let plural = if names.len() > 1 { "s" } else { "" };
+    (!names.is_empty()).then(|| format!("{one}{plural} {}", names.join(", ")))
 }
 
 #[cfg(test)]
