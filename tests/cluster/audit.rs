@@ -1,45 +1,33 @@
-//! Cost of one submission for the API server, by its audit log.
+//! Cost of one submission for the API server, by its audit log. For a test whose scene has one.
 
 use std::collections::BTreeMap;
 use std::fmt::Write as _;
 use std::fs;
-use std::time::Duration;
 
-use serde_json::{Value, json};
+use serde_json::Value;
 
-use crate::evalai::Evalai;
-use crate::operator::{bridge, controller};
-use crate::scene::{Scene, USER_AGENT, say, scenario};
+use crate::scene::{Scene, USER_AGENT, say};
 
 /// Writes of the operator that one submission may cost. The Lease's renewals are not of a submission.
 const MOST_WRITES: u32 = 40;
 /// The operator's clients name themselves by nothing.
 const OPERATOR: &str = "(operator)";
 
-#[tokio::test]
-async fn one_submission_costs_few_api_writes() {
+/// The scene's only submission, which has ended, has cost few writes.
+pub fn assert_few_writes(scene: &Scene) {
     let log = std::env::var("LAB_AUDIT_LOG").expect("LAB_AUDIT_LOG is not set: run through `make test`");
-    scenario("audit", async |scene: &Scene| {
-        let evalai = Evalai::start(scene).await;
-        scene.evalai_leaderboard("lb", &evalai, json!({})).await;
-        let (_controller, _bridge) = (controller(scene), bridge(scene));
-        let pk = evalai.submit(&scene.lab.challenge("agent:standard"), 1).await;
-        scene.settled(&format!("submission-{pk}"), Duration::from_mins(3)).await;
-
-        let writes = writes(&log, &scene.namespace);
-        let operator = writes
-            .iter()
-            .filter(|((agent, _, resource), _)| agent == OPERATOR && is_of_the_submission(resource));
-        let total: u32 = operator.map(|(_, count)| count).sum();
-        let mut table = format!("audit: API writes of one submission, by the operator {total}");
-        for ((agent, verb, resource), count) in &writes {
-            _ = write!(table, "\n  {agent:26} {verb:7} {resource:26} {count:4}");
-        }
-        say(&table);
-        assert!(total > 0, "the audit log {log} has no write of the operator");
-        assert!(total <= MOST_WRITES, "{table}");
-    })
-    .await;
+    let writes = writes(&log, &scene.namespace);
+    let operator = writes
+        .iter()
+        .filter(|((agent, _, resource), _)| agent == OPERATOR && is_of_the_submission(resource));
+    let total: u32 = operator.map(|(_, count)| count).sum();
+    let mut table = format!("audit: API writes of one submission, by the operator {total}");
+    for ((agent, verb, resource), count) in &writes {
+        _ = write!(table, "\n  {agent:26} {verb:7} {resource:26} {count:4}");
+    }
+    say(&table);
+    assert!(total > 0, "the audit log {log} has no write of the operator");
+    assert!(total <= MOST_WRITES, "{table}");
 }
 
 /// The lease, the Leaderboard and its policy are written whether or not anybody submits.

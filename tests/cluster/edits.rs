@@ -1,4 +1,4 @@
-//! A Leaderboard is edited while one of its submissions runs.
+//! A Leaderboard is edited while one of its submissions runs, whose agent crashes once.
 
 use std::time::Duration;
 
@@ -6,11 +6,12 @@ use leaderboard_api::Submission;
 use serde_json::json;
 
 use super::expected::{assert_finished, assert_results};
+use super::matrix::Case;
 use crate::operator::controller;
 use crate::scene::{Scene, done, scenario};
 
 #[tokio::test]
-async fn a_run_ends_as_it_began_whatever_becomes_of_its_leaderboard() {
+async fn a_run_ends_as_it_began_whatever_becomes_of_its_leaderboard_and_a_crash_costs_no_points() {
     scenario("edits", async |scene: &Scene| {
         let slow = json!({"agent": {"env": [{"name": "ROUTE_MS", "value": "3000"}]}});
         scene.leaderboard("lb", slow).await;
@@ -28,11 +29,16 @@ async fn a_run_ends_as_it_began_whatever_becomes_of_its_leaderboard() {
         });
         scene.change_leaderboard("lb", &change).await;
 
-        let after = scene.settled("steady", Duration::from_mins(4)).await;
+        let mut case = Case::open("agent crashes once", "Finished");
+        let after = case.ends(scene, "steady", Duration::from_mins(4)).await;
         assert_finished(&after);
-        assert_eq!(after.status.unwrap().plan, before.status.unwrap().plan);
+        let (before, after) = (before.status.unwrap(), after.status.unwrap());
+        assert_eq!(after.plan, before.plan);
+        let crashes: Vec<_> = after.workers.iter().map(|worker| worker.crashes).collect();
+        assert_eq!(crashes, [0, 1, 0, 0]);
         assert_results(&scene.cloud.text("steady", "evalai/results.json").await);
         assert_eq!(scene.jobs().await, ["steady-1"]);
+        case.close();
     })
     .await;
 }

@@ -7,6 +7,7 @@ use evalai_stand_in::model::Status;
 use leaderboard_api::Submission;
 use serde_json::{Value, json};
 
+use super::audit::assert_few_writes;
 use super::expected::{assert_finished, assert_results, assert_row, metrics};
 use crate::evalai::Evalai;
 use crate::operator::{bridge, controller};
@@ -132,7 +133,7 @@ fn assert_requests(requests: &[Entry]) {
 }
 
 #[tokio::test]
-async fn a_table_keyed_with_hyphens_gets_its_row_too() {
+async fn a_table_keyed_with_hyphens_gets_its_row_too_and_a_submission_costs_few_api_writes() {
     scenario("hyphens", async |scene: &Scene| {
         let evalai = Evalai::start(scene).await;
         let change = json!({"evaluation": {"carla": {"pairs": 2, "routes": 6}}, "table": {"dynamoDB": {"name": scene.cloud.hyphen_table}}});
@@ -157,6 +158,7 @@ async fn a_table_keyed_with_hyphens_gets_its_row_too() {
             0,
             "the other table is not named"
         );
+        assert_few_writes(scene);
     })
     .await;
 }

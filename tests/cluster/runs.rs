@@ -3,11 +3,10 @@
 use std::collections::{BTreeMap, BTreeSet};
 use std::time::Duration;
 
-use leaderboard_api::{Submission, conditions};
+use leaderboard_api::conditions;
 use serde_json::{Value, json};
 
 use super::expected::{assert_finished, assert_results};
-use super::matrix::Case;
 use crate::operator::controller;
 use crate::scene::{Scene, is_true, scenario};
 
@@ -136,28 +135,4 @@ async fn assert_events(scene: &Scene) {
         events.iter().all(|event| event.series.is_none()),
         "an event was sent again: {events:?}"
     );
-}
-
-#[tokio::test]
-async fn a_crash_of_an_agent_costs_one_restart_and_no_points() {
-    scenario("crash-once", async |scene: &Scene| {
-        scene.leaderboard("lb", json!({})).await;
-        let _controller = controller(scene);
-        scene.submit("crashing", "agent:crash-once").await;
-        let mut case = Case::open("agent crashes once", "Finished");
-        let submission: Submission = case.ends(scene, "crashing", Duration::from_mins(4)).await;
-        assert_finished(&submission);
-        let crashes: Vec<_> = submission
-            .status
-            .unwrap()
-            .workers
-            .iter()
-            .map(|worker| worker.crashes)
-            .collect();
-        assert_eq!(crashes, [0, 1, 0, 0]);
-        assert_results(&scene.cloud.text("crashing", "evalai/results.json").await);
-        assert_eq!(scene.jobs().await, ["crashing-1"]);
-        case.close();
-    })
-    .await;
 }
