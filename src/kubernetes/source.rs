@@ -19,7 +19,7 @@ const REFUSED_AGAIN: Duration = Duration::from_secs(10);
 /// How one API of a watch stands.
 pub(super) struct Source {
     /// Its namespace, where it is one of several.
-    namespace: Option<Box<str>>,
+    pub namespace: Option<Box<str>>,
     pub probe: WatchProbe,
     /// Keys that the list under way has shown. Its objects are cached at once, so that no second cache is needed.
     pub shown: HashSet<Box<str>>,
@@ -44,10 +44,6 @@ impl Source {
         self.namespace
             .as_deref()
             .is_none_or(|namespace| object.starts_with(&*key(Some(namespace), "")))
-    }
-
-    pub(super) fn namespace(&self) -> Option<&str> {
-        self.namespace.as_deref()
     }
 
     /// A cause of failure, with the namespace where there are several.

@@ -256,7 +256,7 @@ impl<K: Watchable> Task<K> {
         }
         tracing::info!(
             kind = self.kind,
-            namespace = self.sources[source].namespace(),
+            namespace = self.sources[source].namespace.as_deref(),
             objects = self.watch.store.len(),
             gone = gone.len(),
             "listed"
