@@ -83,46 +83,33 @@ impl<Q: Ask> State<Q> {
     pub fn want(&mut self, about: &ObjectKey, question: Q, log: LogSpan, now: Instant) -> bool {
         let uid: Uid = about.uid.as_str().into();
         let service = question.service();
-        let mut place = now;
-        match self.entries.get_mut(&uid) {
-            Some(entry) if entry.wanted.is_some() && entry.question == question => {
-                entry.wanted = Some(now);
-                return false;
-            }
-            Some(entry) => {
-                if entry
-                    .last
-                    .as_ref()
-                    .is_some_and(|last| question.outdates(&last.question))
-                {
-                    (entry.last, entry.silence) = (None, None);
-                }
-                // A newer question keeps the place in line of the one that it replaces.
-                place = entry
-                    .due
-                    .filter(|due| *due < now && entry.service == service)
-                    .unwrap_or(now);
-                (entry.question, entry.service, entry.log, entry.failures) = (question, service, log, 0);
-                (entry.waits_since, entry.wanted, entry.due) = (Some(now), Some(now), Some(place));
-            }
-            None => {
-                let entry = Entry {
-                    about: about.clone(),
-                    question,
-                    service,
-                    log,
-                    waits_since: Some(now),
-                    wanted: Some(now),
-                    due: Some(now),
-                    is_under_way: false,
-                    is_dropped: false,
-                    failures: 0,
-                    last: None,
-                    silence: None,
-                };
-                self.entries.insert(Arc::clone(&uid), entry);
-            }
+        let entry = self.entries.entry(Arc::clone(&uid)).or_insert_with(|| Entry {
+            about: about.clone(),
+            question: question.clone(),
+            service: service.clone(),
+            log: log.clone(),
+            waits_since: None,
+            wanted: None,
+            due: None,
+            is_under_way: false,
+            is_dropped: false,
+            failures: 0,
+            last: None,
+            silence: None,
+        });
+        if entry.wanted.is_some() && entry.question == question {
+            entry.wanted = Some(now);
+            return false;
         }
+        let last = entry.last.as_ref();
+        if last.is_some_and(|last| question.outdates(&last.question)) {
+            (entry.last, entry.silence) = (None, None);
+        }
+        // A newer question keeps the place in line of the one that it replaces.
+        let kept = entry.due.filter(|due| *due < now && entry.service == service);
+        let place = kept.unwrap_or(now);
+        (entry.question, entry.service, entry.log, entry.failures) = (question, service, log, 0);
+        (entry.waits_since, entry.wanted, entry.due) = (Some(now), Some(now), Some(place));
         self.due.insert((place, uid));
         true
     }
