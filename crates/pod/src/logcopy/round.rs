@@ -51,12 +51,10 @@ pub(super) enum Why {
 #[derive(Debug)]
 struct Found {
     gathered: Gathered,
+    /// Without the logs, which are taken out.
+    files: Files,
     logs: Vec<Wanted>,
     statuses: Vec<StatusFile>,
-    activity: u64,
-    /// Entries that are not looked at.
-    left_out: usize,
-    agents_fill_disk: bool,
 }
 
 /// News for the rounds from other tasks.
@@ -224,8 +222,9 @@ impl Rounds {
             // Logs must keep neither the progress back nor the end.
             self.report(&found).await?;
         }
-        if found.left_out > 0 {
-            self.uploader.complain("logs", &Complaint::Entries(found.left_out));
+        if found.files.left_out > 0 {
+            let left_out = Complaint::Entries(found.files.left_out);
+            self.uploader.complain("logs", &left_out);
         }
         self.store_logs(found.logs, at_end.then_some(why)).await?;
         if self.ending.is_some() && !self.finished {
@@ -241,14 +240,12 @@ impl Rounds {
         let (pairs, host) = (self.pairs(), self.host());
         let read = move || {
             let gathered = lock(&reader).round();
-            let files = Files::find(&tree, pairs, host);
+            let mut files = Files::find(&tree, pairs, host);
             Ok(Found {
                 logs: files.wanted(&gathered.refused, host),
                 gathered,
                 statuses: protocol::present(&status, u16::try_from(pairs).unwrap_or(u16::MAX), host),
-                activity: files.activity,
-                left_out: files.left_out,
-                agents_fill_disk: files.agents_fill_disk,
+                files,
             })
         };
         blocking(read).await
@@ -259,7 +256,7 @@ impl Rounds {
         let outside = Outside {
             stop: *self.stop.borrow_and_update(),
             cancelled: found.statuses.contains(&StatusFile::Cancel),
-            activity: found.activity,
+            activity: found.files.activity,
             now: self.epoch.elapsed(),
         };
         let seen = self.judge.see(&found.gathered, outside);
@@ -382,7 +379,7 @@ impl Rounds {
             self.ending.as_ref(),
         );
         report.round = self.reported.as_ref().map_or(0, |reported| reported.round);
-        report.agents_fill_disk = found.agents_fill_disk;
+        report.agents_fill_disk = found.files.agents_fill_disk;
         report.logs.clone_from(&self.logs.borrow());
         if self.reported.as_ref() == Some(&report) {
             return Ok(());

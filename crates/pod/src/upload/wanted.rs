@@ -121,16 +121,17 @@ impl Files {
         walk.hides
     }
 
-    /// Files to store, given why each worker's results are refused. Results are stored from memory, whole. Those that are
+    /// Takes out the files to store, given why each worker's results are refused. Results are stored from memory, whole. Those that are
     /// refused are kept as evidence under another name, so that nothing is resumed from them.
-    pub fn wanted(&self, refused: &[Option<Ending>], host: Host) -> Vec<Wanted> {
+    pub fn wanted(&mut self, refused: &[Option<Ending>], host: Host) -> Vec<Wanted> {
         let of_pair: BTreeMap<String, bool> = Pair::first(refused.len())
             .zip(refused)
             .map(|(pair, refused)| (results_path(host, pair), refused.is_some()))
             .collect();
-        let wanted = self.files.iter().filter_map(|(path, stamp)| {
-            let wanted = Wanted::new(path, *stamp, Haste::Soon);
-            match of_pair.get(path) {
+        let files = std::mem::take(&mut self.files).into_iter();
+        let wanted = files.filter_map(|(path, stamp)| {
+            let wanted = Wanted::new(&path, stamp, Haste::Soon);
+            match of_pair.get(&path) {
                 None => Some(wanted),
                 Some(true) => Some(Wanted {
                     key: format!("{REFUSED}{path}"),
@@ -265,7 +266,7 @@ mod tests {
         let tree = Tree::open(dir.path()).unwrap();
         let found = || Files::find(&tree, 1, Host::Evaluator);
         let keys = |found: &Files| -> Vec<String> {
-            let wanted = found.wanted(&[None], Host::Evaluator);
+            let wanted = found.clone().wanted(&[None], Host::Evaluator);
             wanted.into_iter().map(|wanted| wanted.key).collect()
         };
         let before = found();
@@ -286,7 +287,7 @@ mod tests {
         ] {
             let files = Pair::first(2).map(|pair| results_path(host, pair));
             let files = files.chain(["agent/agent1/x".to_owned()]);
-            let found = Files {
+            let mut found = Files {
                 files: files.map(|path| (path, Stamp::default())).collect(),
                 ..Files::default()
             };
