@@ -134,7 +134,7 @@ fn collect(run: &Run, places: &Places) -> Result<(), CollectError> {
         }
         Err(error) => {
             // Nothing starts after a failure, so a rest that stays is read by nobody.
-            let _ = forget(&tree);
+            let _ = forget(&tree, volume);
             Err(error)
         }
     }
@@ -209,7 +209,7 @@ fn find(tree: &Tree, bounds: &InputBounds) -> Result<BTreeMap<String, Stamp>, Co
 
 /// Copies all of them, and lists them then.
 fn copy_all(tree: &Tree, files: &BTreeMap<String, Stamp>) -> Result<Collected, CollectError> {
-    forget(tree).map_err(|(path, error)| volume(path, error))?;
+    forget(tree, volume)?;
     let copied = files
         .iter()
         .map(|(path, stamp)| copy(tree, path, *stamp).map(|copied| (path.clone(), copied)));
@@ -219,11 +219,11 @@ fn copy_all(tree: &Tree, files: &BTreeMap<String, Stamp>) -> Result<Collected, C
     Ok(list)
 }
 
-/// Removes the list, and then the copies.
-pub(crate) fn forget(tree: &Tree) -> Result<(), (&'static str, TreeError)> {
-    tree.remove(COLLECTED).map_err(|error| (COLLECTED, error))?;
+/// Removes the list, and then the copies. `failed` makes the error of a path.
+pub(crate) fn forget<E>(tree: &Tree, failed: fn(&str, TreeError) -> E) -> Result<(), E> {
+    tree.remove(COLLECTED).map_err(|error| failed(COLLECTED, error))?;
     let cleared = tree.clear(INPUT.trim_end_matches('/'));
-    cleared.map_err(|error| (INPUT, error))
+    cleared.map_err(|error| failed(INPUT, error))
 }
 
 /// Copies one file, which has to be the one with this stamp from its first byte to its last.

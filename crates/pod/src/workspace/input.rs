@@ -145,7 +145,7 @@ fn forget(tree: &Tree) -> Result<(), WorkspaceError> {
         let folder = format!("{STATUS_FOLDER}/{agent}");
         tree.clear(&folder).map_err(|error| volume(&folder, error))?;
     }
-    collect::forget(tree).map_err(|(path, error)| volume(path, error))
+    collect::forget(tree, volume)
 }
 
 /// Marks the one agent as done, so that it does not run again.
