@@ -2,7 +2,7 @@
 //!
 //! kubectl calls a program `kubectl_complete-leaderboard` with the words so far, and takes lines and a directive in cobra's form.
 
-use clap::{Arg, Command};
+use clap::{Arg, ArgMatches, Command};
 
 /// The program that kubectl calls.
 pub const SCRIPT: &str = "\
@@ -31,7 +31,7 @@ pub fn offer(command: &Command, words: &[String]) -> Offer {
     let (last, before) = words
         .split_last()
         .map_or(("", &[][..]), |(last, before)| (last.as_str(), before));
-    let verb = verb(command, before);
+    let verb = parsed(command, words).and_then(|line| command.find_subcommand(line.subcommand_name()?));
     let within = verb.unwrap_or(command);
     if let Some(flag) = before
         .last()
@@ -68,18 +68,11 @@ pub fn fitting(words: impl IntoIterator<Item = String>, last: &str) -> Vec<Strin
     words
 }
 
-fn verb<'a>(command: &'a Command, before: &[String]) -> Option<&'a Command> {
-    let mut words = before.iter();
-    while let Some(word) = words.next() {
-        if let Some(flag) = flag(command, command, word) {
-            if takes_value(flag) {
-                words.next();
-            }
-        } else if !word.starts_with('-') {
-            return command.find_subcommand(word);
-        }
-    }
-    None
+/// The line before its last word, which may be half of anything. A required argument may be missing while it is typed.
+pub fn parsed(command: &Command, words: &[String]) -> Option<ArgMatches> {
+    let (_, before) = words.split_last()?;
+    let line = std::iter::once("kubectl-leaderboard").chain(before.iter().map(String::as_str));
+    command.clone().ignore_errors(true).try_get_matches_from(line).ok()
 }
 
 fn flag<'a>(command: &'a Command, within: &'a Command, word: &str) -> Option<&'a Arg> {

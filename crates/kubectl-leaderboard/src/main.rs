@@ -270,12 +270,9 @@ async fn carry_out_there(command: Command, cluster: &Cluster) -> Result<ExitCode
 async fn complete(words: &[String]) {
     let offered = complete::offer(&Cli::command(), words);
     let last = words.last().map(String::as_str).unwrap_or_default();
-    // The flags that name the cluster may be among the words; the last one may be half of anything.
-    let before = words.split_last().map_or(&[][..], |(_, before)| before);
-    let before = std::iter::once("kubectl-leaderboard").chain(before.iter().map(String::as_str));
-    // A required argument may be missing while its line is typed.
-    let matches = Cli::command().ignore_errors(true).try_get_matches_from(before);
-    let target = matches.ok().and_then(|matches| Target::from_arg_matches(&matches).ok());
+    // The flags that name the cluster may be among the words.
+    let line = complete::parsed(&Cli::command(), words);
+    let target = line.and_then(|line| Target::from_arg_matches(&line).ok());
     let target = target.unwrap_or_default();
     let (names, directive) = match offered {
         Offer::Files => (Vec::new(), complete::FILES),
