@@ -36,7 +36,7 @@ pub fn offer(command: &Command, words: &[String]) -> Offer {
     if let Some(flag) = before
         .last()
         .and_then(|word| flag(command, within, word))
-        .filter(|flag| takes_value(flag))
+        .filter(|flag| flag.get_action().takes_values())
     {
         return value_of(flag, last);
     }
@@ -77,19 +77,11 @@ pub fn parsed(command: &Command, words: &[String]) -> Option<ArgMatches> {
 
 fn flag<'a>(command: &'a Command, within: &'a Command, word: &str) -> Option<&'a Arg> {
     let is_it = |flag: &&Arg| {
-        let long = word
-            .strip_prefix("--")
-            .is_some_and(|name| flag.get_long() == Some(name));
-        let short = word
-            .strip_prefix('-')
-            .is_some_and(|name| flag.get_short().is_some_and(|letter| name == letter.to_string()));
-        long || short
+        let long = flag.get_long().map(|name| format!("--{name}"));
+        let short = flag.get_short().map(|letter| format!("-{letter}"));
+        [long, short].into_iter().flatten().any(|name| name == word)
     };
     within.get_arguments().chain(command.get_arguments()).find(is_it)
-}
-
-fn takes_value(flag: &Arg) -> bool {
-    flag.get_action().takes_values()
 }
 
 fn value_of(flag: &Arg, last: &str) -> Offer {
