@@ -3,6 +3,7 @@
 //! Called by `main`; decides nothing.
 
 use std::collections::BTreeMap;
+use std::fmt::Debug;
 use std::future::Future;
 use std::path::PathBuf;
 use std::time::Duration;
@@ -14,9 +15,10 @@ use k8s_openapi::api::core::v1::Pod;
 use k8s_openapi::api::events::v1::Event;
 use kube::api::{DeleteParams, ListParams, LogParams, PartialObjectMeta, Patch, PatchParams, PostParams};
 use kube::config::{KubeConfigOptions, Kubeconfig, KubeconfigError};
+use kube::core::NamespaceResourceScope;
 use kube::runtime::WatchStreamExt;
 use kube::runtime::watcher::{self, watch_object};
-use kube::{Api, Client, Config, ResourceExt};
+use kube::{Api, Client, Config, Resource, ResourceExt};
 use serde::de::DeserializeOwned;
 use serde_json::Value;
 
@@ -125,6 +127,11 @@ impl Scope {
         Some(parts.collect::<Vec<_>>().join(" and ")).filter(|text| !text.is_empty())
     }
 }
+
+/// A kind of objects in namespaces.
+pub trait Kind: Resource<Scope = NamespaceResourceScope, DynamicType = ()> + Clone + DeserializeOwned + Debug {}
+
+impl<K: Resource<Scope = NamespaceResourceScope, DynamicType = ()> + Clone + DeserializeOwned + Debug> Kind for K {}
 
 /// A namespace of a cluster.
 pub struct Cluster {
@@ -276,11 +283,7 @@ impl Cluster {
     }
 
     /// Changes an object by a merge patch. The caller judges the API server's answer.
-    pub async fn patch<K>(&self, name: &str, patch: &Value) -> Result<kube::Result<K>, Error>
-    where
-        K: kube::Resource<Scope = kube::core::NamespaceResourceScope> + Clone + DeserializeOwned + std::fmt::Debug,
-        K::DynamicType: Default,
-    {
+    pub async fn patch<K: Kind>(&self, name: &str, patch: &Value) -> Result<kube::Result<K>, Error> {
         let params = PatchParams::apply(MANAGER);
         let api = self.api::<K>();
         self.in_time(api.patch(name, &params, &Patch::Merge(patch))).await
@@ -312,11 +315,7 @@ impl Cluster {
         watch_object(self.api::<Submission>(), name).default_backoff().boxed()
     }
 
-    fn api_of<K>(&self, scope: &Scope) -> Api<K>
-    where
-        K: kube::Resource<Scope = kube::core::NamespaceResourceScope>,
-        K::DynamicType: Default,
-    {
+    fn api_of<K: Kind>(&self, scope: &Scope) -> Api<K> {
         if scope.all_namespaces {
             Api::all(self.client.clone())
         } else {
@@ -324,19 +323,12 @@ impl Cluster {
         }
     }
 
-    fn api<K>(&self) -> Api<K>
-    where
-        K: kube::Resource<Scope = kube::core::NamespaceResourceScope>,
-        K::DynamicType: Default,
-    {
+    fn api<K: Kind>(&self) -> Api<K> {
         Api::namespaced(self.client.clone(), &self.namespace)
     }
 
     /// The error for a name that the namespace does not have, with where else to look.
-    pub async fn unknown<K>(&self, kind: &'static str, name: &str) -> Result<Error, Error>
-    where
-        K: kube::Resource<Scope = kube::core::NamespaceResourceScope, DynamicType = ()> + Clone + std::fmt::Debug,
-    {
+    pub async fn unknown<K: Kind>(&self, kind: &'static str, name: &str) -> Result<Error, Error> {
         let (here, anywhere): (Api<PartialObjectMeta<K>>, _) = (self.api(), Api::all(self.client.clone()));
         let known: Vec<String> = match list(self, &here, ListParams::default()).await {
             Ok(found) => found.iter().map(ResourceExt::name_any).collect(),
@@ -394,10 +386,7 @@ fn labels(selector: Option<&str>) -> ListParams {
 }
 
 /// All objects of a kind, in pages.
-async fn list<K>(cluster: &Cluster, api: &Api<K>, params: ListParams) -> Result<Vec<K>, Error>
-where
-    K: Clone + DeserializeOwned + std::fmt::Debug,
-{
+async fn list<K: Kind>(cluster: &Cluster, api: &Api<K>, params: ListParams) -> Result<Vec<K>, Error> {
     let mut found = Vec::new();
     let mut params = params.limit(PAGE);
     loop {
