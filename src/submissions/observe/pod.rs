@@ -141,7 +141,8 @@ fn end(container: &str, terminated: &Ended) -> EndView {
         why: short(&verdict.why),
         ..verdict
     });
-    let foreign = Some(message).filter(|_| may_speak(container, terminated));
+    let words = may_speak(container, terminated).then(|| words(container, message));
+    let (own_reason, why) = words.unwrap_or_default();
     let out_of_memory = verdict.as_ref().is_some_and(|v| v.out_of_memory);
     let reason = terminated.reason.as_deref().unwrap_or_default().to_owned();
     EndView {
@@ -150,28 +151,24 @@ fn end(container: &str, terminated: &Ended) -> EndView {
         began: terminated.started_at.as_ref().map(|t| t.0),
         at: terminated.finished_at.as_ref().map(|t| t.0),
         verdict,
-        own_reason: foreign
-            .filter(|_| [names::CONTAINER_WORKSPACE, names::CONTAINER_COLLECT].contains(&container))
-            .and_then(own_reason),
-        why: foreign.and_then(foreign_why),
+        own_reason,
+        why,
     }
 }
 
-fn own_reason(message: &str) -> Option<WorkspaceReason> {
-    WorkspaceVerdict::parse(message).ok().map(|verdict| verdict.reason)
-}
-
-fn foreign_why(message: &str) -> Option<String> {
-    if let Err(error @ NotAVerdict::Schema(_)) = WorkspaceVerdict::parse(message) {
-        return Some(error.to_string());
+/// The reason that `workspace` or `collect` reported, and the sentence of any container that may speak.
+fn words(container: &str, message: &str) -> (Option<WorkspaceReason>, Option<String>) {
+    match WorkspaceVerdict::parse(message) {
+        Ok(verdict) => {
+            let is_own = [names::CONTAINER_WORKSPACE, names::CONTAINER_COLLECT].contains(&container);
+            (is_own.then_some(verdict.reason), Some(short(&verdict.message)))
+        }
+        Err(error @ NotAVerdict::Schema(_)) => (None, Some(error.to_string())),
+        Err(_) => match serde_json::from_str::<serde_json::Value>(message) {
+            Ok(json) => (None, json["message"].as_str().map(short)),
+            Err(_) => (None, (!message.trim().is_empty()).then(|| short(message))),
+        },
     }
-    let parsed: Option<serde_json::Value> = serde_json::from_str(message).ok();
-    let told = parsed
-        .as_ref()
-        .and_then(|v| v.get("message"))
-        .and_then(|m| m.as_str())
-        .map(short);
-    told.or_else(|| (!message.trim().is_empty() && parsed.is_none()).then(|| short(message)))
 }
 
 fn short(text: &str) -> String {
