@@ -210,6 +210,6 @@ fn credentials(error: &(dyn StdError + 'static)) -> Option<String> {
 }
 
 /// An error and its causes.
-fn causes(error: &(dyn StdError + 'static)) -> impl Iterator<Item = &(dyn StdError + 'static)> {
+fn causes<'a>(error: &'a (dyn StdError + 'static)) -> impl Iterator<Item = &'a (dyn StdError + 'static)> {
     successors(Some(error), |error| (*error).source())
 }
