@@ -27,7 +27,7 @@ pub(super) struct Passing {
     waiting: VecDeque<(u64, Duration, Request)>,
     /// Number of the last one.
     last: u64,
-    /// Whoever waits for an answer, by the number of the request.
+    /// The waiters for answers, by the numbers of their requests.
     waiters: BTreeMap<u64, oneshot::Sender<Reply>>,
     /// Queues that cannot be received from, since when, and EvalAI's answer.
     troubles: BTreeMap<String, (Duration, InboxTrouble)>,
@@ -116,7 +116,7 @@ impl Queue {
             self.wake_leaderboards(|target| target.inbox.as_ref() == Some(name));
         }
         if let Some(waiter) = self.passing.waiters.remove(&number) {
-            // Whoever is gone has no use for it.
+            // A waiter that is gone has no use for it.
             let _ = waiter.send(reply);
         }
     }
