@@ -64,7 +64,7 @@ impl Detail {
         Self {
             waits: Waits::of(submission),
             state: state.as_str(),
-            failure: status.failure.as_ref().map(Cause::of),
+            failure: status.failure.as_deref().map(Cause::of),
             run: Run::of(submission, status),
             file: file.map(|file| file.size),
             score: score.map(|score| Number::new(&score.name, &score.text)),

@@ -23,6 +23,7 @@ use crate::kubernetes::objects::{Job, Owner, Pod};
 use crate::kubernetes::{Namespaces, Store, Synced, Writer};
 use crate::leaderboards::probe::Asks;
 use crate::leaderboards::state::LeaderboardState;
+use crate::metrics::{Metrics, Program};
 use crate::observability::traces::Traces;
 use crate::runtime::context::Context;
 use crate::runtime::objects::{Wake, by_key};
@@ -129,7 +130,7 @@ pub async fn surroundings(cluster: Cluster, endpoint: &str) -> Surroundings {
         }),
         external,
         recorder: EventRecorder::new(client.clone(), Reporter::from("test")),
-        metrics: Arc::default(),
+        metrics: Arc::new(Metrics::new(Program::Controller)),
         traces: Traces::default(),
         wake: noting(&waking),
         client,

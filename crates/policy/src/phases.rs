@@ -89,9 +89,9 @@ pub fn ended(view: &View, new: &SubmissionStatus) -> Vec<Ended> {
         let created = created(view);
         step.add(Phase::Intake, Some(sent(view).unwrap_or(created)), created);
     }
-    step.to_job();
+    step.reach_job();
     step.of_job();
-    step.to_end();
+    step.reach_end();
     step.ended
 }
 
@@ -121,7 +121,7 @@ impl Step<'_> {
         self.ended.extend(ended);
     }
 
-    fn to_job(&mut self) {
+    fn reach_job(&mut self) {
         let (old, new) = (self.old, self.new);
         let accepted = new.times.accepted.as_ref().map(|time| time.0);
         if let Some(accepted) = accepted
@@ -159,7 +159,7 @@ impl Step<'_> {
         }
     }
 
-    fn to_end(&mut self) {
+    fn reach_end(&mut self) {
         let finished = self.new.end();
         if let Some(end) = finished.filter(|_| !self.old.is_some_and(SubmissionStatus::has_ended)) {
             self.add(Phase::Attempt, self.begun(), end.last_transition_time.0);

@@ -39,16 +39,16 @@ fn key(uid: &str) -> ObjectKey {
     }
 }
 
-fn found(done: u32) -> Option<Stored> {
+fn found(done: u32) -> Stored {
     let digest = ReportDigest {
         attempt: Attempt(1),
         done,
         ..ReportDigest::default()
     };
-    Some(Stored {
+    Stored {
         etag: Some(done.to_string()),
         digest: Some(Arc::new(digest)),
-    })
+    }
 }
 
 fn failed(why: &str) -> Result<Option<Stored>, Failure> {
@@ -128,7 +128,7 @@ fn an_answer_has_the_stage_that_was_known_when_it_was_asked_for() {
         "after a restart nothing is known"
     );
     bench.demand(Stage::Live);
-    assert!(bench.read(Ok(found(1))));
+    assert!(bench.read(Ok(Some(found(1)))));
     assert_eq!((bench.stage(), bench.done()), (Some(Stage::Live), Some(1)));
     assert!(bench.is_idle());
 
@@ -137,7 +137,7 @@ fn an_answer_has_the_stage_that_was_known_when_it_was_asked_for() {
     let under_way = bench.begin();
     bench.demand(Stage::JobEnded);
     assert!(bench.is_idle(), "one read of a report at a time");
-    bench.answer(&under_way, Ok(found(2)));
+    bench.answer(&under_way, Ok(Some(found(2))));
     assert_eq!(
         (bench.stage(), bench.done()),
         (Some(Stage::Live), Some(2)),
@@ -145,7 +145,7 @@ fn an_answer_has_the_stage_that_was_known_when_it_was_asked_for() {
     );
     bench.wait(Report::SPACING);
     let second = bench.begin();
-    assert!(bench.answer(&second, Ok(found(4))));
+    assert!(bench.answer(&second, Ok(Some(found(4)))));
     assert_eq!((bench.stage(), bench.done()), (Some(Stage::JobEnded), Some(4)));
     bench.wait(Duration::from_hours(1));
     assert!(bench.is_idle(), "an end is read once");
@@ -155,14 +155,14 @@ fn an_answer_has_the_stage_that_was_known_when_it_was_asked_for() {
 fn an_end_takes_two_reads_and_the_same_report_counts_as_read() {
     let mut bench = Bench::new();
     bench.demand(Stage::Live);
-    bench.read(Ok(found(4)));
+    bench.read(Ok(Some(found(4))));
     for stage in [Stage::RunEnded, Stage::JobEnded] {
         bench.wait(Report::SPACING);
         bench.demand(stage);
         let work = bench.begin();
         let known = work.asked.last.as_ref().map(|last| last.result.as_ref());
-        assert_eq!(known, Some(&Ok(found(4))), "S3 is asked for a change");
-        assert!(bench.answer(&work, Ok(found(4))), "the end may be decided now");
+        assert_eq!(known, Some(&Ok(Some(found(4)))), "S3 is asked for a change");
+        assert!(bench.answer(&work, Ok(Some(found(4)))), "the end may be decided now");
         assert_eq!((bench.stage(), bench.done()), (Some(stage), Some(4)));
     }
 }
@@ -171,7 +171,7 @@ fn an_end_takes_two_reads_and_the_same_report_counts_as_read() {
 fn what_was_read_for_one_pod_or_job_is_no_answer_for_another() {
     let mut bench = Bench::new();
     bench.demand(Stage::RunEnded);
-    bench.read(Ok(found(4)));
+    bench.read(Ok(Some(found(4))));
     assert_eq!(bench.seen_of(0, Some("p")).stage, Some(Stage::RunEnded));
     assert_eq!(bench.seen_of(0, Some("q")).stage, None);
     assert_eq!(bench.seen_of(0, None).stage, None);
@@ -182,7 +182,7 @@ fn what_was_read_for_one_pod_or_job_is_no_answer_for_another() {
     // The Pod goes with its Job.
     bench.wait(Report::SPACING);
     bench.demand(Stage::JobEnded);
-    bench.read(Ok(found(4)));
+    bench.read(Ok(Some(found(4))));
     assert_eq!(bench.seen_of(0, None).stage, Some(Stage::JobEnded));
     let gone = ReportDemand {
         pod: None,
@@ -196,7 +196,7 @@ fn what_was_read_for_one_pod_or_job_is_no_answer_for_another() {
 fn a_read_that_failed_is_an_answer_and_is_made_again() {
     let mut bench = Bench::new();
     bench.demand(Stage::Live);
-    bench.read(Ok(found(1)));
+    bench.read(Ok(Some(found(1))));
     bench.wait(Report::SPACING);
     bench.demand(Stage::JobEnded);
     assert!(bench.read(failed("away")));
@@ -213,8 +213,8 @@ fn a_read_that_failed_is_an_answer_and_is_made_again() {
     assert_eq!(bench.seen().waited, READ_AGAIN * 2);
     let work = bench.begin();
     let known = work.asked.last.as_ref().map(|last| last.result.as_ref());
-    assert_eq!(known, Some(&Ok(found(1))), "what is known may still be so");
-    assert!(bench.answer(&work, Ok(found(1))));
+    assert_eq!(known, Some(&Ok(Some(found(1)))), "what is known may still be so");
+    assert!(bench.answer(&work, Ok(Some(found(1)))));
     assert_eq!(bench.done(), Some(1));
 }
 
@@ -229,7 +229,7 @@ fn live_reports_are_read_once_a_period_and_with_too_many_in_turn() {
     while bench.now < begin + Duration::from_mins(1) {
         while let Some(work) = bench.state.next(bench.now) {
             reads.push(bench.now - begin);
-            let is_new = bench.answer(&work, Ok(found(1)));
+            let is_new = bench.answer(&work, Ok(Some(found(1))));
             assert_eq!(is_new, reads.len() <= many, "the same is nothing new");
         }
         bench.wait(Report::SPACING);
@@ -264,19 +264,19 @@ fn what_goes_on_again_is_not_answered_by_what_was_asked_before() {
     bench.demand(Stage::JobEnded);
     let under_way = bench.begin();
     bench.demand(Stage::Live);
-    assert!(!bench.answer(&under_way, Ok(found(3))));
+    assert!(!bench.answer(&under_way, Ok(Some(found(3)))));
     assert_eq!(bench.stage(), None);
     bench.wait(Report::SPACING);
-    bench.read(Ok(found(3)));
+    bench.read(Ok(Some(found(3))));
     assert_eq!((bench.stage(), bench.done()), (Some(Stage::Live), Some(3)));
     bench.wait(Report::SPACING);
     bench.demand(Stage::JobEnded);
-    bench.read(Ok(found(3)));
+    bench.read(Ok(Some(found(3))));
     bench.demand(Stage::Live);
     bench.demand(Stage::JobEnded);
     assert_eq!(bench.stage(), None, "the first end is no answer to the second");
     bench.wait(Report::SPACING);
-    assert!(bench.read(Ok(found(4))), "the second end is read too");
+    assert!(bench.read(Ok(Some(found(4)))), "the second end is read too");
     assert_eq!((bench.stage(), bench.done()), (Some(Stage::JobEnded), Some(4)));
 }
 
@@ -288,10 +288,10 @@ fn what_is_dropped_is_not_answered_by_what_was_asked_before() {
     let under_way = bench.begin();
     bench.state.forget("u");
     bench.demand(Stage::Live);
-    assert!(!bench.answer(&under_way, Ok(found(4))));
+    assert!(!bench.answer(&under_way, Ok(Some(found(4)))));
     assert_eq!((bench.stage(), bench.done()), (None, None));
     bench.wait(Report::SPACING);
-    assert!(bench.read(Ok(found(0))), "it is read in its turn");
+    assert!(bench.read(Ok(Some(found(0)))), "it is read in its turn");
 }
 
 #[test]
