@@ -1,4 +1,7 @@
-"""examples/aws/up.sh: run by AWS's own program against the stand-in for AWS. Twice is once, and a dry run changes nothing."""
+"""examples/aws/up.sh: run by AWS's own program against the stand-in for AWS. Twice is once, and a dry run changes nothing.
+
+The program is loaded once for more than a hundred calls.
+"""
 
 import json
 import os
@@ -12,7 +15,7 @@ from collections.abc import Iterator, Mapping
 from contextlib import contextmanager
 from pathlib import Path
 
-from labkit import pythonenv, settings
+from labkit import aws_fork, pythonenv, settings
 
 from .test_aws import AWS, stand_in
 
@@ -50,6 +53,23 @@ class Style(unittest.TestCase):
 
 
 class Up(unittest.TestCase):
+    loaded: Path
+
+    @classmethod
+    def setUpClass(cls) -> None:
+        folder = tempfile.TemporaryDirectory()
+        cls.addClassCleanup(folder.cleanup)
+        cls.loaded = Path(folder.name) / "aws"
+        python = pythonenv.ensure(settings.load(REPOSITORY), pythonenv.EXAMPLES) / "python"
+        env = {**os.environ, "PYTHONPATH": str(REPOSITORY / "local"), "PYTHONDONTWRITEBYTECODE": "1"}
+        argv = [str(python), "-m", "labkit.aws_fork", str(cls.loaded)]
+        server = subprocess.Popen(argv, env=env, stdin=subprocess.DEVNULL, stdout=subprocess.PIPE)
+        assert server.stdout
+        for cleanup in (server.stdout.close, server.wait, server.kill):
+            cls.addClassCleanup(cleanup)
+        if server.stdout.readline() != b"ready\n":
+            raise AssertionError("AWS's program could not be loaded, see above")
+
     def setUp(self) -> None:
         folder = tempfile.TemporaryDirectory()
         self.addCleanup(folder.cleanup)
@@ -61,12 +81,14 @@ class Up(unittest.TestCase):
                 text = text.replace(name, value)
             file.write_text(text)
         (self.home / "token.json").write_text('{"auth_token": "first-token"}')
-        bin_ = pythonenv.ensure(settings.load(REPOSITORY), pythonenv.EXAMPLES)
         (self.home / "bin").mkdir()
+        client = self.home / "bin" / "client"
+        client.write_text(aws_fork.client(self.loaded))
         # By the variable alone the program would ask SQS at AWS.
         wrapper = self.home / "bin" / "aws"
-        wrapper.write_text(f'#!/bin/sh\nexec {bin_ / "aws"} --endpoint-url "$AWS_ENDPOINT_URL" "$@"\n')
-        wrapper.chmod(0o755)
+        wrapper.write_text(f'#!/bin/sh\nexec {client} --endpoint-url "$AWS_ENDPOINT_URL" "$@"\n')
+        for program in (client, wrapper):
+            program.chmod(0o755)
 
     @contextmanager
     def account(self) -> Iterator[dict[str, str]]:
