@@ -15,7 +15,7 @@ from .errors import LabError
 GOLDEN = "crates/pod-spec/src/job/golden"
 NAMES = "crates/results/src/names.rs"
 CELL = re.compile(r"`([^`]+)`")
-METRIC = re.compile(r"metric\(\s*\"([^\"]+)\"")
+METRIC = re.compile(r"\b(?:metric|same)\(\s*\"([^\"]+)\"")
 
 
 @dataclass(frozen=True)

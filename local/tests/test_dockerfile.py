@@ -301,9 +301,9 @@ class NotRunLayers(unittest.TestCase):
                 testrun.Plan(SimpleNamespace(), ""), testrun.Layer("image", "it", work, testrun.COMPUTES), []
             )
         self.assertEqual((result.failure, result.lacks), ("", "no engine"))
-        lines = testrun.table([testrun.Result("lab", 1.0, ""), result], 1.0).splitlines()
-        self.assertTrue(lines[2].endswith("   not run: no engine"))
-        self.assertTrue(lines[3].endswith("   passed; not run: image"))
+        lines = testrun.table([testrun.Result("lab", 1.0, ""), result], 1.0, 0.0).splitlines()
+        self.assertTrue(lines[3].endswith("   not run: no engine"))
+        self.assertTrue(lines[4].endswith("   passed; not run: image"))
 
 
 if __name__ == "__main__":
