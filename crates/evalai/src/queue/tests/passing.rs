@@ -50,7 +50,7 @@ impl Bench {
 }
 
 #[test]
-fn each_answer_is_handed_to_whoever_made_its_request() {
+fn each_answer_is_handed_to_what_made_its_request() {
     let mut bench = Bench::reading();
     let (mut first, mut second) = (bench.pass(), bench.pass());
     let ticket = bench.expect("message");
