@@ -146,11 +146,11 @@ mod tests {
     #[tokio::test]
     async fn a_claim_is_read_in_the_namespace_of_its_leaderboard_and_one_that_may_not_be_read_goes_unchecked() {
         let claim = json!({"metadata": {"name": "l"}, "spec": {"accessModes": ["ReadWriteOnce"]}});
-        let refusal = |code: u16| json!({"kind": "Status", "status": "Failure", "message": "no", "code": code});
+        let refusal = |code: u16, reason: &str| json!({"kind": "Status", "status": "Failure", "message": "no", "code": code, "reason": reason});
         for (code, answer, is_refused, notes) in [
             (200, claim, false, 1),
-            (404, refusal(404), true, 0),
-            (403, refusal(403), false, 0),
+            (404, refusal(404, "NotFound"), true, 0),
+            (403, refusal(403, "Forbidden"), false, 0),
         ] {
             let (service, mut server) = tower_test::mock::pair::<Request<Body>, Response<Body>>();
             let client = Client::new(service, "default");

@@ -64,8 +64,8 @@ pub(super) async fn ask(aws: Aws, asked: Asked<Place>) -> Result<Seen, Failure> 
         }
     };
     if let Ok(Seen { hidden: Some(why), .. }) | Err(Failure { why, .. }) = &answer {
-        let (leaderboard, place) = (&asked.about, place.resource);
-        tracing::warn!(%leaderboard, ?place, why, "the bucket, table, queue or log group cannot be reached");
+        let leaderboard = &asked.about;
+        tracing::warn!(%leaderboard, why, "the bucket, table, queue or log group cannot be reached");
     }
     answer
 }

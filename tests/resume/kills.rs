@@ -24,7 +24,7 @@ const MOST_KILLS: u32 = 3;
 /// No run takes so long, however busy the machine is.
 const PATIENCE: Duration = Duration::from_mins(3);
 const FORMATS: [LeaderboardVersion; 2] = [LeaderboardVersion::V2, LeaderboardVersion::V1];
-const ASK_EVERY: Duration = Duration::from_millis(5);
+const ASK_EVERY: Duration = Duration::from_millis(25);
 
 /// The victim of a kill.
 #[derive(Clone, Copy, Debug, PartialEq, Eq, PartialOrd, Ord)]
