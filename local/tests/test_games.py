@@ -123,6 +123,7 @@ class Games(unittest.TestCase):
                     lambda worker=worker, done=done: self.result(worker)["done"] == done, SECONDS, PAUSE
                 )
                 self.assertTrue(played, agent.poll())
+                self.assertIn(agent.poll(), (None, 1))
                 if kind == "crash-once":
                     self.assertEqual(agent.wait(SECONDS), 1)
                 agent.kill()
