@@ -13,7 +13,7 @@ use super::failure::{self, charged};
 use super::plan::{Action, EvalaiUpdate, Question, TableUpdate};
 use super::status::PlanBuilder;
 use super::waits::{Wait, after};
-use super::workers::agents_of;
+use super::workers::{agents_of, only_merges};
 use super::{blame, cause, limits};
 use crate::report_digest::{ReportDigest, clamp};
 use crate::view::{ContainerView, ObservedJob, ObservedReport, PodView, ReportDemand, Stage, Standing, View};
@@ -71,7 +71,7 @@ fn awaits_images(draft: &PlanBuilder<'_>) -> bool {
 /// The failure of a run that took longer than its limit: the hosts' own, where no agent was at work.
 pub(super) fn over_time(draft: &PlanBuilder<'_>, limit: i64) -> Failure {
     let pod = draft.view.pod.as_ref();
-    if limits::is_agents_time(pod, agents_of(&draft.status)) {
+    if limits::is_agents_time(pod, agents_of(&draft.status)) && !only_merges(&draft.status) {
         failure::time_limit(limit, draft.words())
     } else {
         failure::evaluators_late(limit, draft.words())

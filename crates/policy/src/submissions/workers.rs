@@ -1,6 +1,6 @@
 //! The workers of a submission, as its status has them. Pure.
 
-use leaderboard_api::{Agents, EndReason, RunPlan, SubmissionStatus, WorkerStatus};
+use leaderboard_api::{Agents, EndReason, RunPlan, SubmissionStatus, WorkerState, WorkerStatus};
 use leaderboard_evaluation::of_plan;
 use leaderboard_protocol::files::{Host, Pair};
 
@@ -21,6 +21,18 @@ pub(super) fn agents_beside(status: &SubmissionStatus, id: i32) -> Agents {
     let plan = status.plan.as_ref();
     let of_worker = |plan: &RunPlan| plan.agents_of(usize::try_from(id).unwrap_or_default());
     plan.map_or(Agents::Beside, of_worker)
+}
+
+/// True once every evaluator is done whose results a command merges. An agent cannot forge that end.
+pub(super) fn only_merges(status: &SubmissionStatus) -> bool {
+    let Some(merger) = status.plan.as_ref().and_then(RunPlan::merger) else {
+        return false;
+    };
+    let is_done = |id: usize| {
+        let mut done = status.workers.iter().filter(|worker| worker.state == WorkerState::Done);
+        done.any(|worker| usize::try_from(worker.id) == Ok(id))
+    };
+    (1..merger).all(is_done)
 }
 
 pub(super) fn pair_with(id: i32) -> Option<Pair> {

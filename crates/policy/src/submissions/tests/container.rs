@@ -7,7 +7,9 @@ use super::log::places;
 use crate::submissions::Plan;
 use leaderboard_api::FailureClass::{Infrastructure, Participant};
 use leaderboard_api::State::{Failed, Finished, Pending, Running};
-use leaderboard_api::{Attempt, Evaluation, FailedNode, Failure, MergeMethod, Metric, Progress, Reason, State};
+use leaderboard_api::{
+    Attempt, Evaluation, FailedNode, Failure, MergeMethod, Metric, Progress, Reason, State, WorkerState,
+};
 use leaderboard_contract::report::{Outcome, RefusedResults, Report, ReportWorker};
 
 /// Words that only CARLA has.
@@ -399,6 +401,34 @@ fn a_command_that_merges_and_fails_is_an_evaluator_beside_no_agent() {
         world.complete();
         world.report(told(10));
         world.pass_to(Pending, Reason::Replacing);
+    }
+}
+
+#[test]
+fn the_time_in_which_a_command_merges_is_no_agents() {
+    let (done, at_work) = (WorkerState::Done, WorkerState::Running);
+    for (states, class, reason) in [
+        (vec![], Participant, Reason::TimeLimit),
+        (vec![done, at_work, done], Participant, Reason::TimeLimit),
+        (vec![done, done, at_work], Infrastructure, Reason::EvaluatorFailed),
+    ] {
+        let mut world = merging();
+        let worker = |(id, state)| ReportWorker {
+            id,
+            state,
+            ..told(10).workers[0].clone()
+        };
+        world.report(Report {
+            workers: (1..).zip(states.clone()).map(worker).collect(),
+            ..told(10)
+        });
+        world.go_to(90_000);
+        let failure = world.pass_to(Running, Reason::Stopping).status.failure.unwrap();
+        assert_eq!(
+            (failure.class, failure.reason.known()),
+            (class, Some(reason)),
+            "{states:?}"
+        );
     }
 }
 
