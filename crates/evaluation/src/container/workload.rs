@@ -1,8 +1,6 @@
 //! Evaluators and agents: images, commands, flags, variables and mounts of a worker, mode by mode. Pure.
 
-use leaderboard_api::{
-    Agents, ContainerEvaluation, ContainerPlan, EvaluationMode, LeaderboardSpec, MergeMethod, PORT_STEP, names,
-};
+use leaderboard_api::{Agents, ContainerEvaluation, ContainerPlan, EvaluationMode, LeaderboardSpec, PORT_STEP, names};
 use leaderboard_contract::keys::{EVALUATORS, INPUT, SUBMISSION_FOLDER, agent_folder, host_folder, host_log_name};
 use leaderboard_protocol::files::Pair;
 
@@ -38,28 +36,23 @@ const PARTS_PATH: &str = "PARTS";
 const MERGE: &str = "merge";
 /// EvalAI's own name for it.
 const SUBMISSION_PATH: &str = "SUBMISSION_PATH";
-/// They follow from the plan, in every mode.
-const ENV: [&str; 8] = [
-    "WORKER", "WORKERS", "TRACK", "PHASE", ADDRESS, "RESULTS", "RESUME", "ATTEMPT",
+/// They follow from the plan, in every mode. A plan keeps its merge when that of the Leaderboard changes.
+const ENV: [&str; 9] = [
+    "WORKER", "WORKERS", "TRACK", "PHASE", ADDRESS, "RESULTS", "RESUME", "ATTEMPT", PARTS_PATH,
 ];
 
-/// What a host may not give another meaning: names of what the Pods of this Leaderboard have, and no others.
+/// What a host may not give another meaning: names of what the Pods of this Leaderboard can have, and no others.
 pub(super) fn reserved(mode: EvaluationMode, spec: &LeaderboardSpec) -> Reserved {
     let data = data(spec);
     let input = mode.has_input().then_some((INPUT_PATH, INPUTS));
     let submission = (mode == EvaluationMode::Batch).then_some((SUBMISSION_PATH, SUBMISSION));
-    let merges = spec
-        .evaluation
-        .container()
-        .is_some_and(|own| own.merge == MergeMethod::Command);
-    let parts = merges.then_some((PARTS_PATH, PARTS));
     let of_data = data.iter().map(|data| (data.variable, data.volume.read));
-    let all = [input, submission, parts].into_iter().flatten();
+    let all = [input, submission].into_iter().flatten();
     let (env, folders): (Vec<_>, Vec<_>) = all.chain(of_data).unzip();
     Reserved {
         env: ENV.into_iter().chain(env).collect(),
         volumes: &[],
-        folders: [AGENT, RESULTS, SHM].into_iter().chain(folders).collect(),
+        folders: [AGENT, RESULTS, PARTS, SHM].into_iter().chain(folders).collect(),
     }
 }
 

@@ -83,7 +83,7 @@ fn the_agent_finds_the_evaluator_of_its_own_worker_and_sees_nothing_else_of_it()
     assert_eq!((host.shm, agent.shm), (Some(64 << 20), Some(1 << 30)));
     let reserved = reserved(EvaluationMode::Interactive, &spec(Some(5000)));
     assert_eq!(reserved.env, ENV, "other names are the host's own");
-    assert_eq!(reserved.folders, [AGENT, RESULTS, SHM]);
+    assert_eq!(reserved.folders, [AGENT, RESULTS, PARTS, SHM]);
 }
 
 /// Names of variables, and what is mounted where: a folder of `logs`, or a volume; `+` for one that can be written.
@@ -230,7 +230,9 @@ fn the_one_that_merges_reads_what_the_others_have_left_and_has_no_agent_in_any_m
             assert!(!env.contains(&"PARTS") && !mounts.contains(&"evaluators /parts".to_owned()));
             assert!(!role.flags.contains(&"--after=/parts".to_owned()));
         }
-        let reserved = reserved(mode, &spec);
+        // A submission keeps the merge of its plan.
+        let merges_no_more = spec_with(&json!({"merge": "Mean", "mode": format!("{mode:?}")}));
+        let reserved = reserved(mode, &merges_no_more);
         assert!(reserved.env.contains(&"PARTS") && reserved.folders.contains(&"/parts"));
     }
     let with_port = spec_with(&json!({"merge": "Command", "port": 5000}));
