@@ -22,10 +22,14 @@ const NO_DEVICE: &str = "void";
 const RESOURCES: &str = "nvidia.com/";
 /// The source of a container's GPU. A command that merges results has none.
 pub(super) fn source_of<'a>(spec: &'a LeaderboardSpec, plan: &RunPlan, member: Member) -> GpuSource<'a> {
-    if plan.merger() == Some(member.pair.get().into()) {
+    if merges(plan, member) {
         return GpuSource::None;
     }
     source(spec)
+}
+
+fn merges(plan: &RunPlan, member: Member) -> bool {
+    plan.merger() == Some(member.pair.get().into())
 }
 
 /// The variables of a container of a worker.
@@ -51,15 +55,16 @@ pub(super) fn variables(source: GpuSource<'_>, member: Member) -> Vec<EnvVar> {
 /// Requests and limits of a container of a worker: the host's own, and its GPU. What an agent requests that runs first is free again for
 /// the hosts' containers, so that it requests as they do.
 pub(super) fn resources(
-    source: GpuSource<'_>,
-    agents: Agents,
+    spec: &LeaderboardSpec,
+    plan: &RunPlan,
     member: Member,
     hosts: Option<&ResourceRequirements>,
 ) -> Value {
     let mut resources = json!(hosts);
-    match source {
+    match source(spec) {
+        gpus if merges(plan, member) => drop_gpus(&mut resources, gpus),
         GpuSource::None => {}
-        GpuSource::NodeIndex(_) if agents == Agents::Beside && member.side == Side::Agent => {}
+        GpuSource::NodeIndex(_) if plan.agents() == Agents::Beside && member.side == Side::Agent => {}
         GpuSource::PerContainer(resource) | GpuSource::NodeIndex(resource) => {
             resources["limits"][resource] = "1".into();
         }
@@ -72,6 +77,15 @@ pub(super) fn resources(
         }
     }
     resources
+}
+
+/// Takes the GPUs away that the host's own resources name.
+fn drop_gpus(resources: &mut Value, source: GpuSource<'_>) {
+    for list in ["limits", "requests"] {
+        if let Some(named) = resources.get_mut(list).and_then(Value::as_object_mut) {
+            named.retain(|name, _| !is_gpu(name, source));
+        }
+    }
 }
 
 /// One claim for each worker that shares the work, for its two containers.

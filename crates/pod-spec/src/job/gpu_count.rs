@@ -15,8 +15,7 @@ pub fn gpus(spec: &LeaderboardSpec, track: Option<&Track>, plan: &RunPlan) -> i6
     let of_member = |member: Member| {
         let hosts = spec.given(track, workers::part(member.side));
         let hosts = hosts.and_then(|hosts| hosts.resources);
-        let source = gpu::source_of(spec, plan, member);
-        let resources = gpu::resources(source, plan.agents(), member, hosts.as_ref());
+        let resources = gpu::resources(spec, plan, member, hosts.as_ref());
         json!({"name": member.to_string(), "resources": resources})
     };
     let (first, beside): (Vec<Member>, Vec<Member>) =

@@ -393,14 +393,19 @@ fn an_agent_that_runs_first_has_a_gpu_as_the_evaluators_after_it() {
 #[test]
 fn the_one_that_merges_stands_beside_the_evaluators_without_an_agent_or_a_gpu() {
     let claim = json!({"resourceClaimTemplateName": "t"});
+    let resources = json!({"limits": {GPU: "1", "cpu": "2"}, "requests": {GPU: 1}});
     for gpu in [
         json!(null),
+        json!({"mode": "None"}),
         json!({"resourceName": GPU}),
         json!({"mode": "NodeIndex", "resourceName": GPU}),
         json!({"mode": "Claim", "claim": claim}),
     ] {
         for mode in MODES {
-            let of = |merge: &str| case_with(json!({"mode": mode, "merge": merge}), &json!({"gpu": gpu}));
+            let of = |merge: &str| {
+                let evaluation = json!({"mode": mode, "merge": merge, "resources": resources});
+                case_with(evaluation, &json!({"gpu": gpu}))
+            };
             let (case, without) = (of("Command"), of("Mean"));
             let job = case.json();
             let mut expected = names(&without.json(), "containers").join(",");
@@ -409,7 +414,10 @@ fn the_one_that_merges_stands_beside_the_evaluators_without_an_agent_or_a_gpu() 
             let merger = container(&job, "evaluator-3");
             let (words, mut env) = started(merger, &[]);
             assert_eq!(env["NVIDIA_VISIBLE_DEVICES"], "void", "{mode} {gpu}");
-            assert_eq!(merger["resources"]["limits"].get(GPU), None, "{mode} {gpu}");
+            for list in ["limits", "requests"] {
+                assert_eq!(merger["resources"][list].get(GPU), None, "{mode} {gpu}");
+            }
+            assert_eq!(merger["resources"]["limits"]["cpu"], "2", "{mode} {gpu}");
             assert_eq!(merger["resources"].get("claims"), None, "{mode} {gpu}");
             let (runs, _) = behind_runner(&words, &mut env);
             assert!(

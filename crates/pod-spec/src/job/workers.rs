@@ -44,7 +44,7 @@ fn container(input: &JobInput<'_>, member: Member, role: &Role) -> Option<Value>
         "imagePullPolicy": (member.side == Side::Agent).then_some("IfNotPresent"),
         "command": behind_runner(member, flags, &role.command),
         "env": merged(env, hosts.env, &input.kind().reserved(input.spec()).env),
-        "resources": gpu::resources(gpus, agents, member, hosts.resources.as_ref()),
+        "resources": gpu::resources(input.spec(), input.plan, member, hosts.resources.as_ref()),
         "securityContext": context(hosts.security),
         "volumeMounts": volumes::of_member(member, role),
     }))
