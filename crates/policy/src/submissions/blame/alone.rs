@@ -1,7 +1,8 @@
 //! The fault for the last crash of a worker whose two sides never live at one time: its own end alone. Pure.
 //!
-//! In Batch the agent ends before the evaluators begin, and in Predictions there is none. So no end follows from that of another container, and
-//! none is waited for. The end of logcopy shows if all containers were ended from outside.
+//! In Batch the agent ends before the evaluators begin, and in Predictions there is none. A command that merges has none either: in Interactive
+//! agents of the others live on beside it for some seconds, and no end of theirs explains its own. So no end follows from that of another
+//! container, and none is waited for. The end of logcopy shows if all containers were ended from outside.
 
 use super::ends::{
     Crash, Order, by_times_and_rounds, crash, end_from_outside, is_crash, is_false_claim, is_killed_from_outside,
@@ -49,7 +50,8 @@ fn of_lone_agent(agent: &ContainerView, end: &EndView) -> EndReason {
     }
 }
 
-/// No agent is there to use up the Pod's processes, or to take a port.
+/// It has no agent to use up the Pod's processes, or to take its port. The agents of others may still do the first to one that merges, for some
+/// seconds.
 fn of_lone_evaluator(host: &ContainerView, end: &EndView) -> EndReason {
     match of_evaluator(of_host(Some(host), end)) {
         EndReason::NoProcess | EndReason::PortTaken => EndReason::EvaluatorCrashed,
