@@ -250,7 +250,7 @@ fn results_fit_the_splits_of_their_leaderboard_or_are_not_sent() {
     let catalog = |names: [Option<&str>; 2]| Catalog {
         at: wall(0),
         phases: vec![],
-        splits: vec![split(1, &["accuracy"]), split(2, &["accuracy", "loss"])],
+        splits: vec![split(1, &["accuracy"]), split(2, &["loss", "accuracy"])],
         codenames: [(1, names[0]), (2, names[1])]
             .map(|(id, name)| (id, name.map(str::to_owned)))
             .into(),
@@ -260,7 +260,8 @@ fn results_fit_the_splits_of_their_leaderboard_or_are_not_sent() {
     let (of_evalai, fixed) = (takes_what_is_listed(None), with_split("val"));
     let (known, unnamed) = (catalog([Some("test"), Some("dev")]), catalog([Some("test"), None]));
     let (known, unnamed) = (Some(&known), Some(&unnamed));
-    let (both, in_order, dev) = (format!("[{DEV},{TEST}]"), format!("[{TEST},{DEV}]"), format!("[{DEV}]"));
+    let own = DEV.replace(r#""accuracy":0.50,"loss":1e2"#, r#""loss":1e2,"accuracy":0.50"#);
+    let (both, in_order, dev) = (format!("[{DEV},{TEST}]"), format!("[{TEST},{own}]"), format!("[{DEV}]"));
     let (both, in_order, dev) = (both.as_str(), in_order.as_str(), dev.as_str());
     let score = r#"[{"split":"leaderboard","accuracies":{"Driving score":1.50}}]"#;
     let of_val = r#"[{"split":"val","show_to_participant":false,"accuracies":{"Driving score":1.50}}]"#;
