@@ -22,7 +22,7 @@ use super::name_files;
 use super::places::{Places, Setting};
 use leaderboard_api::names::FAILURE_LOG_KEY;
 use leaderboard_api::{Agents, Attempt, Enforcement};
-use leaderboard_aws::archive::{Archive, ArchiveError, Listed};
+use leaderboard_aws::archive::{Archive, ArchiveError, Listed, Object};
 use leaderboard_contract::keys::{INPUT, SUBMISSION_FOLDER, host_folder};
 use leaderboard_contract::report::{MAX_BYTES, OWNER_KEY, Owner, REPORT_KEY, Report};
 use leaderboard_contract::run::{Run, STATUS_FOLDER};
@@ -230,8 +230,16 @@ async fn of_nobody(run: &Run, archive: &Archive) -> Result<Option<Vec<Listed>>, 
 
 /// The report that was stored last; `None` if there is none that can be read.
 async fn last_report(archive: &Archive) -> Result<Option<Report>, ArchiveError> {
-    let stored = archive.get(REPORT_KEY, MAX_BYTES as u64).await?;
+    let stored = get(archive, REPORT_KEY, MAX_BYTES as u64).await?;
     Ok(stored.and_then(|object| Report::parse(&object.bytes).ok()))
+}
+
+/// A stored object. One that is too large to be ours counts as none: it must not stop each Pod of the run.
+async fn get(archive: &Archive, key: &str, limit: u64) -> Result<Option<Object>, ArchiveError> {
+    match archive.get(key, limit).await {
+        Err(error) if error.is_too_large() => Ok(None),
+        object => object,
+    }
 }
 
 /// True if the evaluators read what a submission brings.

@@ -164,6 +164,25 @@ async fn only_where_results_were_refused_a_new_attempt_goes_on_without_the_final
 }
 
 #[tokio::test]
+async fn a_stored_file_that_is_too_large_to_be_ours_stops_no_pod() {
+    let before = evaluated().await;
+    let ended = Report {
+        is_final: true,
+        unusable: Some(RefusedResults::new(Some(2), "torn")),
+        ..before.report().await.unwrap()
+    };
+    let ended = serde_json::to_vec(&ended).unwrap();
+    let large = vec![b' '; MAX_BYTES + 1];
+    for (key, report) in [("evaluators/1/result.json", &ended), (REPORT_KEY, &large)] {
+        before.archive.put(REPORT_KEY, report.clone()).await.unwrap();
+        before.archive.put(key, large.clone()).await.unwrap();
+        let mut next = before.replaced("pod-2").await;
+        next.setting.run.attempt = Attempt(2);
+        next.prepare().await.unwrap();
+    }
+}
+
+#[tokio::test]
 async fn results_that_no_reader_takes_are_the_hosts_fault_and_refused_ones_the_participants() {
     let good = result(2, 2, 0.5);
     let broken = Box::pin(ended([&good, r#"{"schema": 1, "done": 3, "total": 2}"#])).await;

@@ -9,7 +9,7 @@ use std::sync::Arc;
 use futures::{StreamExt, TryStreamExt};
 
 use super::restore::{AT_ONCE, download, is_evaluators, remove, unknown};
-use super::{WorkspaceError, place, volume};
+use super::{WorkspaceError, get, place, volume};
 use crate::blocking;
 use crate::collect::{self, bounds, digest_of, usable};
 use crate::upload::Stored;
@@ -86,10 +86,7 @@ async fn collected(
 ) -> Result<Option<Vec<(String, Stored)>>, WorkspaceError> {
     forget(tree)?;
     let by_key: BTreeMap<&str, &Listed> = stored.iter().map(|object| (object.key.as_str(), object)).collect();
-    let object = match archive.get(COLLECTED, MAX_BYTES).await {
-        Err(error) if error.is_too_large() => None,
-        object => object?,
-    };
+    let object = get(archive, COLLECTED, MAX_BYTES).await?;
     let Some(list) = object.and_then(|object| usable(&object.bytes, &bounds(run))) else {
         tracing::info!("no {COLLECTED} that can be used is stored; the agent runs anew");
         return Ok(None);

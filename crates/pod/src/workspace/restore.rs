@@ -11,7 +11,7 @@ use std::sync::Arc;
 
 use futures::{StreamExt, TryStreamExt};
 
-use super::{WorkspaceError, input, last_report, volume};
+use super::{WorkspaceError, get, input, last_report, volume};
 use crate::blocking;
 use crate::daily::Daily;
 use crate::upload::quota::{LEAST, Quota};
@@ -106,7 +106,7 @@ async fn remove_refused(run: &Run, archive: &Archive) -> Result<(), ArchiveError
     }
     let mut finals = Vec::new();
     for path in Pair::first(run.plan.workers()).map(result_path) {
-        let stored = archive.get(&path, MAX_BYTES as u64).await?;
+        let stored = get(archive, &path, MAX_BYTES as u64).await?;
         let found = stored.and_then(|object| parse(&object.bytes).ok());
         if found.is_some_and(|result| result.is_final) {
             finals.push(path);
