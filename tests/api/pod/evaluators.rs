@@ -10,9 +10,19 @@ const EVALUATOR: Side = Side::Host(Host::Evaluator);
 
 /// Two workers.
 async fn evaluated() -> Pod {
+    prepared(container_run().plan.evaluation).await
+}
+
+/// Two workers, whose results a command merges.
+async fn merging() -> Pod {
+    prepared(merging_run(EvaluationMode::Interactive).plan.evaluation).await
+}
+
+/// A Pod that is prepared for these evaluators.
+async fn prepared(evaluation: PlannedEvaluation) -> Pod {
     let bucket = server().await.bucket().await;
     let mut run = run(&bucket);
-    run.plan.evaluation = container_run().plan.evaluation;
+    run.plan.evaluation = evaluation;
     let pod = Pod::on(&server().await.endpoint(), &bucket, run).await;
     pod.prepare().await.unwrap();
     pod
@@ -105,6 +115,35 @@ async fn a_replaced_pod_gives_each_evaluator_its_own_files_back() {
     assert_eq!(read("evaluators/1/result.json"), good.as_bytes());
     assert_eq!(read("evaluators/2/episodes/1.json"), b"{}");
     assert!(!next.path("escaped").exists());
+}
+
+#[tokio::test]
+async fn what_a_command_has_merged_of_results_that_are_refused_does_not_come_back() {
+    let early = r#"{"schema": 1, "done": 7, "total": 10, "final": true, "splits": []}"#;
+    let lost = merging().await;
+    let logcopy = lost.logcopy();
+    lost.reported(|report| report.round >= 1).await;
+    for (worker, text) in [(3, &*result(1, 1, 0.7)), (2, &*result(2, 2, 0.5)), (1, early)] {
+        lost.append(&format!("evaluators/{worker}/console.log"), b"a line\n");
+        put_result(lost.logs(), worker.into(), text);
+        lost.mark(EVALUATOR, worker, Mark::Done);
+    }
+    lost.until_has(StatusFile::Stored).await;
+    logcopy.end().await;
+    let unusable = lost.report().await.unwrap().unusable.unwrap();
+    assert_eq!(unusable.worker, Some(1), "{unusable}");
+    assert!(lost.stored("evaluators/3/result.json").await.is_some());
+
+    let next = lost.replaced("pod-2").await;
+    next.prepare().await.unwrap();
+    for (path, is_there) in [
+        ("evaluators/1/result.json", false),
+        ("evaluators/2/result.json", true),
+        ("evaluators/3/result.json", false),
+        ("evaluators/3/console.log", true),
+    ] {
+        assert_eq!(next.path(path).exists(), is_there, "{path}");
+    }
 }
 
 #[tokio::test]

@@ -50,8 +50,9 @@ pub async fn restore(
     }
     let (objects, input) = input::take(run, archive, tree, listing.objects).await?;
     let (limit, workers) = (run.plan.storage.s3.size_limit.bytes(), run.plan.workers());
+    let merger = run.plan.merger().and(Pair::first(workers).last());
     let quota = Quota::new(limit, workers, of_plan(&run.plan).host());
-    let chosen = choose(objects, &quota, workers, run.plan.sharing());
+    let chosen = choose(objects, &quota, workers, merger);
     if chosen.left_out > 0 {
         tracing::warn!(
             objects = chosen.left_out,
@@ -132,18 +133,23 @@ struct Chosen {
 }
 
 /// Chooses objects: results and known logs first, then the smallest, so that no flood and no huge file keeps a checkpoint out.
-fn choose(objects: Vec<Listed>, quota: &Quota, pairs: usize, sharing: usize) -> Chosen {
+fn choose(objects: Vec<Listed>, quota: &Quota, pairs: usize, merger: Option<Pair>) -> Chosen {
     let not_counted = [OWNER_KEY, REPORT_KEY, FAILURE_LOG_KEY];
     let (of_workers, objects) = checkpoints_of_workers(objects, quota, pairs);
     // With another number of evaluators each had another share, and the run begins anew. Each has a log; that of a command that merges them
     // comes last.
     let evaluators = objects.iter().filter_map(|object| evaluator_of(&object.key)).max();
+    let sharing = pairs.saturating_sub(usize::from(merger.is_some()));
     let are_ours = evaluators.is_some_and(|last| (sharing..=pairs).contains(&usize::from(last.get())));
+    // To merge again is cheap, and an evaluator whose result was refused judges anew.
+    let merged = merger.map(result_path);
     let (mut objects, mut others): (Vec<_>, Vec<_>) = objects
         .into_iter()
         .filter(|object| !not_counted.contains(&object.key.as_str()))
         .partition(|Listed { key, .. }| {
-            is_restored(key, pairs) && (!is_evaluators(key) || (are_ours && evaluator_of(key).is_some()))
+            is_restored(key, pairs)
+                && (!is_evaluators(key) || (are_ours && evaluator_of(key).is_some()))
+                && merged.as_ref() != Some(key)
         });
     let all = objects.len();
     let shadowed = shadowed(&objects);
@@ -313,7 +319,7 @@ mod tests {
             listed("logcopy/logcopy.log", 40),
             listed("submission/forged.csv", 5),
         ];
-        let chosen = choose(objects, &Quota::new(MIB, 2, Host::Simulator), 2, 2);
+        let chosen = choose(objects, &Quota::new(MIB, 2, Host::Simulator), 2, None);
         let expected = [
             "agent/agent1/agent_results.json",
             "agent/agent2/leaderboard.log",
@@ -344,7 +350,7 @@ mod tests {
             ),
         ] {
             let objects = keys.iter().map(|key| listed(key, 10)).collect();
-            let chosen = choose(objects, &Quota::new(MIB, 2, Host::Simulator), 2, 2);
+            let chosen = choose(objects, &Quota::new(MIB, 2, Host::Simulator), 2, None);
             let found: Vec<_> = chosen.of_workers.iter().map(|object| object.key.clone()).collect();
             assert_eq!(found, taken, "{keys:?}");
             assert!(
@@ -353,7 +359,7 @@ mod tests {
             );
         }
         let large = vec![listed(&partial("1"), 2 * MIB), listed(&partial("2"), 10)];
-        let chosen = choose(large, &Quota::new(MIB, 2, Host::Simulator), 2, 2);
+        let chosen = choose(large, &Quota::new(MIB, 2, Host::Simulator), 2, None);
         assert_eq!(chosen.of_workers.len(), 1, "within the limit of the run");
     }
 
@@ -374,21 +380,23 @@ mod tests {
             (vec!["1", "2", "02", "x", "0", "1000"], 6),
         ] {
             let quota = Quota::new(MIB, 2, Host::Evaluator);
-            let chosen = choose(results(&stored), &quota, 2, 2);
+            let chosen = choose(results(&stored), &quota, 2, None);
             assert_eq!(chosen.objects.len(), restored, "{stored:?}: {:?}", keys(&chosen));
             assert_eq!(chosen.left_out, 0, "{stored:?}");
             let first = chosen.objects.first().map_or("result.json", |object| &object.key);
             assert!(first.ends_with("result.json"), "{stored:?}");
         }
-        // The third merges the results of the two, and may not have begun.
+        // The third merges the results of the two, and may not have begun. Its result does not come back.
         for (stored, restored) in [
             (vec!["1"], 0),
             (vec!["1", "2"], 6),
-            (vec!["1", "2", "3"], 9),
+            (vec!["1", "2", "3"], 8),
             (vec!["4"], 0),
         ] {
-            let chosen = choose(results(&stored), &Quota::new(MIB, 3, Host::Evaluator), 3, 2);
+            let quota = Quota::new(MIB, 3, Host::Evaluator);
+            let chosen = choose(results(&stored), &quota, 3, Pair::new(3));
             assert_eq!(chosen.objects.len(), restored, "{stored:?}: {:?}", keys(&chosen));
+            assert!(!keys(&chosen).contains(&"evaluators/3/result.json"), "{stored:?}");
         }
     }
 
@@ -404,7 +412,7 @@ mod tests {
             "simulator/x",
         ];
         let objects = objects.iter().map(|key| listed(key, 1)).collect();
-        let chosen = choose(objects, &Quota::new(MIB, 2, Host::Simulator), 2, 2);
+        let chosen = choose(objects, &Quota::new(MIB, 2, Host::Simulator), 2, None);
         assert_eq!((keys(&chosen), chosen.left_out), (vec!["simulator/x"], 6));
     }
 
@@ -416,7 +424,7 @@ mod tests {
             listed("simulator/a-b", 1),
         ];
         assert_eq!(
-            keys(&choose(objects, &Quota::new(MIB, 1, Host::Simulator), 1, 1)),
+            keys(&choose(objects, &Quota::new(MIB, 1, Host::Simulator), 1, None)),
             ["simulator/a-b", "simulator/a/b"]
         );
     }
@@ -430,7 +438,7 @@ mod tests {
             listed("logcopy/report.json", 5),
             listed("plain", 6),
         ];
-        let chosen = choose(objects, &Quota::new(MIB, 2, Host::Simulator), 2, 2);
+        let chosen = choose(objects, &Quota::new(MIB, 2, Host::Simulator), 2, None);
         assert_eq!(keys(&chosen), Vec::<&str>::new());
         let others: Vec<&str> = chosen.others.iter().map(|object| object.key.as_str()).collect();
         let expected = [
@@ -451,7 +459,7 @@ mod tests {
             listed("agent/agent1/b", 9),
             listed("agent/agent1/c", 10),
         ];
-        let chosen = choose(objects, &Quota::new(MIB, 1, Host::Simulator), 1, 1);
+        let chosen = choose(objects, &Quota::new(MIB, 1, Host::Simulator), 1, None);
         let expected = [
             "agent/agent1/agent_results.json",
             "agent/agent1/leaderboard.log",
