@@ -106,9 +106,11 @@ impl Cause {
         E: ProvideErrorMetadata + std::error::Error + 'static,
     {
         let status = status(error);
+        let sentence = fault::sentence(error);
+        // Without a message it names the status itself.
         let text = match status {
-            Some(status) => format!("status {status}, {}", fault::sentence(error)),
-            None => fault::sentence(error),
+            Some(status) if !sentence.ends_with(&format!("(HTTP {status})")) => format!("status {status}, {sentence}"),
+            _ => sentence,
         };
         match (status, error.code()) {
             (_, Some("NoSuchBucket")) => Self::NoBucket,
@@ -126,4 +128,30 @@ impl Cause {
 /// The status of an answer that the SDK takes for an error.
 pub(super) fn status<E>(error: &SdkError<E, HttpResponse>) -> Option<u16> {
     error.raw_response().map(|response| response.status().as_u16())
+}
+
+#[cfg(test)]
+mod tests {
+    use aws_sdk_s3::error::ErrorMetadata;
+    use aws_sdk_s3::operation::get_object::GetObjectError;
+    use aws_sdk_s3::primitives::SdkBody;
+
+    use super::*;
+
+    #[test]
+    fn a_refusal_names_its_status_once() {
+        let cause = |message: Option<&str>| {
+            let mut answer = ErrorMetadata::builder().code("AccessDenied");
+            if let Some(message) = message {
+                answer = answer.message(message);
+            }
+            let raw = HttpResponse::new(403_u16.try_into().unwrap(), SdkBody::empty());
+            Cause::of(&SdkError::service_error(GetObjectError::generic(answer.build()), raw)).to_string()
+        };
+        assert_eq!(cause(None), "S3 denies access (AccessDenied (HTTP 403))");
+        assert_eq!(
+            cause(Some("Not yours.")),
+            "S3 denies access (status 403, AccessDenied: Not yours.)"
+        );
+    }
 }
