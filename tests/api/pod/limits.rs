@@ -1,6 +1,8 @@
 //! Limits of a run: every byte and every object that it stores or sends counts, over restarts too. An agent cannot hide a log or keep a
 //! report back.
 
+use std::time::Instant;
+
 use leaderboard_contract::keys::{COLLECTED, known_logs};
 
 use super::shelf::Shelf;
@@ -238,6 +240,51 @@ async fn what_the_evaluators_read_arrives_however_long_it_takes_and_keeps_no_rep
     shelf.until(|shelf| is_stored(shelf, LARGE)).await;
     assert_eq!(shelf.aborted(LARGE), 0);
     logcopy.end().await;
+}
+
+/// The last files of a run, in the order in which they are stored: the first of what the evaluators read is on its way beside the rounds,
+/// and arrives if it is found. Returns what was sent, too.
+async fn last_files(is_found: bool, time: Duration) -> (Vec<String>, Sent) {
+    const LARGE: &str = "input/large";
+    const LOG: &str = "agent/agent1/leaderboard.log";
+    let (shelf, pod) = shelved().await;
+    pod.put(LARGE, &noise(20 * MIB, 1));
+    pod.put("input/late", b"x");
+    pod.put(LOG, b"x");
+    let tree = Tree::open(pod.logs()).unwrap();
+    let wanted = |path: &str| Wanted::new(path, tree.file(path).unwrap().unwrap().1, Haste::Now);
+    let (mut uploader, before) = (pod.uploader(), shelf.order().len());
+    shelf.lose(LARGE);
+    uploader.sync(&[wanted(LARGE)], Window::default()).await.unwrap();
+    shelf.until(|shelf| shelf.begun(LARGE) == 1).await;
+
+    let until = Instant::now().checked_add(time);
+    let last = Window {
+        begin_until: until,
+        cut_at: until,
+        is_last: true,
+        ..Window::default()
+    };
+    let files = [LARGE, "input/late", LOG].map(wanted);
+    let finding = async {
+        shelf.until(|shelf| shelf.order().len() > before).await;
+        if is_found {
+            shelf.find(LARGE);
+        }
+    };
+    let (sent, ()) = tokio::join!(uploader.sync(&files, last), finding);
+    assert_eq!(shelf.begun(LARGE), 1, "it is not begun again");
+    (shelf.order().split_off(before), sent.unwrap())
+}
+
+#[tokio::test]
+async fn what_the_evaluators_read_goes_on_to_arrive_at_the_end_while_there_is_time() {
+    let (order, sent) = last_files(true, PATIENCE).await;
+    assert_eq!(order, ["agent/agent1/leaderboard.log", "input/large", "input/late"]);
+    assert_eq!((sent.objects, sent.late, sent.left_out), (3, 0, 0));
+    let (order, sent) = last_files(false, Duration::from_secs(3)).await;
+    assert_eq!(order, ["agent/agent1/leaderboard.log"]);
+    assert_eq!((sent.objects, sent.late, sent.left_out), (1, 2, 0));
 }
 
 #[tokio::test]

@@ -21,6 +21,8 @@ struct State {
     objects: BTreeMap<String, Stored>,
     /// Keys as they were stored, each time.
     order: Vec<String>,
+    /// Keys whose uploads in parts were begun.
+    begun: Vec<String>,
     /// Keys whose uploads were given up.
     aborted: Vec<String>,
     /// Keys for which no content arrives.
@@ -63,6 +65,12 @@ impl Shelf {
     /// The keys that were stored, in order; each as often as it was.
     pub(super) fn order(&self) -> Vec<String> {
         self.state.borrow().order.clone()
+    }
+
+    /// How often an upload in parts to the key was begun.
+    pub(super) fn begun(&self, key: &str) -> usize {
+        let state = self.state.borrow();
+        state.begun.iter().filter(|begun| *begun == key).count()
     }
 
     /// How often an upload to the key was given up.
@@ -119,6 +127,7 @@ impl State {
             }
             Method::PUT => self.put(key, body),
             Method::POST if query.contains("uploads") => {
+                self.begun.push(key.to_owned());
                 "<InitiateMultipartUploadResult><UploadId>u</UploadId></InitiateMultipartUploadResult>".into_response()
             }
             Method::POST if query.contains("uploadId=") => {

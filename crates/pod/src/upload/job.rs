@@ -172,7 +172,7 @@ impl Job {
 }
 
 /// Output of the work; `None` if it takes longer than until then.
-async fn in_time<T>(until: Option<Instant>, work: impl Future<Output = T>) -> Option<T> {
+pub(super) async fn in_time<T>(until: Option<Instant>, work: impl Future<Output = T>) -> Option<T> {
     match until {
         Some(until) => tokio::time::timeout_at(until.into(), work).await.ok(),
         None => Some(work.await),

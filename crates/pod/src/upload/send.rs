@@ -10,10 +10,10 @@ use std::time::{Duration, Instant};
 
 use futures::StreamExt;
 use tokio::sync::Semaphore;
-use tokio::task::JoinSet;
+use tokio::task::{JoinError, JoinSet};
 
 use super::complaints::{Complaints, Why};
-use super::job::{Job, Outcome, put};
+use super::job::{Job, Outcome, in_time, put};
 use super::quota::{Kind, Ledger, Quota, cost};
 use super::wanted::Wanted;
 use super::{Decision, Memory, Stored, decide_upload};
@@ -70,7 +70,7 @@ pub struct Uploader {
     complaints: Complaints,
     /// Files that were cut.
     slow: BTreeMap<String, Slow>,
-    /// What the evaluators read, on its way beside the rounds: it may take longer than one, and its end ends no round.
+    /// What the evaluators read, on its way beside the rounds: it may take longer than one. What fails there fails the next round.
     beside: JoinSet<(String, Outcome)>,
 }
 
@@ -140,15 +140,42 @@ impl Uploader {
     /// Stores what is due, the known logs first, as far as several at once allow. The first failure of S3 ends it; what was
     /// stored until then is remembered.
     pub async fn sync(&mut self, files: &[Wanted], window: Window) -> Result<Sent, ArchiveError> {
+        let sent = self.pass(files, window).await?;
+        if !window.is_last || self.beside.is_empty() {
+            return Ok(sent);
+        }
+        let landed = self.land(window.cut_at).await?;
+        // It sends what was not on its way yet, and counts what is missing.
+        let rest = self.pass(files, window).await?;
+        let objects = sent.objects.saturating_add(landed.objects);
+        let objects = objects.saturating_add(rest.objects);
+        Ok(Sent { objects, ..rest })
+    }
+
+    /// Waits for what is on its way beside the rounds, and gives up what still is when the time is over.
+    async fn land(&mut self, cut_at: Option<Instant>) -> Result<Sent, ArchiveError> {
+        let (mut sent, mut failed) = (Sent::default(), None);
+        let all = async {
+            while let Some(ended) = self.beside.join_next().await {
+                let outcome = outcome_of(ended).into_iter().collect();
+                failed = self.settle(outcome, None, &mut sent).or(failed.take());
+            }
+        };
+        let _ = in_time(cut_at, all).await;
+        self.give_up();
+        self.remember().await;
+        failed.map_or(Ok(sent), Err)
+    }
+
+    /// One pass over the files.
+    async fn pass(&mut self, files: &[Wanted], window: Window) -> Result<Sent, ArchiveError> {
         let began = Instant::now();
         let mut sent = Sent::default();
         self.memory.sent.begin(today());
-        let arrived: Vec<_> = std::iter::from_fn(|| self.beside.try_join_next()).flatten().collect();
+        let arrived = std::iter::from_fn(|| self.beside.try_join_next());
+        let arrived: Vec<_> = arrived.filter_map(outcome_of).collect();
         let mut has_changed = !arrived.is_empty();
         let failed_beside = self.settle(arrived, None, &mut sent);
-        if window.is_last {
-            self.give_up();
-        }
         let (jobs, left_out) = self.due(files, window);
         sent.left_out = sent.left_out.saturating_add(left_out.len());
         for (key, why) in &left_out {
@@ -345,6 +372,16 @@ impl Uploader {
             tracing::warn!("what is stored can't be noted down, a restart will send it again: {error}");
         }
     }
+}
+
+/// What became of an upload beside the rounds.
+fn outcome_of(ended: Result<(String, Outcome), JoinError>) -> Option<(String, Outcome)> {
+    let logged = ended.inspect_err(|error| {
+        if !error.is_cancelled() {
+            tracing::error!("an upload of what the evaluators read broke off, and is begun again: {error}");
+        }
+    });
+    logged.ok()
 }
 
 /// Stores files. After a failure, or the end of the window, none begins. Those under way end or are cut, so that each is remembered.
