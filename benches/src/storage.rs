@@ -181,6 +181,7 @@ fn report(is_final: bool) -> Report {
         total: ROUTES,
         unit: "routes".into(),
         workers: (1..=PAIRS).map(worker).collect(),
+        merger: None,
         score: Some(Metric::new("Driving score", 41.25, 2)),
         metrics: vec![
             Metric::new("Route completion", 75.5, 2),

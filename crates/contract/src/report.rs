@@ -79,6 +79,9 @@ pub struct Report {
     pub unit: String,
     /// Each worker, from 1.
     pub workers: Vec<ReportWorker>,
+    /// The worker among them whose command merges the results of all others, if there is one.
+    #[serde(default, skip_serializing_if = "Option::is_none")]
+    pub merger: Option<u32>,
     /// The number that ranks the run: over what is done, or of the whole run when final.
     #[serde(default, skip_serializing_if = "Option::is_none")]
     pub score: Option<Metric>,

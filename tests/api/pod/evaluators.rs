@@ -1,6 +1,6 @@
 //! The Pod of a host's own evaluators: what it stores, reports and takes up.
 
-use leaderboard_api::EvaluationMode;
+use leaderboard_api::{EvaluationMode, MergeMethod};
 use leaderboard_contract::report::{Outcome, RefusedResults};
 use leaderboard_evaluation::fixtures::{container_run, merging_run, put_result, result};
 
@@ -146,9 +146,54 @@ async fn what_a_command_has_merged_of_results_that_are_refused_does_not_come_bac
     }
 }
 
+/// The plan of so many workers.
+fn planned(workers: i32, merge: MergeMethod) -> PlannedEvaluation {
+    let mut evaluation = container_run().plan.evaluation;
+    if let PlannedEvaluation::Container(container) = &mut evaluation {
+        (container.workers, container.merge) = (workers, merge);
+    }
+    evaluation
+}
+
+#[tokio::test]
+async fn what_evaluators_with_other_shares_have_left_comes_back_in_no_later_pod() {
+    use MergeMethod::{Command, Mean};
+    for (before, after) in [
+        ((2, Mean), (3, Mean)),
+        ((3, Mean), (2, Mean)),
+        // Both have three workers.
+        ((3, Mean), (2, Command)),
+        ((2, Command), (3, Mean)),
+    ] {
+        let what = format!("{before:?} {after:?}");
+        let lost = prepared(planned(before.0, before.1)).await;
+        for worker in 1..=3 {
+            let key = format!("evaluators/{worker}/half.json");
+            lost.archive.put(&key, b"{}".to_vec()).await.unwrap();
+        }
+        let mut next = lost.replaced("pod-2").await;
+        next.setting.run.plan.evaluation = planned(after.0, after.1);
+        next.prepare().await.unwrap();
+        let logcopy = next.logcopy();
+        next.append("evaluators/2/console.log", b"a line\n");
+        until(|| async { next.stored("evaluators/2/console.log").await }).await;
+        logcopy.end().await;
+
+        let last = next.replaced("pod-3").await;
+        last.prepare().await.unwrap();
+        assert!(last.path("evaluators/2/console.log").exists(), "{what}");
+        for worker in 1..=3 {
+            for pod in [&next, &last] {
+                let path = pod.path(&format!("evaluators/{worker}/half.json"));
+                assert!(!path.exists(), "{what}: {}", path.display());
+            }
+        }
+    }
+}
+
 #[tokio::test]
 async fn only_where_results_were_refused_a_new_attempt_goes_on_without_the_final_ones() {
-    let first = evaluated().await.report().await.unwrap();
+    let first = merging().await.report().await.unwrap();
     let ended = Report {
         is_final: true,
         unusable: Some(RefusedResults::new(Some(2), "torn")),
@@ -180,7 +225,7 @@ async fn only_where_results_were_refused_a_new_attempt_goes_on_without_the_final
         ("a lost node", 2, &lost, true),
         ("a lost node at the beginning", 2, &first, true),
     ] {
-        let before = evaluated().await;
+        let before = merging().await;
         for (key, bytes) in [
             ("evaluators/1/result.json", result(2, 2, 0.5).into_bytes()),
             ("evaluators/1/games.json", b"{}".to_vec()),
@@ -191,7 +236,6 @@ async fn only_where_results_were_refused_a_new_attempt_goes_on_without_the_final
         }
         let mut next = before.replaced("pod-2").await;
         next.setting.run.attempt = Attempt(attempt);
-        next.setting.run.plan.evaluation = merging_run(EvaluationMode::Interactive).plan.evaluation;
         next.prepare().await.unwrap();
         let path = "evaluators/1/result.json";
         assert_eq!(next.path(path).exists(), is_kept, "{what}");

@@ -139,6 +139,7 @@ pub fn report(submission_uid: String, pod_uid: String, done: u32) -> Report {
             state: WorkerState::Running,
             names_crash: false,
         }],
+        merger: None,
         score: Some(Metric::new("Driving score", score, 2)),
         metrics: Vec::new(),
         is_final: is_last,

@@ -39,6 +39,7 @@ pub fn describe(run: &Run, pod_uid: &str, gathered: &Gathered, ending: Option<&E
         total,
         unit: words(Some(&run.plan)).units.to_owned(),
         workers: gathered.workers.clone(),
+        merger: run.plan.merger().and_then(|merger| u32::try_from(merger).ok()),
         score: merged.and_then(|merged| merged.score.clone()),
         metrics: merged.map(|merged| merged.metrics.clone()).unwrap_or_default(),
         is_final: ending.is_some(),

@@ -6,7 +6,7 @@
 //! The newest pipeline before this operator (carla-simulator/leaderboard-cloud, one Job for each worker) has the checkpoints of its
 //! workers at other keys. They are restored to where a pair's is.
 
-use std::collections::BTreeSet;
+use std::collections::{BTreeMap, BTreeSet};
 use std::sync::Arc;
 
 use futures::{StreamExt, TryStreamExt};
@@ -16,6 +16,7 @@ use crate::blocking;
 use crate::daily::Daily;
 use crate::upload::quota::{LEAST, Quota};
 use crate::upload::{Memory, Stored, fingerprint};
+use leaderboard_api::RunPlan;
 use leaderboard_api::evaluator_result::{MAX_BYTES, parse};
 use leaderboard_api::names::FAILURE_LOG_KEY;
 use leaderboard_aws::archive::{Archive, ArchiveError, Listed};
@@ -40,15 +41,7 @@ pub async fn restore(
     archive: &Archive,
     tree: &Arc<Tree>,
 ) -> Result<(), WorkspaceError> {
-    let statuses = archive.list(&format!("{STATUS_FOLDER}/"), MAX_OBJECTS).await?;
-    remove(archive, statuses.objects).await?;
-    remove_refused(run, archive).await?;
-
-    let listing = archive.list("", MAX_OBJECTS).await?;
-    if !listing.complete {
-        tracing::warn!("the prefix holds more than {MAX_OBJECTS} objects; the rest is not restored");
-    }
-    let (objects, input) = input::take(run, archive, tree, listing.objects).await?;
+    let (objects, input) = usable(run, archive, tree).await?;
     let (limit, workers) = (run.plan.storage.s3.size_limit.bytes(), run.plan.workers());
     let merger = run.plan.merger().and(Pair::first(workers).last());
     let quota = Quota::new(limit, workers, of_plan(&run.plan).host());
@@ -86,6 +79,28 @@ pub async fn restore(
     memory.save(tree).map_err(|error| volume("logcopy", error))
 }
 
+/// The stored objects that the run may go on with, and what is stored of its input. Removes what it must not go on with.
+async fn usable(
+    run: &Run,
+    archive: &Archive,
+    tree: &Arc<Tree>,
+) -> Result<(Vec<Listed>, BTreeMap<String, Stored>), WorkspaceError> {
+    let statuses = archive.list(&format!("{STATUS_FOLDER}/"), MAX_OBJECTS).await?;
+    remove(archive, statuses.objects).await?;
+    let report = last_report(archive).await?;
+    remove_refused(run, archive, report.as_ref()).await?;
+    let listing = archive.list("", MAX_OBJECTS).await?;
+    if !listing.complete {
+        tracing::warn!("the prefix holds more than {MAX_OBJECTS} objects; the rest is not restored");
+    }
+    let (mut objects, input) = input::take(run, archive, tree, listing.objects).await?;
+    if !are_ours(&run.plan, report.as_ref(), &objects) {
+        let of_others = objects.extract_if(.., |object| is_evaluators(&object.key));
+        remove(archive, of_others.collect()).await?;
+    }
+    Ok((objects, input))
+}
+
 pub(super) async fn remove(archive: &Archive, objects: Vec<Listed>) -> Result<(), WorkspaceError> {
     let keys: Vec<String> = objects.into_iter().map(|object| object.key).collect();
     Ok(archive.delete(&keys).await?)
@@ -93,8 +108,8 @@ pub(super) async fn remove(archive: &Archive, objects: Vec<Listed>) -> Result<()
 
 /// Removes the final results of evaluators where an attempt before this one has ended because of its results: an evaluator does not start
 /// beside a final one, so a corrected one would judge nothing.
-async fn remove_refused(run: &Run, archive: &Archive) -> Result<(), ArchiveError> {
-    let is_refused = |report: Report| {
+async fn remove_refused(run: &Run, archive: &Archive, report: Option<&Report>) -> Result<(), ArchiveError> {
+    let is_refused = |report: &Report| {
         let fault = report.refused.as_ref().or(report.unusable.as_ref());
         let worker = fault.and_then(|fault| usize::try_from(fault.worker?).ok());
         // The results that a command merges are not its fault.
@@ -102,7 +117,7 @@ async fn remove_refused(run: &Run, archive: &Archive) -> Result<(), ArchiveError
         let is_own = report.belongs_to(&run.uid, run.attempt);
         fault.is_some() && report.is_final && report.stopped.is_none() && !is_mergers && !is_own
     };
-    if run.plan.container().is_none() || !last_report(archive).await?.is_some_and(is_refused) {
+    if run.plan.container().is_none() || !report.is_some_and(is_refused) {
         return Ok(());
     }
     let mut finals = Vec::new();
@@ -114,6 +129,24 @@ async fn remove_refused(run: &Run, archive: &Archive) -> Result<(), ArchiveError
         }
     }
     archive.delete(&finals).await
+}
+
+/// True if evaluators that share the work as this plan's do have stored what lies below [`EVALUATORS`]. With another number of them each had
+/// another share, and the run begins anew.
+fn are_ours(plan: &RunPlan, report: Option<&Report>, objects: &[Listed]) -> bool {
+    let (workers, merger) = (
+        plan.workers(),
+        plan.merger().and_then(|merger| u32::try_from(merger).ok()),
+    );
+    match report {
+        _ if plan.container().is_none() => true,
+        Some(report) => report.workers.len() == workers && report.merger == merger,
+        None => {
+            // Each has a log; that of a command that merges them comes last.
+            let last = objects.iter().filter_map(|object| evaluator_of(&object.key)).max();
+            last.is_some_and(|last| (plan.sharing()..=workers).contains(&usize::from(last.get())))
+        }
+    }
 }
 
 /// Objects whose content is not known.
@@ -136,11 +169,6 @@ struct Chosen {
 fn choose(objects: Vec<Listed>, quota: &Quota, pairs: usize, merger: Option<Pair>) -> Chosen {
     let not_counted = [OWNER_KEY, REPORT_KEY, FAILURE_LOG_KEY];
     let (of_workers, objects) = checkpoints_of_workers(objects, quota, pairs);
-    // With another number of evaluators each had another share, and the run begins anew. Each has a log; that of a command that merges them
-    // comes last.
-    let evaluators = objects.iter().filter_map(|object| evaluator_of(&object.key)).max();
-    let sharing = pairs.saturating_sub(usize::from(merger.is_some()));
-    let are_ours = evaluators.is_some_and(|last| (sharing..=pairs).contains(&usize::from(last.get())));
     // To merge again is cheap, and an evaluator whose result was refused judges anew.
     let merged = merger.map(result_path);
     let (mut objects, mut others): (Vec<_>, Vec<_>) = objects
@@ -148,7 +176,7 @@ fn choose(objects: Vec<Listed>, quota: &Quota, pairs: usize, merger: Option<Pair
         .filter(|object| !not_counted.contains(&object.key.as_str()))
         .partition(|Listed { key, .. }| {
             is_restored(key, pairs)
-                && (!is_evaluators(key) || (are_ours && evaluator_of(key).is_some()))
+                && (!is_evaluators(key) || evaluator_of(key).is_some_and(|one| one.index() < pairs))
                 && merged.as_ref() != Some(key)
         });
     let all = objects.len();
@@ -281,6 +309,8 @@ fn fingerprint_of(tree: &Tree, path: &str) -> Result<Option<(String, Stamp)>, Tr
 
 #[cfg(test)]
 mod tests {
+    use leaderboard_api::EvaluationMode;
+    use leaderboard_evaluation::fixtures::{container_run, merging_run};
     use leaderboard_protocol::files::Host;
 
     use super::*;
@@ -364,39 +394,33 @@ mod tests {
     }
 
     #[test]
-    fn evaluators_go_on_where_as_many_have_been() {
-        let results = |workers: &[&str]| -> Vec<Listed> {
-            let keys = workers.iter().flat_map(|worker| {
-                ["console.log", "result.json", "games.json"].map(|file| format!("evaluators/{worker}/{file}"))
-            });
-            keys.map(|key| listed(&key, 10)).collect()
-        };
-        for (stored, restored) in [
-            (vec!["1", "2"], 6),
-            // The first has no result yet.
-            (vec!["2"], 3),
-            (vec!["1"], 0),
-            (vec!["1", "2", "3"], 0),
-            (vec!["1", "2", "02", "x", "0", "1000"], 6),
-        ] {
-            let quota = Quota::new(MIB, 2, Host::Evaluator);
-            let chosen = choose(results(&stored), &quota, 2, None);
-            assert_eq!(chosen.objects.len(), restored, "{stored:?}: {:?}", keys(&chosen));
-            assert_eq!(chosen.left_out, 0, "{stored:?}");
-            let first = chosen.objects.first().map_or("result.json", |object| &object.key);
-            assert!(first.ends_with("result.json"), "{stored:?}");
+    fn of_evaluators_all_but_what_a_command_has_merged_comes_back() {
+        let workers = ["1", "2", "02", "x", "0", "3", "1000"];
+        let of_worker =
+            |worker| ["console.log", "result.json", "games.json"].map(|file| format!("evaluators/{worker}/{file}"));
+        let objects: Vec<Listed> = workers.iter().flat_map(of_worker).map(|key| listed(&key, 10)).collect();
+        for (pairs, merger, restored) in [(2, None, 6), (3, None, 9), (3, Pair::new(3), 8)] {
+            let quota = Quota::new(MIB, pairs, Host::Evaluator);
+            let chosen = choose(objects.clone(), &quota, pairs, merger);
+            let keys = keys(&chosen);
+            assert_eq!((keys.len(), chosen.left_out), (restored, 0), "{merger:?}: {keys:?}");
+            assert!(keys[0].ends_with("result.json"), "{merger:?}: {keys:?}");
+            assert_eq!(keys.contains(&"evaluators/3/result.json"), restored == 9, "{merger:?}");
         }
-        // The third merges the results of the two, and may not have begun. Its result does not come back.
-        for (stored, restored) in [
-            (vec!["1"], 0),
-            (vec!["1", "2"], 6),
-            (vec!["1", "2", "3"], 8),
-            (vec!["4"], 0),
-        ] {
-            let quota = Quota::new(MIB, 3, Host::Evaluator);
-            let chosen = choose(results(&stored), &quota, 3, Pair::new(3));
-            assert_eq!(chosen.objects.len(), restored, "{stored:?}: {:?}", keys(&chosen));
-            assert!(!keys(&chosen).contains(&"evaluators/3/result.json"), "{stored:?}");
+    }
+
+    #[test]
+    fn without_a_report_evaluators_go_on_where_as_many_have_been() {
+        let of_two = [("12", true), ("2", true), ("1", false), ("123", false)];
+        // The third merges the results of the two, and may not have begun.
+        let of_command = [("1", false), ("12", true), ("123", true), ("4", false)];
+        let merging = merging_run(EvaluationMode::Interactive);
+        for (run, stored) in [(container_run(), of_two), (merging, of_command)] {
+            for (workers, expected) in stored {
+                let keys = workers.chars().map(|worker| format!("evaluators/{worker}/console.log"));
+                let objects: Vec<Listed> = keys.map(|key| listed(&key, 10)).collect();
+                assert_eq!(are_ours(&run.plan, None, &objects), expected, "{workers}");
+            }
         }
     }
 

@@ -403,6 +403,7 @@ pub fn report(done: u32) -> Report {
         total: 4,
         unit: "routes".into(),
         workers: vec![worker(1), worker(2)],
+        merger: None,
         score: (done > 0).then(|| Metric::new("Driving score", 41.2, 2)),
         metrics: if done > 0 {
             vec![Metric::new("Route completion", 90.0, 2)]
