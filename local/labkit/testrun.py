@@ -49,7 +49,7 @@ OPERATOR = "leaderboard-operator"
 # Tests of the API server that run at once, as they wait most of their time for controllers.
 AT_ONCE = 6
 # The most tests of the cluster that do, which wait for the kubelet. How many in fact is what tests/support/cluster/turns.rs finds.
-MOST_AT_ONCE = 10
+MOST_AT_ONCE = 8
 # Tests that disturb every other one, all of them ignored unless named: they run alone, after the others.
 ALONE = "cluster::restarts::"
 # A backtrace pushes the message out of what is kept of a long log; `cargo test` itself still gives one.

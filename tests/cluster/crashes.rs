@@ -19,7 +19,7 @@ use crate::scene::{Scene, containers, done, say, scenario};
 /// Kills happen when the status has so many routes. It is behind the run on a busy machine: after the last one each pair that is
 /// furthest has two routes left.
 const MOMENTS: [i32; 5] = [1, 3, 5, 7, 10];
-const ROUTE_MS: &str = "6000";
+const ROUTE_MS: &str = "10000";
 const ROUTES: usize = 20;
 const PAIRS: usize = 4;
 /// Restarted containers and Pods wait for the kubelet, which doubles its pauses.

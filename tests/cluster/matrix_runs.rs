@@ -217,7 +217,7 @@ fn of_simulators() -> Vec<Row> {
                 // the way of the stop.
                 json!({
                     "deadlines": {"idleSeconds": 15}, "retries": {"perWorker": 0},
-                    "agent": {"env": [{"name": "ROUTE_MS", "value": "5000"}]},
+                    "agent": {"env": [{"name": "ROUTE_MS", "value": "9000"}]},
                 }),
             ),
             "Failed SimulationCrashed (infrastructure, not charged); 1/2 routes; EvalAI failed",
