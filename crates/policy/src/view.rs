@@ -36,8 +36,7 @@ pub struct View {
     pub pod: Option<PodView>,
     pub node: NodeView,
     pub report: ReportView,
-    pub fence: ObservedFence,
-    pub log: ObservedLog,
+    pub requested: Requested,
     /// None for a submission that is not EvalAI's.
     pub evalai: Option<EvalaiView>,
     /// How long ago this process wrote the status; None: it has not.
@@ -351,6 +350,13 @@ impl ReportView {
             _ => None,
         }
     }
+}
+
+/// What was requested to be stored as a run ends.
+#[derive(Clone, Copy, Debug, Default, PartialEq, Eq)]
+pub struct Requested {
+    pub fence: ObservedFence,
+    pub log: ObservedLog,
 }
 
 /// State of our own mark in `logcopy/owner`. While it is there, a lost Pod stores nothing more.

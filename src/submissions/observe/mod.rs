@@ -22,7 +22,7 @@ use causes::Causes;
 use leaderboard_api::{Leaderboard, Submission, SubmissionStatus};
 use leaderboard_base::clock::Clock;
 use leaderboard_policy::submissions::job_name;
-use leaderboard_policy::view::{NodeView, ObservedJob, PodView, View};
+use leaderboard_policy::view::{NodeView, ObservedJob, PodView, Requested, View};
 use workers::Workers;
 
 /// The sources of a submission's view.
@@ -62,8 +62,10 @@ pub fn observe(uses: Uses<'_>, submission: Arc<Submission>, is_policy_in_place: 
         turn: uses.slots.turn(&submission, board),
         node: node(uses, pod.as_ref()),
         report: reports::seen(&workers.reports.get(key), number, pod_uid),
-        fence: fences::seen(&workers.fences.get(key), number),
-        log: failure_log::seen(&workers.logs.get(key), number, is_over),
+        requested: Requested {
+            fence: fences::seen(&workers.fences.get(key), number),
+            log: failure_log::seen(&workers.logs.get(key), number, is_over),
+        },
         evalai: uses.external.evalai_view(board, &submission, waited),
         record: board.and_then(|board| uses.external.record_view(board, &submission)),
         written_ago: uses.memory.since_write(&submission),

@@ -318,12 +318,12 @@ fn keep_at_end(draft: &mut PlanBuilder<'_>) -> Option<Duration> {
             let log = if has_just_ended {
                 ObservedLog::NotRequested
             } else {
-                draft.view.log
+                draft.view.requested.log
             };
             return stop::log_left(log, Wait::LOG.left(Duration::ZERO));
         }
     }
-    stop::log_left(draft.view.log, None).filter(|_| !has_just_ended)
+    stop::log_left(draft.view.requested.log, None).filter(|_| !has_just_ended)
 }
 
 /// Shown while the row may still turn out otherwise.

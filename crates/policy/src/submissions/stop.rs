@@ -216,7 +216,7 @@ pub(super) fn leaves_lost_pod(draft: &mut PlanBuilder<'_>, job: &JobView) -> boo
 
 /// How long a lost Pod still waits for the fence.
 fn fence_left(draft: &PlanBuilder<'_>) -> Option<Duration> {
-    let waited = match draft.view.fence {
+    let waited = match draft.view.requested.fence {
         // Without a plan the place of the fence is unknown.
         _ if draft.status.plan.is_none() => return None,
         ObservedFence::Held => return None,
@@ -228,7 +228,7 @@ fn fence_left(draft: &PlanBuilder<'_>) -> Option<Duration> {
 
 /// How long the steps after the Pod wait for the fence: only for one that was requested.
 pub(super) fn requested_fence_left(draft: &PlanBuilder<'_>) -> Option<Duration> {
-    fence_left(draft).filter(|_| draft.view.fence != ObservedFence::NotRequested)
+    fence_left(draft).filter(|_| draft.view.requested.fence != ObservedFence::NotRequested)
 }
 
 /// Requests the log of a run that is being stopped for a failure, as far as the end of its Pod would take it away. Returns how
@@ -244,7 +244,7 @@ fn keep_while_there(draft: &mut PlanBuilder<'_>) -> Option<Duration> {
     }
     places.retain(logs::is_on_node);
     draft.act(Action::KeepLog { places });
-    log_left(draft.view.log, Wait::LOG.left(Duration::ZERO))
+    log_left(draft.view.requested.log, Wait::LOG.left(Duration::ZERO))
 }
 
 /// How long a log is still waited for, None if not at all. `at_first` is the answer before the log is requested.

@@ -12,7 +12,7 @@ use crate::submissions::blame::ends::is_crash;
 use crate::submissions::{Action, EvalaiUpdate, Plan, decide, job_name};
 use crate::view::{
     ContainerView, EndView, EvalaiEnd, EvalaiInfo, EvalaiView, JobEnd, JobView, NodeView, ObservedFence, ObservedJob,
-    ObservedLog, ObservedReport, PodView, RecordView, ReportView, Stage, Standing, Turn, View,
+    ObservedLog, ObservedReport, PodView, RecordView, ReportView, Requested, Stage, Standing, Turn, View,
 };
 use leaderboard_api::conditions;
 use leaderboard_api::evalai_status::Status;
@@ -118,8 +118,10 @@ impl World {
                     stage: Some(Stage::JobEnded),
                     ..ReportView::default()
                 },
-                fence: ObservedFence::Held,
-                log: ObservedLog::Kept,
+                requested: Requested {
+                    fence: ObservedFence::Held,
+                    log: ObservedLog::Kept,
+                },
                 evalai: evalai.then_some(known),
                 record: Some(RecordView::default()),
                 ..View::default()

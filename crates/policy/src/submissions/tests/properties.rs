@@ -393,8 +393,8 @@ fn apply(world: &mut World, change: Change) {
         } => {
             world.view.report.stage = stage;
             world.view.report.waited = waited;
-            world.view.fence = fence;
-            world.view.log = log;
+            world.view.requested.fence = fence;
+            world.view.requested.log = log;
         }
         Change::Evalai(view) => world.view.evalai = is_evalais.then_some(*view),
         Change::Recorded(end) => world.view.record.get_or_insert_default().end_written = end,
@@ -453,7 +453,7 @@ proptest! {
         world.view.report.stage = None;
         for _ in 0..12 {
             world.view.report.waited += Duration::from_mins(5);
-            world.view.fence = ObservedFence::Failed(world.view.report.waited);
+            world.view.requested.fence = ObservedFence::Failed(world.view.report.waited);
             if world.view.report.stored == ObservedReport::NotRead {
                 world.view.report.stored = ObservedReport::Absent;
             }

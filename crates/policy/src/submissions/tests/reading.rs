@@ -148,7 +148,7 @@ fn a_lost_pod_is_given_up_with_the_fence_held_or_a_minute_after_it_was_requested
         (ObservedFence::Held, Ok(())),
     ] {
         let mut world = lost();
-        world.view.fence = fence;
+        world.view.requested.fence = fence;
         let plan = world.pass_to(Running, Reason::Replacing);
         assert!(has(&plan, |a| *a == Action::TakeOwnership), "{fence:?}");
         assert_eq!(deletes(&plan), expected.is_ok(), "{fence:?}");
@@ -170,13 +170,13 @@ fn the_next_job_waits_for_a_fence_that_was_requested() {
         let mut world = lost();
         world.pass();
         world.job_gone();
-        world.view.fence = fence;
+        world.view.requested.fence = fence;
         let plan = world.pass();
         assert_eq!(plan.status.retry, i32::from(!waits), "{fence:?}");
         // Somebody else's deletion, in the middle of which the Pod was removed by force.
         let mut world = World::local().running();
         world.job_gone();
-        world.view.fence = fence;
+        world.view.requested.fence = fence;
         assert_eq!(creates(&world.pass()), !waits, "{fence:?}");
     }
 }
@@ -195,7 +195,7 @@ fn a_job_is_deleted_after_a_failure_when_its_log_is_kept_or_was_waited_for() {
         world.see(ended("workspace", 5, "", 3, 1700));
         world.pass();
         world.go_to(1800);
-        world.view.log = log;
+        world.view.requested.log = log;
         let plan = world.pass_to(Pending, Reason::Stopping);
         assert!(has(&plan, |a| matches!(a, Action::KeepLog { .. })));
         assert_eq!(deletes(&plan), expected.is_ok(), "{log:?}");
@@ -205,7 +205,7 @@ fn a_job_is_deleted_after_a_failure_when_its_log_is_kept_or_was_waited_for() {
     }
     // A cancelled run needs no log.
     let mut world = World::local().with_pod();
-    world.view.log = ObservedLog::NotRequested;
+    world.view.requested.log = ObservedLog::NotRequested;
     world.submission().spec.cancel = true;
     assert!(deletes(&world.pass()));
 }
@@ -228,7 +228,7 @@ fn evalai_has_a_failure_with_its_log_or_after_that_was_waited_for() {
         (ObservedLog::GivenUp, vec![EvalaiUpdate::Failed]),
         (ObservedLog::Kept, vec![EvalaiUpdate::Failed]),
     ] {
-        world.view.log = log;
+        world.view.requested.log = log;
         assert_eq!(evalai_updates(&world.pass()), told, "{log:?}");
     }
 }
@@ -240,13 +240,13 @@ fn nothing_is_forgotten_before_the_log_is_stored() {
     world.pass();
     world.complete();
     world.recorded();
-    world.view.log = ObservedLog::NotRequested;
+    world.view.requested.log = ObservedLog::NotRequested;
     let forgets = |plan: &Plan| has(plan, |a| *a == Action::Forget);
     let plan = world.pass_to(Failed, Reason::AgentCrashed);
     assert!(has(&plan, |a| matches!(a, Action::KeepLog { .. })) && !forgets(&plan));
-    world.view.log = ObservedLog::Pending(SECOND);
+    world.view.requested.log = ObservedLog::Pending(SECOND);
     assert!(!forgets(&world.pass()));
-    world.view.log = ObservedLog::Kept;
+    world.view.requested.log = ObservedLog::Kept;
     assert!(forgets(&world.pass()));
 }
 
