@@ -139,7 +139,7 @@ struct Task<K: Watchable> {
     /// Makes the cache complete.
     listed: Sender<bool>,
     watch: Watch<K>,
-    /// Keys that have come before every source has listed once, and are events when they have.
+    /// Keys that came before every source had listed once, or that a list after a refusal has shown: events once a list is complete.
     pending: HashSet<Box<str>>,
 }
 
@@ -173,14 +173,14 @@ impl<K: Watchable> Task<K> {
         match event {
             Event::Apply(item) => {
                 from.probe.running();
-                self.apply(item);
+                self.apply(source, item);
             }
             Event::Delete(item) => {
                 from.probe.running();
-                self.delete(item);
+                self.delete(source, item);
             }
             Event::InitApply(item) => {
-                let key = self.apply(item);
+                let key = self.apply(source, item);
                 self.sources[source].shown.insert(key);
             }
             Event::Init | Event::InitDone => self.list_done(source),
@@ -188,7 +188,7 @@ impl<K: Watchable> Task<K> {
     }
 
     /// Takes an object in, and returns its key. One that can't be read stays as it was last read, because it has not been deleted.
-    fn apply(&mut self, item: Item<K>) -> Box<str> {
+    fn apply(&mut self, source: usize, item: Item<K>) -> Box<str> {
         let mut object = match item.object {
             Ok(object) => object,
             Err(malformed) => {
@@ -209,16 +209,16 @@ impl<K: Watchable> Task<K> {
         let (after, before) = self.watch.store.insert(object);
         match before {
             // The end of an object that was replaced by another one of its name between two reads.
-            Some(before) if before.uid() != after.uid() => self.tell(&before, true),
+            Some(before) if before.uid() != after.uid() => self.tell(source, &before, true),
             // No code here reads most fields of a Pod that its kubelet and the Job controller write.
             Some(before) if after.is_same(&before) => return key,
             _ => {}
         }
-        self.tell(&after, false);
+        self.tell(source, &after, false);
         key
     }
 
-    fn delete(&mut self, item: Item<K>) {
+    fn delete(&mut self, source: usize, item: Item<K>) {
         let (key, last) = match item.object {
             Ok(object) => (key_of(&object), Some(Arc::new(object))),
             Err(malformed) => (malformed.key(), None),
@@ -227,13 +227,15 @@ impl<K: Watchable> Task<K> {
         let known = self.watch.store.evict(&key);
         // No event was sent for an object that never could be read.
         if let Some(last) = last.or(known) {
-            self.tell(&last, true);
+            self.tell(source, &last, true);
         }
     }
 
-    /// Sends an event once the cache is complete. Before that it keeps the name for the end of the list, unless the object is gone.
-    fn tell(&mut self, object: &Arc<K>, is_gone: bool) {
-        if self.watch.store.is_ready() {
+    /// Sends an event once the cache is complete and its source is in sync: a reader that it wakes earlier would not trust the cache. Until
+    /// then it keeps the name for the end of the list, unless the object is gone.
+    fn tell(&mut self, source: usize, object: &Arc<K>, is_gone: bool) {
+        let is_due = is_gone || self.sources[source].is_synced;
+        if is_due && self.watch.store.is_ready() {
             self.watch.feed.push(object, is_gone);
         } else if !is_gone {
             self.pending.insert(key_of(object.as_ref()));

@@ -67,6 +67,22 @@ async fn a_change_that_a_broken_list_has_shown_is_an_event_of_the_next_one() {
     assert_eq!(rig.next().await, event("last", "30", false), "and nothing of b");
 }
 
+#[tokio::test(start_paused = true)]
+async fn a_change_that_a_list_after_a_refusal_shows_is_an_event_once_the_cache_is_in_sync() {
+    let mut rig = rig(vec![list(&[board("a", "1", "3")])]);
+    assert_eq!(rig.next().await, event("a", "3", false));
+    rig.send(vec![status(403, "Forbidden"), page(&[board("a", "1", "20")])]);
+    while rig.watch.store.state().remove(0).resource_version().as_deref() != Some("20") {
+        tokio::time::sleep(Duration::from_millis(10)).await;
+    }
+    assert!(!rig.watch.synced.is_true());
+    let early = timeout(Duration::from_secs(1), rig.events.next()).await;
+    assert!(early.is_err(), "nothing would wake its reader again");
+    rig.send(vec![list(&[])]);
+    assert_eq!(rig.next().await, event("a", "20", false));
+    assert!(rig.watch.synced.is_true());
+}
+
 #[test]
 fn what_nobody_reads_is_not_kept() {
     let mut object = board("a", "1", "3");
