@@ -54,12 +54,12 @@ impl Malformed {
         store::key(self.namespace.as_deref(), &self.name)
     }
 
-    /// Logs that it is left out of a watch.
-    pub(super) fn log(&self, watch: &str) {
+    /// Logs that it is left out of a watch of this kind.
+    pub(super) fn log(&self, kind: &str) {
         let Self {
             namespace, name, error, ..
         } = self;
-        tracing::error!(watch, namespace, name, error, "skipped an object that can't be read");
+        tracing::error!(kind, namespace, name, error, "skipped an object that can't be read");
     }
 }
 

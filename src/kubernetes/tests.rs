@@ -21,6 +21,7 @@ use kube::runtime::watcher::Config;
 use super::preflight::{access_missing, await_kinds};
 use super::*;
 use crate::observability::Observability;
+use crate::observability::logging::tests::Lines;
 use leaderboard_api::Leaderboard;
 use leaderboard_base::shutdown::Stop;
 
@@ -208,6 +209,8 @@ async fn a_list_after_an_expired_watch_reports_only_what_changed_and_what_went_a
 
 #[tokio::test(start_paused = true)]
 async fn a_malformed_object_is_left_out_and_stops_nothing() {
+    let lines = Lines::default();
+    let _guard = lines.collect();
     let mut rig = rig(vec![
         list(&[malformed("bad", "1", "4"), board("a", "2", "5")]),
         Answer::Watch(vec![
@@ -221,6 +224,9 @@ async fn a_malformed_object_is_left_out_and_stops_nothing() {
     assert_eq!(rig.next().await, event("a", "5", false));
     let unreadable = |number: u32| format!("leaderboard_watch_unreadable_objects{{kind=\"Leaderboard\"}} {number}");
     assert!(rig.metric(&unreadable(1)), "it was so in the first list");
+    let logged = lines.take_json();
+    let skipped = logged.iter().find(|line| line["level"] == "ERROR").expect("a line of it");
+    assert_eq!((&skipped["kind"], &skipped["name"]), (&json!("Leaderboard"), &json!("bad")));
     assert_eq!(rig.next().await, event("b", "13", false));
     assert!(rig.metric(&unreadable(1)), "one is gone, and another was edited");
     rig.send(vec![Answer::Watch(vec![line("DELETED", &malformed("a", "2", "31"))])]);

@@ -38,7 +38,7 @@ pub fn spawn_uncached<K: Watchable>(
                     metrics.event();
                     match item.object {
                         Ok(object) => take(object),
-                        Err(malformed) => malformed.log(name),
+                        Err(malformed) => malformed.log(&K::kind(&())),
                     }
                 }
                 // Without news a watch stays where it was, until the server has forgotten that.
