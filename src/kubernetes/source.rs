@@ -4,6 +4,7 @@ use std::collections::HashSet;
 use std::pin::Pin;
 use std::time::Duration;
 
+use futures::future::ready;
 use futures::{Stream, StreamExt, stream};
 use kube::Api;
 use kube::runtime::watcher::{Config, Error, Event};
@@ -59,13 +60,21 @@ impl Source {
 type News<K> = Result<Event<Item<K>>, Error>;
 type Events<K> = Pin<Box<dyn Stream<Item = News<K>> + Send>>;
 
-/// Events of all APIs, each with its number.
+/// Events of all APIs, each with its number, until those of one end.
 pub(super) fn all<K: Watchable>(
     apis: Vec<Api<Item<K>>>,
     config: &Config,
 ) -> impl Stream<Item = (usize, News<K>)> + Send + Unpin + use<K> {
-    let apis = apis.into_iter().enumerate();
-    stream::select_all(apis.map(|(number, api)| lasting(api, config.clone()).map(move |event| (number, event))))
+    numbered(apis.into_iter().map(|api| lasting(api, config.clone())).collect())
+}
+
+/// Items of all streams, each with its stream's number. The end of one is the end of all.
+fn numbered<S: Stream + Unpin>(streams: Vec<S>) -> impl Stream<Item = (usize, S::Item)> + Unpin {
+    let with_end = |(number, one): (usize, S)| {
+        let items = one.map(move |item| Some((number, item)));
+        items.chain(stream::once(ready(None)))
+    };
+    stream::select_all(streams.into_iter().enumerate().map(with_end)).scan((), |(), item| ready(item))
 }
 
 /// A list, then what changes; a list again after a refusal, because a watch without news does not show that the right is back.
@@ -111,5 +120,17 @@ pub(super) fn is_refusal(error: &Error) -> bool {
             status.code == 403
         }
         _ => false,
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[tokio::test]
+    async fn the_end_of_one_stream_is_the_end_of_all() {
+        let streams = vec![stream::pending().boxed(), stream::iter(["last"]).boxed()];
+        let all = tokio::time::timeout(Duration::from_mins(1), numbered(streams).collect::<Vec<_>>());
+        assert_eq!(all.await.expect("an end"), [(1, "last")]);
     }
 }

@@ -26,7 +26,7 @@ pub fn spawn_uncached<K: Watchable>(
     };
     let probes: Vec<_> = apis.iter().map(of_namespace).collect();
     let mut events = source::all(apis, &config.page_size(PAGE));
-    // They have no end; if they end all the same, this task ends, and with it the process.
+    // No API's events have an end; if one's end all the same, this task ends, and with it the process.
     telemetry.tasks.until_stop(name, async move {
         while let Some((source, event)) = events.next().await {
             let probe = &probes[source];

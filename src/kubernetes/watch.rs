@@ -155,7 +155,7 @@ impl<K: Watchable> Task<K> {
             match event {
                 Some((source, Ok(event))) => self.event(source, event),
                 Some((source, Err(error))) => self.error(source, &error),
-                // They have no end; if they end all the same, this task ends, and with it the process.
+                // No API's events have an end; if one's end all the same, this task ends, and with it the process.
                 None => break,
             }
         }
