@@ -13,7 +13,7 @@ use leaderboard_aws::fault::Fault;
 use leaderboard_aws::log_groups::{self, LogGroupError};
 use leaderboard_aws::queue::{self, QueueError, Reading};
 use leaderboard_aws::table::{Table, TableError};
-use leaderboard_policy::ask::Failure;
+use leaderboard_policy::ask::{Ask, Failure};
 
 /// Prefix of a run that does not exist: the list below it is empty, and costs little.
 const NO_RUN: &str = "none/";
@@ -64,8 +64,8 @@ pub(super) async fn ask(aws: Aws, asked: Asked<Place>) -> Result<Seen, Failure> 
         }
     };
     if let Ok(Seen { hidden: Some(why), .. }) | Err(Failure { why, .. }) = &answer {
-        let leaderboard = &asked.about;
-        tracing::warn!(%leaderboard, why, "the bucket, table, queue or log group cannot be reached");
+        let (leaderboard, place) = (&asked.about, place.service());
+        tracing::warn!(%leaderboard, %place, why, "the bucket, table, queue or log group cannot be reached");
     }
     answer
 }
@@ -112,9 +112,33 @@ fn of_log_group(answer: Result<(), LogGroupError>) -> Result<Seen, Failure> {
 
 #[cfg(test)]
 mod tests {
+    use std::time::Duration;
+
     use super::*;
+    use crate::fixtures;
+    use crate::observability::logging::tests::Lines;
+    use crate::runtime::objects::key_of;
     use leaderboard_aws::archive::Cause;
     use serde_json::json;
+
+    #[tokio::test(start_paused = true)]
+    async fn the_log_names_where_a_place_is_that_cannot_be_reached() {
+        let endpoint = "http://127.0.0.1:1";
+        let board = fixtures::leaderboard("carla", endpoint);
+        let aws = Box::pin(fixtures::aws(endpoint)).await;
+        let lines = Lines::default();
+        let _guard = lines.collect();
+        let asked = Asked {
+            about: key_of(&board),
+            question: named(&board).remove(0),
+            waited: Duration::ZERO,
+            last: None,
+        };
+        assert!(Box::pin(ask(aws, asked)).await.is_err());
+        let logged = lines.take_json();
+        let places: Vec<_> = logged.iter().filter_map(|line| line["place"].as_str()).collect();
+        assert_eq!(places, ["the server http://127.0.0.1:1"], "{logged:?}");
+    }
 
     #[test]
     fn a_refusal_of_aws_has_its_reason_and_next_step() {
