@@ -12,7 +12,7 @@ use std::sync::Arc;
 
 use kube::runtime::watcher::Config;
 
-pub use crate::intake::leaderboards::Scope;
+use crate::intake::leaderboards::Scope;
 use crate::intake::pollers::follow;
 use crate::intake::shared::{Problems, Shared};
 use crate::kubernetes::{Clients, recorder, spawn_watch};

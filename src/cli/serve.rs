@@ -11,6 +11,7 @@ use kube::{Client, Config};
 
 use super::{Controller, InPod, Server};
 use crate::bridge;
+use crate::intake::leaderboards::Scope;
 use crate::kubernetes::{Clients, Namespaces, watch_client};
 use crate::metrics::Program;
 use crate::observability::Observability;
@@ -193,7 +194,7 @@ async fn serve_bridge(options: Server) -> End {
     let telemetry = Observability::of(Program::Bridge, on_signals()?);
     let server = HealthServer::start(options.http, telemetry.clone()).await?;
     let clients = Clients::new(cluster("bridge").await?).map_err(|e| client_errors::kube(&e))?;
-    let scope = bridge::Scope {
+    let scope = Scope {
         namespaces: Namespaces::of(options.namespaces),
         allowed: options.allowed,
     };

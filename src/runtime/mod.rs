@@ -32,7 +32,7 @@ use super::leaderboards::probe::Asks;
 use super::leaderboards::state::LeaderboardState;
 use super::leaderboards::{isolation, operator};
 use super::slots::Slots;
-use crate::bridge::Scope;
+use crate::intake::leaderboards::Scope;
 use crate::intake::shared;
 use crate::kubernetes::objects::Event;
 use crate::kubernetes::preflight::{self, await_kinds};

@@ -27,6 +27,7 @@ use leaderboard_base::tasks::TaskFailed;
 use leaderboard_evalai::Swept;
 use leaderboard_operator::bridge;
 use leaderboard_operator::intake::ingest::{self, Incoming, Source};
+use leaderboard_operator::intake::leaderboards::Scope;
 use leaderboard_operator::kubernetes::{Clients, Namespaces};
 use leaderboard_operator::metrics::Program;
 use leaderboard_operator::observability::Observability;
@@ -155,7 +156,7 @@ impl Bridge {
         let (stop, stopped) = Stop::new();
         let telemetry = Observability::of(Program::Bridge, stopped);
         let aws = stand_in.aws.clone();
-        let scope = bridge::Scope {
+        let scope = Scope {
             namespaces: Namespaces::of([namespace.to_owned()]),
             allowed: Allowed::default(),
         };
