@@ -10,12 +10,12 @@ const EVALUATOR: Side = Side::Host(Host::Evaluator);
 
 /// Two workers.
 async fn evaluated() -> Pod {
-    prepared(container_run().plan.evaluation).await
+    Box::pin(prepared(container_run().plan.evaluation)).await
 }
 
 /// Two workers, whose results a command merges.
 async fn merging() -> Pod {
-    prepared(merging_run(EvaluationMode::Interactive).plan.evaluation).await
+    Box::pin(prepared(merging_run(EvaluationMode::Interactive).plan.evaluation)).await
 }
 
 /// A Pod that is prepared for these evaluators.

@@ -279,10 +279,10 @@ async fn last_files(is_found: bool, time: Duration) -> (Vec<String>, Sent) {
 
 #[tokio::test]
 async fn what_the_evaluators_read_goes_on_to_arrive_at_the_end_while_there_is_time() {
-    let (order, sent) = last_files(true, PATIENCE).await;
+    let (order, sent) = Box::pin(last_files(true, PATIENCE)).await;
     assert_eq!(order, ["agent/agent1/leaderboard.log", "input/large", "input/late"]);
     assert_eq!((sent.objects, sent.late, sent.left_out), (3, 0, 0));
-    let (order, sent) = last_files(false, Duration::from_secs(3)).await;
+    let (order, sent) = Box::pin(last_files(false, Duration::from_secs(3))).await;
     assert_eq!(order, ["agent/agent1/leaderboard.log"]);
     assert_eq!((sent.objects, sent.late, sent.left_out), (1, 2, 0));
 }
