@@ -225,8 +225,14 @@ async fn a_malformed_object_is_left_out_and_stops_nothing() {
     let unreadable = |number: u32| format!("leaderboard_watch_unreadable_objects{{kind=\"Leaderboard\"}} {number}");
     assert!(rig.metric(&unreadable(1)), "it was so in the first list");
     let logged = lines.take_json();
-    let skipped = logged.iter().find(|line| line["level"] == "ERROR").expect("a line of it");
-    assert_eq!((&skipped["kind"], &skipped["name"]), (&json!("Leaderboard"), &json!("bad")));
+    let skipped = logged
+        .iter()
+        .find(|line| line["level"] == "ERROR")
+        .expect("a line of it");
+    assert_eq!(
+        (&skipped["kind"], &skipped["name"]),
+        (&json!("Leaderboard"), &json!("bad"))
+    );
     assert_eq!(rig.next().await, event("b", "13", false));
     assert!(rig.metric(&unreadable(1)), "one is gone, and another was edited");
     rig.send(vec![Answer::Watch(vec![line("DELETED", &malformed("a", "2", "31"))])]);
