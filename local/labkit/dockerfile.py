@@ -220,6 +220,7 @@ def seed(built: list[str]) -> list[str]:
             f"mkdir -p {to}/deps",
             f"cd /warm/target/{folder}",
             f"cp -a .fingerprint build {to}/",
-            rf"find deps \( -name 'lib*' -o -name '*.d' \) -exec cp -a -t {to}/deps {{}} +",
+            # A compiler that was interrupted leaves a folder with files of such names.
+            rf"find deps -maxdepth 1 \( -name 'lib*' -o -name '*.d' \) -exec cp -a -t {to}/deps {{}} +",
         ]
     return commands

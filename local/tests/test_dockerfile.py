@@ -165,7 +165,7 @@ class Machine(unittest.TestCase):
     def test_its_caches_get_libraries_and_no_programs(self) -> None:
         text = "\n".join(dockerfile.seed(["local"]))
         self.assertIn("cp -a .fingerprint build /src/target/local/", text)
-        self.assertIn(r"find deps \( -name 'lib*' -o -name '*.d' \)", text)
+        self.assertIn(r"find deps -maxdepth 1 \( -name 'lib*' -o -name '*.d' \)", text)
         self.assertEqual(len(dockerfile.folders("release")), len(set(dockerfile.folders("release"))))
 
     def test_what_is_mounted_can_t_be_written(self) -> None:
