@@ -8,10 +8,10 @@ use kube::KubeSchema;
 use schemars::JsonSchema;
 use serde::{Deserialize, Serialize};
 
+use super::agents::Agents;
 use super::byte_quantity::ByteQuantity;
 use super::order::Order;
 use super::progress::MAX_NAME;
-use super::run_plan::Agents;
 use super::shared_text::SharedText;
 use super::track_container::TrackContainer;
 

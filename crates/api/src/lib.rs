@@ -2,6 +2,7 @@
 //!
 //! Called by everyone. Knows no network and no clock: types, constants and pure functions only.
 
+mod agents;
 mod attempt;
 pub mod byte_quantity;
 mod carla;
@@ -42,6 +43,7 @@ mod state;
 pub mod submission;
 pub mod submission_status;
 mod submission_use;
+mod submitted_file;
 mod team;
 pub mod text;
 mod track_container;
@@ -51,6 +53,7 @@ mod worker_status;
 /// Name, namespace and UID of an object.
 pub use kube::ResourceExt;
 
+pub use agents::Agents;
 pub use attempt::Attempt;
 pub use carla::*;
 pub use conditions::Condition;
@@ -73,12 +76,13 @@ pub use reasons::{Reason, ReasonName};
 pub use retention::Retention;
 pub use route_slice::{NotASlice, RouteSlice};
 pub use run_id::{NotARunId, RunId};
-pub use run_plan::{Agents, Given, Part};
+pub use run_plan::{Given, Part};
 pub use shared_text::SharedText;
 pub use standings::{MAX_STANDINGS, Order, RankedScore, Ranking, Standing};
-pub use submission::{EvalaiRef, Submission, SubmissionSpec, SubmittedFile};
+pub use submission::{EvalaiRef, Submission, SubmissionSpec};
 pub use submission_status::*;
 pub use submission_use::{Interruptions, MAX_INTERRUPTED_NODES, MAX_USING_TEAMS, TeamUse, Use};
+pub use submitted_file::SubmittedFile;
 pub use team::{Team, TeamStatus};
 pub use waiting::{Eta, Waiting};
 pub use worker_status::{EndReason, LastEnd, WorkerState, WorkerStatus};

@@ -4,21 +4,11 @@
 
 use k8s_openapi::api::core::v1::{EnvVar, ResourceRequirements, SecurityContext};
 
+use super::agents::Agents;
 use super::leaderboard_parts::Evaluation;
 use super::{
     CarlaPlan, ContainerPlan, DataSource, LeaderboardSpec, PlannedEvaluation, RouteSlice, RunPlan, Track, effective,
 };
-
-/// How the agents of a run stand to the containers of the host.
-#[derive(Clone, Copy, Debug, PartialEq, Eq)]
-pub enum Agents {
-    /// Each worker has one, beside the container of the host.
-    Beside,
-    /// There is one. It ends before the containers of the host start.
-    First,
-    /// There is none.
-    Absent,
-}
 
 impl RunPlan {
     /// How its agents stand to the containers of the host.

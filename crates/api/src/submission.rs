@@ -8,6 +8,7 @@ use serde::{Deserialize, Serialize};
 
 use super::attempt::Attempt;
 use super::submission_status::SubmissionStatus;
+use super::submitted_file::SubmittedFile;
 use super::team::{Team, TeamStatus};
 
 /// One participant's image or file on one track of a Leaderboard.
@@ -118,17 +119,6 @@ impl Submission {
         let team = accepted.or(given.as_ref())?;
         team.name.clone().or_else(|| team.id.clone())
     }
-}
-
-/// A file in the bucket that is a submission.
-#[derive(Serialize, Deserialize, JsonSchema, Clone, Debug, PartialEq, Eq)]
-pub struct SubmittedFile {
-    /// SHA-256 of its content, in hexadecimal digits.
-    #[schemars(length(max = 64), regex(pattern = r"^[0-9a-f]{64}$"))]
-    pub sha256: String,
-    /// Number of its bytes.
-    #[schemars(range(min = 0))]
-    pub size: i64,
 }
 
 /// A submission's ids in EvalAI.

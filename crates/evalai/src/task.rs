@@ -11,7 +11,7 @@ use tokio::time::Instant;
 
 use super::answer::{Answer, Silence};
 use super::client::Client;
-use super::hub::Options;
+use super::options::Options;
 use super::queue::{Next, Now, Place, Queue, Ticket};
 use super::request::{Reply, Request};
 use super::types::{Key, Outline, Payload, PayloadProblem};

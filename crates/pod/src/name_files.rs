@@ -10,7 +10,7 @@ use std::os::unix::fs::PermissionsExt;
 use std::path::Path;
 
 use super::places::Places;
-use super::workspace::WorkspaceError;
+use super::workspace::error::WorkspaceError;
 use leaderboard_contract::run::NAME_FILES;
 
 /// Copies all of them, also when they are there already: a Pod whose node was restarted has another address.

@@ -4,12 +4,13 @@
 //! Called by `leaderboard-operator workspace`. Knows S3 and the volumes. Everything it does may be done again: the kubelet
 //! restarts it when it fails.
 
+pub(crate) mod error;
 mod input;
 pub mod restore;
+mod stored;
 
 use std::collections::BTreeMap;
 use std::fs;
-use std::io;
 use std::os::unix::fs::PermissionsExt;
 use std::path::Path;
 use std::sync::Arc;
@@ -27,9 +28,11 @@ use leaderboard_contract::keys::{INPUT, SUBMISSION_FOLDER, host_folder};
 use leaderboard_contract::report::{MAX_BYTES, OWNER_KEY, Owner, REPORT_KEY, Report};
 use leaderboard_contract::run::{Run, STATUS_FOLDER};
 use leaderboard_contract::verdict::{WorkspaceReason, WorkspaceVerdict};
-use leaderboard_evaluation::{Refused, Results, of_plan};
+use leaderboard_evaluation::{Results, of_plan};
 use leaderboard_evidence::{Tree, TreeError};
 use leaderboard_protocol::files::Pair;
+
+pub use error::WorkspaceError;
 
 /// Folders that no mount makes, beside those of the host's containers. The others are the kubelet's.
 const FOLDERS: [&str; 4] = ["agent", STATUS_FOLDER, "logcopy", "contents"];
@@ -48,73 +51,6 @@ fn verdict_of(finding: &Finding) -> WorkspaceVerdict {
         Finding::Unmeasured(_) => WorkspaceReason::NotMeasured,
     };
     WorkspaceVerdict::new(reason, finding.to_string())
-}
-
-/// Why the workspace could not be prepared.
-#[derive(thiserror::Error, Debug)]
-pub enum WorkspaceError {
-    /// The results of another submission are there.
-    #[error("s3://{0} already holds results of something else.")]
-    PrefixInUse(String),
-    /// `network.enforcement` is `Require`.
-    #[error("{0} The run is not started, because network.enforcement is Require.")]
-    NotIsolated(Finding),
-    /// The plan does not hold.
-    #[error(transparent)]
-    Plan(#[from] Refused),
-    /// The submitted file of the mode Predictions.
-    #[error(
-        "The submitted file s3://{place} {why}. Put the file of the submission there and resume it, or submit the file again."
-    )]
-    InputMissing {
-        /// Bucket and key.
-        place: String,
-        /// What is there.
-        why: &'static str,
-    },
-    /// S3.
-    #[error(transparent)]
-    Storage(#[from] ArchiveError),
-    /// A file below the volume's root.
-    #[error("{path} on the logs volume can't be used: {error}. Look at the node's disk and the Pod's volumes.")]
-    Volume {
-        /// Which.
-        path: String,
-        /// The system's own text.
-        error: TreeError,
-    },
-    /// The files by which names are resolved.
-    #[error("{path} can't be written: {error}. Look at the node's disk and the Pod's volumes.")]
-    NameFile {
-        /// Where to.
-        path: String,
-        /// The system's own text.
-        error: io::Error,
-    },
-    /// The runner.
-    #[error("the runner can't be copied to {path}: {error}. Use the operator's own image for this container.")]
-    Runner {
-        /// Where to.
-        path: String,
-        /// The system's own text.
-        error: io::Error,
-    },
-}
-
-impl WorkspaceError {
-    /// For the termination message.
-    pub fn verdict(&self) -> WorkspaceVerdict {
-        let reason = match self {
-            Self::PrefixInUse(_) => WorkspaceReason::PrefixInUse,
-            Self::NotIsolated(Finding::Unmeasured(_)) => WorkspaceReason::NotKnownIsolated,
-            Self::NotIsolated(_) => WorkspaceReason::NotIsolated,
-            Self::Plan(_) => WorkspaceReason::PlanInvalid,
-            Self::InputMissing { .. } => WorkspaceReason::InputMissing,
-            Self::Storage(_) => WorkspaceReason::StorageFailed,
-            Self::Volume { .. } | Self::NameFile { .. } | Self::Runner { .. } => WorkspaceReason::VolumeFailed,
-        };
-        WorkspaceVerdict::new(reason, self.to_string())
-    }
 }
 
 /// Prepares the Pod. A failure, and what was found of the Pod's isolation, are also written to the termination log.
@@ -182,7 +118,7 @@ async fn take(setting: &Setting, archive: &Archive, tree: &Arc<Tree>) -> Result<
     let owner = Owner::new(setting.pod_uid.clone()).to_json();
     if let Some(of_nobody) = of_nobody(run, archive).await? {
         // Before the prefix has an owner: a Pod that goes on with it must not take them for this run's.
-        restore::remove(archive, of_nobody).await?;
+        stored::remove(archive, of_nobody).await?;
         // Names the prefix's owner before anything else is in it, so that a Pod that is lost early can be replaced.
         let report = first_report(run, &setting.pod_uid, &mut *results);
         let bytes = serde_json::to_vec(&report).unwrap_or_default();

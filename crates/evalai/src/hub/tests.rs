@@ -9,7 +9,9 @@ use futures::FutureExt;
 use leaderboard_api::Attempt;
 use leaderboard_base::shutdown::Stop;
 use leaderboard_base::spans::LogSpan;
+use leaderboard_base::tasks::Tasks;
 use std::time::Duration;
+use tokio::sync::mpsc;
 
 /// A hub that nobody listens to.
 fn hub(tasks: &Tasks, write_guard: impl Fn() -> bool + Send + Sync + 'static) -> Hub {

@@ -8,7 +8,7 @@ use std::sync::Arc;
 
 use futures::{StreamExt, TryStreamExt};
 
-use super::restore::{AT_ONCE, download, is_evaluators, remove, unknown};
+use super::stored::{AT_ONCE, download, is_evaluators, remove, unknown};
 use super::{WorkspaceError, get, place, volume};
 use crate::blocking;
 use crate::collect::{self, bounds, digest_of, usable};

@@ -11,11 +11,12 @@ use std::sync::Arc;
 
 use futures::{StreamExt, TryStreamExt};
 
+use super::stored::{AT_ONCE, download, is_evaluators, remove, unknown};
 use super::{WorkspaceError, get, input, last_report, volume};
 use crate::blocking;
 use crate::daily::Daily;
 use crate::upload::quota::{LEAST, Quota};
-use crate::upload::{Memory, Stored, fingerprint};
+use crate::upload::{Memory, Stored};
 use leaderboard_api::RunPlan;
 use leaderboard_api::evaluator_result::{MAX_BYTES, parse};
 use leaderboard_api::names::FAILURE_LOG_KEY;
@@ -26,14 +27,11 @@ use leaderboard_contract::keys::{
 use leaderboard_contract::report::{OWNER_KEY, REPORT_KEY, Report};
 use leaderboard_contract::run::{Run, STATUS_FOLDER};
 use leaderboard_evaluation::{Results, of_plan};
-use leaderboard_evidence::{Stamp, Tree, TreeError, is_plain};
+use leaderboard_evidence::{Tree, is_plain};
 use leaderboard_protocol::files::Pair;
 
 /// Most objects of a run.
 const MAX_OBJECTS: usize = 100_000;
-/// Downloads at once.
-pub(super) const AT_ONCE: usize = 4;
-
 /// Downloads what the run goes on with, and removes the stored status files.
 pub async fn restore(
     results: Box<dyn Results>,
@@ -101,11 +99,6 @@ async fn usable(
     Ok((objects, input))
 }
 
-pub(super) async fn remove(archive: &Archive, objects: Vec<Listed>) -> Result<(), WorkspaceError> {
-    let keys: Vec<String> = objects.into_iter().map(|object| object.key).collect();
-    Ok(archive.delete(&keys).await?)
-}
-
 /// Removes the final results of evaluators where an attempt before this one has ended because of its results: an evaluator does not start
 /// beside a final one, so a corrected one would judge nothing.
 async fn remove_refused(run: &Run, archive: &Archive, report: Option<&Report>) -> Result<(), ArchiveError> {
@@ -147,11 +140,6 @@ fn are_ours(plan: &RunPlan, report: Option<&Report>, objects: &[Listed]) -> bool
             last.is_some_and(|last| (plan.sharing()..=workers).contains(&usize::from(last.get())))
         }
     }
-}
-
-/// Objects whose content is not known.
-pub(super) fn unknown<'a>(objects: impl Iterator<Item = &'a Listed>) -> impl Iterator<Item = (String, Stored)> {
-    objects.map(|one| (one.key.clone(), Stored::unknown(one.size)))
 }
 
 #[derive(Debug, PartialEq, Eq)]
@@ -232,10 +220,6 @@ fn log_of_worker(key: &str) -> Option<Pair> {
         .then(|| worker.parse().ok())?
 }
 
-pub(super) fn is_evaluators(key: &str) -> bool {
-    key.starts_with(EVALUATORS)
-}
-
 /// The number of the evaluator whose file a key is.
 fn evaluator_of(key: &str) -> Option<Pair> {
     key.strip_prefix(EVALUATORS)?.split_once('/')?.0.parse().ok()
@@ -265,46 +249,6 @@ fn shadowed(objects: &[Listed]) -> BTreeSet<String> {
 fn is_foreign_agent(key: &str, pairs: usize) -> bool {
     let number = key.strip_prefix("agent/agent").and_then(|rest| rest.split_once('/'));
     number.is_some_and(|(number, _)| !(1..=pairs).any(|pair| pair.to_string() == number))
-}
-
-/// Downloads an object to a path. `None` if it is gone.
-pub(super) async fn download(
-    archive: &Archive,
-    tree: &Arc<Tree>,
-    object: Listed,
-    path: &str,
-) -> Result<Option<(String, Stored)>, WorkspaceError> {
-    let local = |error: TreeError| volume(path, error);
-    let (creating, key) = (Arc::clone(tree), path.to_owned());
-    let created = blocking(move || creating.create(&key)).await;
-    let mut file = tokio::fs::File::from_std(created.map_err(local)?);
-    // A little more than the list showed, for an object that was replaced since.
-    let limit = object.size.saturating_mul(2).max(1 << 20);
-    let Some(size) = archive.download(&object.key, &mut file, limit).await? else {
-        return Ok(None);
-    };
-    drop(file);
-    let (reading, key) = (Arc::clone(tree), path.to_owned());
-    let read = blocking(move || fingerprint_of(&reading, &key)).await;
-    let Some((fingerprint, stamp)) = read.map_err(local)? else {
-        return Ok(None);
-    };
-    // Known as stored only if it is what the list showed the tag of.
-    let etag = object.etag.filter(|_| size == object.size);
-    let stored = Stored {
-        fingerprint,
-        stamp: Stamp { size, ..stamp },
-        etag,
-        at: std::time::Duration::ZERO,
-    };
-    Ok(Some((object.key, stored)))
-}
-
-fn fingerprint_of(tree: &Tree, path: &str) -> Result<Option<(String, Stamp)>, TreeError> {
-    let Some((file, stamp)) = tree.file(path)? else {
-        return Ok(None);
-    };
-    Ok(Some((fingerprint(&file, stamp.size)?, stamp)))
 }
 
 #[cfg(test)]

@@ -8,8 +8,9 @@ use std::sync::atomic::{AtomicUsize, Ordering};
 
 use super::*;
 use crate::files::InputError;
-use crate::transport::Body;
 use crate::transport::tests::memory::{begun, server, whole};
+use crate::transport::{Body, Connect};
+use crate::types::Changed;
 
 /// An EvalAI whose rows have an address of its file, another one in each read; the first one has expired, and the third row has none.
 fn connect() -> Connect {
