@@ -5,7 +5,7 @@
 use k8s_openapi::api::core::v1::PersistentVolumeClaim;
 use kube::{Api, Client, ResourceExt};
 
-use super::tried_pods::TriedPods;
+use super::pod_findings::TriedPods;
 use crate::kubernetes::call;
 use leaderboard_api::{DataSource, Leaderboard};
 

@@ -9,6 +9,7 @@ mod data_claims;
 pub mod isolation;
 pub mod operator;
 mod places;
+mod pod_findings;
 mod priority;
 pub mod probe;
 mod reach;

@@ -8,7 +8,7 @@ use k8s_openapi::api::scheduling::v1::PriorityClass;
 use kube::{Api, Client};
 use serde_json::Value;
 
-use super::tried_pods::TriedPods;
+use super::pod_findings::TriedPods;
 use crate::kubernetes::call;
 use leaderboard_api::Track;
 use leaderboard_pod_spec::notes::TrackPods;

@@ -10,9 +10,10 @@ use k8s_openapi::api::core::v1::Secret;
 use kube::{Api, Client};
 
 use super::places;
+use super::pod_findings::TriedPods;
 use super::reach::{AwsResource, Place, Reach};
 use super::token::of_entry;
-use super::tried_pods::{self, Pods, TriedPods};
+use super::tried_pods::{self, Pods};
 use crate::ask::{Asked, Asker, Wake};
 use crate::kubernetes::call;
 use crate::metrics::leader::{self, Gauge};

@@ -10,6 +10,7 @@ use kube::{Api, Client, ResourceExt};
 
 use super::claims;
 use super::data_claims;
+use super::pod_findings::TriedPods;
 use super::priority;
 use crate::ask::Asked;
 use crate::kubernetes::call;
@@ -59,19 +60,6 @@ impl Ask for Pods {
             Ok(_) | Err(_) => Some(SOON),
         }
     }
-}
-
-/// The findings about a Leaderboard's Pods.
-#[derive(Clone, Debug, Default, PartialEq, Eq)]
-pub(super) struct TriedPods {
-    /// Why they would be refused.
-    pub(super) refused: Option<String>,
-    /// Notes for their host, one sentence each.
-    pub(super) notes: Vec<String>,
-    /// How the template of their claims stands.
-    pub(super) claims: Claims,
-    /// They depend on objects that may change.
-    may_change: bool,
 }
 
 /// Tries whether Pods of this Leaderboard would be refused, and what is to be noted. Puts the template of their claims in place.
