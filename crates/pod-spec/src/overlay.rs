@@ -121,13 +121,20 @@ fn addresses(addressed: &str, container: &str) -> bool {
 }
 
 /// The value without the fields that are null.
-pub(super) fn without_nulls(value: &Value) -> Value {
+fn without_nulls(value: &Value) -> Value {
+    let mut kept = value.clone();
+    drop_nulls(&mut kept);
+    kept
+}
+
+/// Takes the fields that are null out of a value.
+pub(super) fn drop_nulls(value: &mut Value) {
     match value {
         Value::Object(object) => {
-            let kept = object.iter().filter(|(_, value)| !value.is_null());
-            Value::Object(kept.map(|(key, value)| (key.clone(), without_nulls(value))).collect())
+            object.retain(|_, value| !value.is_null());
+            object.values_mut().for_each(drop_nulls);
         }
-        Value::Array(list) => Value::Array(list.iter().map(without_nulls).collect()),
-        other => other.clone(),
+        Value::Array(list) => list.iter_mut().for_each(drop_nulls),
+        _ => {}
     }
 }

@@ -197,15 +197,18 @@ fn isolation(leaderboard: &Leaderboard, now: Timestamp) -> Option<Isolation> {
 }
 
 fn ours(input: &JobInput<'_>, workloads: &[Workload]) -> Value {
-    pod_overlay::without_nulls(&json!({
+    let mut spec = json!({
         "completions": 1,
         "parallelism": 1,
         "backoffLimit": backoff_limit(input),
         // The default starts the next Pod while the old one still writes.
         "podReplacementPolicy": "Failed",
         "ttlSecondsAfterFinished": input.spec().job_seconds(),
-        "template": template(input, workloads),
-    }))
+    });
+    // Here and below a large part is moved in: `json!` would copy all of it.
+    spec["template"] = template(input, workloads);
+    pod_overlay::drop_nulls(&mut spec);
+    spec
 }
 
 fn metadata(input: &JobInput<'_>) -> ObjectMeta {
@@ -269,7 +272,7 @@ fn active_deadline(input: &JobInput<'_>) -> Option<i64> {
 }
 
 fn template(input: &JobInput<'_>, workloads: &[Workload]) -> Value {
-    json!({
+    let mut template = json!({
         "metadata": {
             "labels": labels(input),
             // Moving a run to another node costs hours of simulation.
@@ -279,8 +282,9 @@ fn template(input: &JobInput<'_>, workloads: &[Workload]) -> Value {
                 (names::ANNOTATION_GENERATION): generation(input).to_string(),
             },
         },
-        "spec": pod(input, workloads),
-    })
+    });
+    template["spec"] = pod(input, workloads);
+    template
 }
 
 fn generation(input: &JobInput<'_>) -> i64 {
@@ -297,11 +301,8 @@ fn pod(input: &JobInput<'_>, workloads: &[Workload]) -> Value {
     // The kubelet's own order keeps an agent that runs first from what follows it.
     let first = workers::first(input, workloads).into_iter();
     let first = first.flat_map(|agent| [agent, init::collect(input)]);
-    json!({
+    let mut pod = json!({
         "restartPolicy": "OnFailure",
-        "initContainers": init.chain(first).collect::<Vec<_>>(),
-        "containers": workers::all(input, workloads),
-        "volumes": volumes::all(input, workloads),
         "activeDeadlineSeconds": active_deadline(input),
         "terminationGracePeriodSeconds": GRACE_SECONDS,
         "serviceAccountName": identity.and_then(|identity| identity.service_account_name.as_ref()),
@@ -313,7 +314,11 @@ fn pod(input: &JobInput<'_>, workloads: &[Workload]) -> Value {
         "resourceClaims": gpu::claims(input),
         "nodeSelector": node_selector(input),
         "tolerations": tolerations(input),
-    })
+    });
+    pod["initContainers"] = init.chain(first).collect();
+    pod["containers"] = workers::all(input, workloads).into();
+    pod["volumes"] = volumes::all(input, workloads).into();
+    pod
 }
 
 /// Images of participants, and mostly of hosts, are for one kind of machine. A track can choose another.
