@@ -178,10 +178,7 @@ impl Looked {
             metrics: metrics(spec),
             inbox: spec.evalai_queue().map(|queue| queue.name.clone()),
             is_observed: evalai.mode == EvalaiMode::Observe,
-            takes_files: spec
-                .evaluation
-                .container()
-                .is_some_and(|container| !container.mode.has_agent()),
+            takes_files: spec.evaluation.takes_files(),
             since: created.map(|time| time.0).unwrap_or_default(),
         })
     }

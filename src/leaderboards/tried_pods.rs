@@ -142,9 +142,7 @@ async fn refused_job(client: &Client, leaderboard: &Leaderboard, job: &DynamicOb
 }
 
 fn sample_job(settings: &Settings, leaderboard: &Leaderboard, track: &Track) -> Option<DynamicObject> {
-    let container = leaderboard.spec.evaluation.container();
-    let takes_files = container.is_some_and(|container| !container.mode.has_agent());
-    let image = (!takes_files).then_some("example/agent:1");
+    let image = (!leaderboard.spec.evaluation.takes_files()).then_some("example/agent:1");
     let spec = serde_json::json!({ "leaderboardName": leaderboard.name_any(), "track": track.name, "image": image });
     let mut sample = Submission::new("sample", serde_json::from_value(spec).ok()?);
     sample.metadata.namespace = leaderboard.namespace();

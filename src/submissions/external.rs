@@ -212,8 +212,7 @@ fn final_update(workers: &Workers, view: &View, status: &SubmissionStatus, outco
 fn wants_image(submission: &Submission, leaderboard: Option<&Leaderboard>) -> bool {
     let status = submission.status.as_ref();
     let has_ended = status.is_some_and(SubmissionStatus::has_ended);
-    let evaluation = leaderboard.and_then(|board| board.spec.evaluation.container());
-    let takes_images = evaluation.is_none_or(|evaluation| evaluation.mode.has_agent());
+    let takes_images = leaderboard.is_none_or(|board| !board.spec.evaluation.takes_files());
     takes_images && submission.spec.image.is_none() && !has_ended
 }
 

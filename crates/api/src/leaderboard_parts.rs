@@ -58,6 +58,11 @@ impl Evaluation {
             Self::Container(container) => Some(container),
         }
     }
+
+    /// True if a submission is a file and no image.
+    pub fn takes_files(&self) -> bool {
+        self.container().is_some_and(|container| !container.mode.has_agent())
+    }
 }
 
 /// A track: what one phase of the challenge asks for.

@@ -4,7 +4,7 @@ use std::path::PathBuf;
 
 use clap::Args;
 use kube::ResourceExt;
-use leaderboard_api::{Evaluation, Submission, names};
+use leaderboard_api::{Submission, names};
 use serde_json::{Value, json};
 
 use crate::board::{self, Observed};
@@ -52,7 +52,7 @@ pub fn fits(name: &str, track: &str, is_file: bool, leaderboard: Observed<'_>) -
     let Some(found) = leaderboard.leaderboard() else {
         return Ok(());
     };
-    let takes_file = matches!(&found.spec.evaluation, Evaluation::Container(by) if !by.mode.has_agent());
+    let takes_file = found.spec.evaluation.takes_files();
     if takes_file != is_file {
         let (takes, flag) = if takes_file {
             ("files and no images, as its mode is Predictions", "--file FILE")

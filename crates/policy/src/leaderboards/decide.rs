@@ -324,8 +324,11 @@ fn without_limit(leaderboard: &Leaderboard) -> Option<String> {
         [one] => ("Runs of the track", (*one).to_owned()),
         several => ("Runs of the tracks", several.join(", ")),
     };
-    let takes_files = spec.evaluation.container().is_some_and(|by| !by.mode.has_agent());
-    let who = if takes_files { "an evaluator" } else { "an agent" };
+    let who = if spec.evaluation.takes_files() {
+        "an evaluator"
+    } else {
+        "an agent"
+    };
     Some(format!(
         "{runs} {names} have no time limit: {who} that does not end keeps its nodes until it is cancelled; set \
          deadlines.runSeconds."
