@@ -34,7 +34,7 @@ def client(place: Path) -> str:
 def serve(place: str, program: Callable[[], int], own: Mapping[str, str]) -> NoReturn:
     """Answers calls until it is killed; a line on standard output shows that it is ready. `own` are variables that the program has set for
     itself as it was loaded."""
-    # Nobody waits for the forks.
+    # No one waits for the forks.
     signal.signal(signal.SIGCHLD, signal.SIG_IGN)
     with socket.socket(socket.AF_UNIX) as server:
         server.bind(place)

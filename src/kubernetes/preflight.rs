@@ -24,7 +24,7 @@ const KINDS_PAUSE: Duration = Duration::from_secs(2);
 /// Requests at once.
 const AT_ONCE: usize = 8;
 
-/// What the process has to be allowed, in words. Without a namespace it is a right in every one, or to a kind that has none.
+/// Right that the process needs, in words. Without a namespace it is a right in every one, or to a kind that has none.
 pub fn described(right: &ResourceAttributes) -> String {
     let part = |before: &str, text: Option<&String>| match text {
         Some(text) if !text.is_empty() => format!("{before}{text}"),

@@ -56,7 +56,7 @@ impl Source {
     }
 }
 
-/// What comes of one API.
+/// An event of one API, or an error.
 type News<K> = Result<Event<Item<K>>, Error>;
 type Events<K> = Pin<Box<dyn Stream<Item = News<K>> + Send>>;
 

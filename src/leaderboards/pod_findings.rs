@@ -1,4 +1,4 @@
-//! What is found of a Leaderboard's Pods before there are any.
+//! Findings about a Leaderboard's Pods before there are any.
 
 use leaderboard_policy::leaderboards::view::Claims;
 

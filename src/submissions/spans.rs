@@ -58,7 +58,7 @@ fn kind(submission: &Submission, phase: Phase) -> Kind {
     }
 }
 
-/// What a phase has in common with all others, and its own.
+/// Attributes of a phase: those that all phases have, and its own.
 fn attributes(submission: &Submission, new: &SubmissionStatus, phase: Phase) -> Vec<(&'static str, Value)> {
     let (meta, old) = (&submission.metadata, submission.status.as_ref());
     let name = meta.name.as_deref().unwrap_or_default();

@@ -356,7 +356,7 @@ async fn node_lost(scene: &Scene) {
     }
 }
 
-/// Of CARLA and of a game, as `node_lost` names its cases.
+/// Submissions to CARLA and to a game, in the order of the cases of `node_lost`.
 const LOST: [&str; 2] = ["lost-node", "lost-game"];
 
 async fn on_the_lost_node(cases: &mut [Case; 2], scene: &Scene, nodes: &Api<Node>, label: &str) {

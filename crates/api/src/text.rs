@@ -4,6 +4,8 @@
 //! goes through [`one_line`] where it enters: from there on it can be shown on a terminal, in a log and on a page.
 
 use std::error::Error;
+use std::iter::successors;
+
 /// Longest name of a team or of another thing that a stranger has named, in characters.
 pub const LONGEST_NAME: usize = 256;
 /// Longest message of another program that is shown, in characters.
@@ -56,17 +58,20 @@ pub fn is_harmful(c: char) -> bool {
             | '\u{feff}' | '\u{fff9}'..='\u{fffb}' | '\u{e0000}'..='\u{e007f}')
 }
 
+/// An error and all that led to it.
+pub fn causes<'a>(error: &'a (dyn Error + 'static)) -> impl Iterator<Item = &'a (dyn Error + 'static)> {
+    successors(Some(error), |error| (*error).source())
+}
+
 /// An error and what caused it, joined by `: `. A cause whose text the error before already holds is left out.
 pub fn chain(error: &(dyn Error + 'static)) -> String {
     let mut text = error.to_string();
-    let mut next = error.source();
-    while let Some(cause) = next {
+    for cause in causes(error).skip(1) {
         let more = cause.to_string();
         if !text.contains(&more) {
             text.push_str(": ");
             text.push_str(&more);
         }
-        next = cause.source();
     }
     text
 }

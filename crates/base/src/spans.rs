@@ -39,7 +39,7 @@ struct Fields {
 }
 
 impl LogSpan {
-    /// That of a submission that has an object. `submission` is `namespace/name`.
+    /// Span of a submission that has an object. `submission` is `namespace/name`.
     pub fn of(submission: impl fmt::Display, leaderboard: &str, attempt: i64, uid: &str) -> Self {
         Self(Some(Arc::new(Fields {
             submission: submission.to_string().into(),

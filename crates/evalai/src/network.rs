@@ -20,6 +20,7 @@ use super::answer::Silence;
 use super::reach::{NotPublic, Reach, check, reached};
 use super::transport::{Body, ClientError, Failure, Timeouts, Transport, unsendable};
 use leaderboard_api::ranges;
+use leaderboard_api::text::causes;
 
 /// Variables with the address of a proxy, in capital letters.
 const PROXIES: [&str; 3] = ["HTTPS_PROXY", "HTTP_PROXY", "ALL_PROXY"];
@@ -131,13 +132,6 @@ fn is_canceled(error: &(dyn std::error::Error + 'static)) -> bool {
             .downcast_ref::<hyper::Error>()
             .is_some_and(hyper::Error::is_canceled)
     })
-}
-
-/// An error and all that led to it.
-fn causes<'a>(
-    error: &'a (dyn std::error::Error + 'static),
-) -> impl Iterator<Item = &'a (dyn std::error::Error + 'static)> {
-    std::iter::successors(Some(error), |error| (*error).source())
 }
 
 struct Resolver {

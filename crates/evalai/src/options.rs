@@ -1,4 +1,4 @@
-//! What a hub and its tasks are given.
+//! Surroundings of a hub and of its tasks.
 
 #[cfg(any(test, feature = "fixtures"))]
 use std::sync::Arc;

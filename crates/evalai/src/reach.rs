@@ -1,6 +1,6 @@
 //! Which addresses a stranger may name: those of the internet alone, and none in a network of the operator's.
 //!
-//! Asked by `network`. Pure. An address that stands in the URL itself is looked up by nobody: ask [`check`] before each request, and follow
+//! Asked by `network`. Pure. An address that stands in the URL itself is not looked up: ask [`check`] before each request, and follow
 //! no redirect without asking again.
 
 use std::net::{IpAddr, SocketAddr};

@@ -93,7 +93,7 @@ pub fn run_of_mode(mode: EvaluationMode) -> Run {
     run
 }
 
-/// The same, whose results a command merges.
+/// A run whose results a command merges.
 pub fn merging_run(mode: EvaluationMode) -> Run {
     let mut run = run_of_mode(mode);
     if let PlannedEvaluation::Container(container) = &mut run.plan.evaluation {

@@ -35,7 +35,7 @@ pub fn place(storage: Option<&S3Bucket>) -> impl Iterator<Item = (&'static str, 
     places.into_iter().filter_map(|(flag, value)| Some((flag, value?)))
 }
 
-/// The same as arguments of the program. No value is taken for a flag.
+/// Arguments of the program that name the place. No value is taken for a flag.
 pub fn flags(storage: Option<&S3Bucket>) -> impl Iterator<Item = String> {
     place(storage).map(|(flag, value)| format!("{flag}={value}"))
 }

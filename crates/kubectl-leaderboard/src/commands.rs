@@ -157,7 +157,7 @@ pub fn changes(cluster: &Cluster, name: &str) -> impl Stream<Item = Result<Submi
     uninterrupted(cluster.changes(name)).map(move |change| change?.ok_or_else(|| Error::Gone(gone.clone())))
 }
 
-/// What a watch shows, through its interruptions.
+/// Objects that a watch shows, through its interruptions.
 pub fn uninterrupted<T>(watch: impl Stream<Item = Result<T, watcher::Error>>) -> impl Stream<Item = Result<T, Error>> {
     watch.filter_map(|change| {
         ready(match change {

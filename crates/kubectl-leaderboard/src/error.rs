@@ -3,7 +3,6 @@
 //! Called by `cluster` and `main`.
 
 use std::error::Error as StdError;
-use std::iter::successors;
 use std::process::ExitStatus;
 
 use kube::client::AuthError;
@@ -11,6 +10,7 @@ use kube::config::KubeconfigError;
 use kube::runtime::watcher;
 
 use super::text::clean;
+use leaderboard_api::text::{causes, chain};
 use leaderboard_api::{DOCUMENTS, client_errors as text};
 
 /// Why a command could not be carried out.
@@ -177,7 +177,7 @@ pub(super) fn of_kubeconfig(error: &(dyn StdError + 'static)) -> Error {
     if found.any(|cause| matches!(cause, KubeconfigError::Parse(_))) {
         return Error::Config("the kubeconfig is not one, or not YAML".to_owned());
     }
-    Error::Config(phrase(&leaderboard_api::text::chain(error)))
+    Error::Config(phrase(&chain(error)))
 }
 
 /// A text of another program in one line and without a full stop.
@@ -185,7 +185,7 @@ pub(super) fn phrase(text: &str) -> String {
     clean(text).trim_end_matches('.').to_owned()
 }
 
-/// What a program that has failed printed last, else how it ended.
+/// Last line that a failed program printed, else how it ended.
 pub(super) fn complaint(stderr: &[u8], status: ExitStatus) -> String {
     let stderr = String::from_utf8_lossy(stderr);
     let last = stderr.lines().rfind(|line| !line.trim().is_empty());
@@ -205,11 +205,6 @@ fn credentials(error: &(dyn StdError + 'static)) -> Option<String> {
         AuthError::AuthExecParse(_) => {
             "the program that the kubeconfig names for credentials printed something else".to_owned()
         }
-        other => phrase(&leaderboard_api::text::chain(other)),
+        other => phrase(&chain(other)),
     })
-}
-
-/// An error and its causes.
-fn causes<'a>(error: &'a (dyn StdError + 'static)) -> impl Iterator<Item = &'a (dyn StdError + 'static)> {
-    successors(Some(error), |error| (*error).source())
 }

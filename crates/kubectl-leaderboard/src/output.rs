@@ -40,7 +40,7 @@ pub struct Output {
     pub format: Format,
 }
 
-/// Those of the formats that a command has.
+/// Formats that a command has.
 pub fn formats<const N: usize>(names: [&'static str; N]) -> impl TypedValueParser<Value = Format> {
     let parser = PossibleValuesParser::new(names);
     parser.map(|name| Format::from_str(&name, true).unwrap_or_default())

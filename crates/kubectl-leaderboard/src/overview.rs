@@ -136,7 +136,7 @@ fn of_leaderboards(place: Place<'_>, submissions: &[Submission], leaderboards: O
     problems.map(|(text, _)| text).collect()
 }
 
-/// What is wrong with a submission; empty if nothing is.
+/// Faults of a submission; empty if there is none.
 fn trouble(submission: &Submission, now: Timestamp) -> String {
     let status = facts::status(submission);
     let is_deleting = submission.metadata.deletion_timestamp.is_some();

@@ -352,7 +352,7 @@ impl ReportView {
     }
 }
 
-/// What was requested to be stored as a run ends.
+/// Requests to store something as a run ends.
 #[derive(Clone, Copy, Debug, Default, PartialEq, Eq)]
 pub struct Requested {
     pub fence: ObservedFence,

@@ -74,7 +74,7 @@ impl Scenario {
     /// One that EvalAI and a table get.
     pub const PUBLISHED: Self = Self::ALL[2];
 
-    /// The same with a host's own evaluator, in each of its modes.
+    /// Published ones with a host's own evaluator, in each of its modes.
     pub const EVALUATED: [Self; 3] = [
         Self::by_container("EvalAI and table, a host's evaluator", "Interactive"),
         Self::by_container("EvalAI and table, an agent before the evaluator", BATCH),

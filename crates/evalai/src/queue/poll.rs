@@ -208,7 +208,7 @@ impl ChallengeCheck {
     }
 }
 
-/// What an answer shows; none where EvalAI does not show it to this token's user.
+/// Content of an answer; none where EvalAI does not show it to this token's user.
 fn or_hidden<T>(answer: Answer<T>) -> Answer<Option<T>> {
     match answer {
         Answer::Refused(refusal) if refusal.about != About::Token => Answer::Done(None),

@@ -41,7 +41,7 @@ const ENV: [&str; 9] = [
     "WORKER", "WORKERS", "TRACK", "PHASE", ADDRESS, "RESULTS", "RESUME", "ATTEMPT", PARTS_PATH,
 ];
 
-/// What a host may not give another meaning: names of what the Pods of this Leaderboard can have, and no others.
+/// Names that a host may not give another meaning: of what the Pods of this Leaderboard can have, and no others.
 pub(super) fn reserved(mode: EvaluationMode, spec: &LeaderboardSpec) -> Reserved {
     let data = data(spec);
     let input = mode.has_input().then_some((INPUT_PATH, INPUTS));

@@ -17,7 +17,7 @@ use leaderboard_protocol::files::{Host, Pair};
 /// Objects for the files of the host's containers and the agents' own: of the 20,000 of a run, the others are results, status files and
 /// known logs.
 const FILES: u64 = 15_500;
-/// Of these, the agents' own.
+/// Objects of those for the agents' files.
 const AGENT_FILES: u64 = 10_000;
 /// Bytes that an object counts at least: an empty one costs a request, an entry in each list, and memory here.
 pub const LEAST: u64 = 4 << 10;

@@ -70,7 +70,7 @@ pub struct Uploader {
     complaints: Complaints,
     /// Files that were cut.
     slow: BTreeMap<String, Slow>,
-    /// What the evaluators read, on its way beside the rounds: it may take longer than one. What fails there fails the next round.
+    /// Uploads of what the evaluators read, on their way beside the rounds: they may take longer than one. A failure there fails the next round.
     beside: JoinSet<(String, Outcome)>,
 }
 
@@ -374,7 +374,7 @@ impl Uploader {
     }
 }
 
-/// What became of an upload beside the rounds.
+/// Outcome of an upload beside the rounds.
 fn outcome_of(ended: Result<(String, Outcome), JoinError>) -> Option<(String, Outcome)> {
     let logged = ended.inspect_err(|error| {
         if !error.is_cancelled() {

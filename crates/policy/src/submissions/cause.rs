@@ -134,7 +134,7 @@ fn of_end(container: &ContainerView, is_init: bool) -> Option<Trouble> {
     Some(trouble(container, Reason::Preparing, &message, Cause::Host))
 }
 
-/// What `workspace` or `collect` has found that no further try changes.
+/// Finding of `workspace` or `collect` that no further try changes.
 fn of_verdict(verdict: WorkspaceReason) -> Option<(Reason, Cause)> {
     match verdict {
         // The next Pod may get another node.
